@@ -1,0 +1,55 @@
+# Everything runs in .venv, made on demand from the lock file. Needs: Python >= 3.11, make.
+PYTHON  ?= python3
+VENV    := .venv
+BIN     := $(VENV)/bin
+READY   := $(VENV)/.ready
+OUT     ?= runs/demo
+WORKERS ?= 2
+
+.PHONY: help venv demo test test-slow lint types format lock clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+venv: $(READY)  ## make the environment: locked dependencies and the package, editable
+
+$(READY): pyproject.toml setup.py requirements.lock
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; v < (3, 11) and sys.exit("Python %d.%d found, 3.11 or later needed: call make PYTHON=python3.12, say" % v)'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --require-hashes --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: $(READY)  ## run the system on a synthetic room; OUT=runs/demo
+	$(BIN)/vggtgeo demo -o $(OUT)
+
+test: $(READY)  ## run the tests (a few minutes); ARGS="-k name" for some
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+
+test-slow: $(READY)  ## run the slow tests: real clips, long sequences
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: $(READY)  ## check format, style and types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	@$(MAKE) --no-print-directory types
+
+# mypy cannot follow the mapping of solvers/ and models/ in an editable install, so it reads an installed copy.
+types: $(READY)  ## check types
+	rm -rf build
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/types .
+	MYPYPATH=build/types $(BIN)/mypy --package vggtgeo
+
+format: $(READY)  ## format the code and apply the safe fixes
+	$(BIN)/ruff check --fix-only --quiet .
+	$(BIN)/ruff format .
+
+lock: $(READY)  ## renew requirements.lock for all supported Pythons and platforms
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --fork-strategy fewest --extra dev \
+		--generate-hashes --no-annotate --no-header --no-emit-index-url --no-emit-find-links \
+		--output-file requirements.lock pyproject.toml
+
+clean:  ## remove what was built, keep .venv and runs
+	rm -rf build dist .cache .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

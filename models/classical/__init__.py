@@ -1,0 +1,31 @@
+"""Classical implementations of the five perception roles: OpenCV and numpy, no weights."""
+
+from vggtgeo.models.classical.depth import NoDepth, SensorDepth
+from vggtgeo.models.classical.line_detector import LsdDetector
+from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
+from vggtgeo.models.classical.line_matcher import BandLineMatcher
+from vggtgeo.models.classical.orb import OrbMatcher
+from vggtgeo.models.classical.pnp import ConstantVelocity, PnpGeometry
+from vggtgeo.models.classical.sift import SiftMatcher
+from vggtgeo.models.classical.structure_tensor import StructureTensor
+from vggtgeo.models.classical.sub_pixel import PatchAlignment
+from vggtgeo.models.classical.two_view import TwoViewStart
+from vggtgeo.models.classical.verification import EpipolarVerifier
+
+__all__ = [
+    "BandLineMatcher",
+    "ConstantVelocity",
+    "EpipolarVerifier",
+    "LsdDetector",
+    "NoDepth",
+    "OrbMatcher",
+    "PatchAlignment",
+    "PnpGeometry",
+    "SensorDepth",
+    "SiftMatcher",
+    "StructureTensor",
+    "TwoViewStart",
+    "line_coefficients",
+    "sample_segments",
+    "segment_depths",
+]

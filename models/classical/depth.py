@@ -1,0 +1,116 @@
+"""Metric depth from a sensor, and its absence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from vggtgeo.models.checks import check_array, check_image
+from vggtgeo.models.roles import DepthEstimate
+
+
+@dataclass(frozen=True)
+class SensorDepth:
+    """A depth camera's own depth, with the noise of a Kinect.
+
+    sigma_z = axial + quadratic (z - near)^2 metres: Nguyen, Izadi, Lovell, "Modeling Kinect sensor noise for improved
+    3D reconstruction and tracking", 3DIMPVT 2012; its growth with z^2 is that of triangulation from disparity
+    (Khoshelham and Oude Elberink, "Accuracy and resolution of Kinect depth data", Sensors 2012). `floor` adds, in
+    quadrature and relative to z, what calibration leaves behind. Near a jump of depth the pixel may belong to either
+    side, so confidence falls there and sigma_rel grows with the jump.
+
+    nearest, farthest: depths outside are dropped, metres. edge: relative jump between neighbours at which confidence
+    has fallen to one half. reach: how far from a jump it is felt, pixels.
+    """
+
+    axial: float = 0.0012
+    quadratic: float = 0.0019
+    near: float = 0.4
+    floor: float = 0.01
+    nearest: float = 0.2
+    farthest: float = 8.0
+    edge: float = 0.05
+    reach: int = 2
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.nearest < self.farthest:
+            raise ValueError(
+                f"`nearest` is {self.nearest} m and `farthest` {self.farthest} m, expected 0 <= nearest < farthest"
+            )
+        if self.floor < 0 or not self.edge > 0 or self.reach < 0:
+            raise ValueError(
+                "`floor` and `reach` must not be negative and `edge` must be positive; correct the settings"
+            )
+
+    def estimate(
+        self,
+        image: np.ndarray,
+        sensor_depth: np.ndarray | None = None,
+        intrinsics: Sequence[float] | None = None,
+    ) -> DepthEstimate:
+        """The sensor's depth with its noise; nothing anywhere when `sensor_depth` is None."""
+        check_image("image", image)
+        if sensor_depth is None:
+            return no_depth(image.shape[:2])
+        check_array("sensor_depth", sensor_depth, image.shape[:2], finite=False)
+        depth = sensor_depth.astype(np.float32)
+        valid = (depth >= self.nearest) & (depth <= self.farthest)
+        jump = _relative_jump(np.where(valid, depth, np.nan), self.reach)
+        confidence = np.where(valid, 1.0 / (1.0 + (jump / self.edge) ** 2), 0.0)
+        safe = np.where(valid, depth, np.float32(1.0))
+        sigma = np.hypot((self.axial + self.quadratic * (safe - self.near) ** 2) / safe, self.floor)
+        sigma = np.where(valid, np.hypot(sigma, 0.5 * jump), np.nan)
+        return DepthEstimate(
+            np.where(valid, depth, np.float32(np.nan)),
+            confidence.astype(np.float32),
+            sigma.astype(np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class NoDepth:
+    """No metric depth at all: the scale of the world stays free."""
+
+    def estimate(
+        self,
+        image: np.ndarray,
+        sensor_depth: np.ndarray | None = None,
+        intrinsics: Sequence[float] | None = None,
+    ) -> DepthEstimate:
+        """NaN everywhere, whatever the sensor says."""
+        check_image("image", image)
+        return no_depth(image.shape[:2])
+
+
+def no_depth(shape: tuple[int, int]) -> DepthEstimate:
+    """An estimate of `shape` (H, W) that knows nothing."""
+    nothing = np.full(shape, np.nan, dtype=np.float32)
+    return DepthEstimate(nothing, np.zeros(shape, dtype=np.float32), nothing.copy())
+
+
+def _relative_jump(depth: np.ndarray, reach: int) -> np.ndarray:
+    """Float [H, W]: how far depth departs from a plane within `reach` pixels, relative to depth; 0 if NaN.
+
+    The second difference of inverse depth vanishes on every plane, however slanted, so that only edges count.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inverse = np.nan_to_num(1.0 / depth, nan=0.0, posinf=0.0)
+    known = (inverse > 0).astype(np.float32)
+    step = max(reach, 1)
+    bend = np.zeros_like(inverse)
+    for axis in (0, 1):
+        before, after = np.roll(inverse, step, axis), np.roll(inverse, -step, axis)
+        both = np.roll(known, step, axis) * np.roll(known, -step, axis) * known
+        second = np.abs(before - 2.0 * inverse + after) * both
+        bend = np.maximum(bend, _without_border(second, step, axis))
+    spread = cv2.dilate(bend.astype(np.float32), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    return np.where(known > 0, spread / np.maximum(inverse, 1e-9), 0.0)
+
+
+def _without_border(values: np.ndarray, width: int, axis: int) -> np.ndarray:
+    """`values` with 0 along the two borders of `axis`, where `np.roll` has wrapped around."""
+    inside = np.zeros(values.shape[axis], dtype=bool)
+    inside[width:-width] = True
+    return values * (inside[:, None] if axis == 0 else inside[None, :])

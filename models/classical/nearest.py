@@ -1,0 +1,43 @@
+"""Mutual nearest neighbours of unit descriptors, by one matrix product."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def mutual_nearest(
+    similarity: np.ndarray, ratio: float, floor: float = -1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs that are each other's best and clearly better than the second best.
+
+    similarity: float [I, J], inner products of unit vectors; -inf where a pair is excluded. It is overwritten.
+    ratio: accept when distance(best) < ratio * distance(second), with distance^2 = 2 - 2 similarity (Lowe 2004).
+    floor: least similarity of a pair.
+
+    Returns index_i int [m], index_j int [m], and the distance ratio float [m] of each pair, smaller is clearer.
+    """
+    rows, columns = similarity.shape
+    if rows == 0 or columns == 0:
+        empty = np.zeros(0, dtype=np.int64)
+        return empty, empty, np.zeros(0)
+    best_j = similarity.argmax(axis=1)
+    best_i = similarity.argmax(axis=0)
+    index = np.arange(rows)
+    best = similarity[index, best_j]
+    mutual = (best_i[best_j] == index) & (best > floor)
+    index_i, index_j, best = index[mutual], best_j[mutual], best[mutual]
+    similarity[index_i, index_j] = -np.inf
+    second = similarity[index_i].max(axis=1, initial=-1.0)
+    clarity = np.sqrt(np.maximum(1.0 - best, 0.0) / np.maximum(1.0 - second, 1e-6))
+    keep = clarity < ratio
+    return index_i[keep], index_j[keep], clarity[keep]
+
+
+def exclude_far(similarity: np.ndarray, predicted: np.ndarray, pixels: np.ndarray, radius: float) -> None:
+    """Set `similarity` [I, J] to -inf, in place, where `pixels` [J, 2] is beyond `radius` of `predicted` [I, 2].
+
+    Rows whose prediction is NaN are left alone.
+    """
+    dx = predicted[:, 0, None] - pixels[:, 0]
+    dy = predicted[:, 1, None] - pixels[:, 1]
+    similarity[dx * dx + dy * dy > radius * radius] = -np.inf

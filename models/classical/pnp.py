@@ -1,0 +1,121 @@
+"""The pose of a new frame from known points (PnP), with a constant-velocity prediction to lean on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from vggtgeo.models.classical.pinhole import intrinsics_matrix
+from vggtgeo.models.classical.pose_refinement import refine_pose, residuals
+from vggtgeo.models.classical.two_view import TwoViewStart
+from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery, StartGuess
+
+
+@dataclass(frozen=True)
+class PnpGeometry:
+    """P3P inside MAGSAC++ (Barath et al. 2020), then a robust refinement weighted by confidence.
+
+    The predicted pose competes with the sampled one: where the prediction explains more matches it is the start of
+    the refinement, so that a frame whose few matches defeat sampling is still tracked.
+
+    threshold: largest reprojection error of an inlier, pixels. least: fewest inliers of a success.
+    """
+
+    threshold: float = 6.0
+    least: int = 12
+    confidence: float = 0.999
+    max_iterations: int = 1000
+    two_view: TwoViewStart = field(default_factory=TwoViewStart)
+
+    def __post_init__(self) -> None:
+        if not self.threshold > 0:
+            raise ValueError(f"`threshold` is {self.threshold}, expected a positive number of pixels")
+        if self.least < 6:
+            raise ValueError(f"`least` is {self.least}, expected at least 6 points to determine a pose")
+
+    def locate(self, query: PoseQuery) -> PoseGuess:
+        """The pose of the query's frame; see `InitialGeometry.locate`."""
+        if len(query.points) < self.least:
+            return failed_guess(query, GeometryResult.TOO_FEW_MATCHES)
+        intrinsics = np.asarray(query.intrinsics, dtype=np.float64)
+        starts = [pose for pose in (query.predicted, self._sample(query)) if pose is not None]
+        if not starts:
+            return failed_guess(query, GeometryResult.DEGENERATE)
+        pose = max(starts, key=lambda start: self._support(start, query))
+        inliers = self._inliers(pose, query)
+        for _ in range(2):
+            if np.count_nonzero(inliers) < self.least:
+                return failed_guess(query, GeometryResult.TOO_FEW_INLIERS)
+            weights = query.confidence[inliers] + 1e-3
+            pose = refine_pose(pose, query.points[inliers], query.pixels[inliers], weights, intrinsics)
+            inliers = self._inliers(pose, query)
+        error = _errors(pose, query)[inliers]
+        if len(error) < self.least:
+            return failed_guess(query, GeometryResult.TOO_FEW_INLIERS)
+        return PoseGuess(pose, inliers, float(np.median(error)), GeometryResult.SUCCESS)
+
+    def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
+        """Motion and structure of the first two views; see `InitialGeometry.start`."""
+        return self.two_view.start(pixels_i, pixels_j, intrinsics)
+
+    def _sample(self, query: PoseQuery) -> np.ndarray | None:
+        try:
+            found, rotation, translation, _ = cv2.solvePnPRansac(
+                query.points.astype(np.float64),
+                query.pixels.astype(np.float64),
+                intrinsics_matrix(query.intrinsics),
+                None,
+                flags=cv2.USAC_MAGSAC,
+                reprojectionError=self.threshold,
+                confidence=self.confidence,
+                iterationsCount=self.max_iterations,
+            )
+        except cv2.error:
+            return None
+        if not found or not np.isfinite(rotation).all() or not np.isfinite(translation).all():
+            return None
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(rotation)[0]
+        pose[:3, 3] = translation.ravel()
+        return pose
+
+    def _inliers(self, pose: np.ndarray, query: PoseQuery) -> np.ndarray:
+        return _errors(pose, query) < self.threshold
+
+    def _support(self, pose: np.ndarray, query: PoseQuery) -> float:
+        return float(query.confidence[self._inliers(pose, query)].sum())
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """Takes the predicted pose as it is, for the bundle adjustment to correct; the matches only judge it.
+
+    threshold: largest reprojection error of an inlier, pixels; a prediction is coarse, so it is wide.
+    """
+
+    threshold: float = 30.0
+    two_view: TwoViewStart = field(default_factory=TwoViewStart)
+
+    def locate(self, query: PoseQuery) -> PoseGuess:
+        """The prediction, with the matches it explains to `threshold`; see `InitialGeometry.locate`."""
+        if query.predicted is None:
+            return failed_guess(query, GeometryResult.NO_PREDICTION)
+        errors = _errors(query.predicted, query)
+        inliers = errors < self.threshold
+        error = float(np.median(errors[inliers])) if inliers.any() else float("nan")
+        return PoseGuess(query.predicted, inliers, error, GeometryResult.SUCCESS)
+
+    def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
+        """Motion and structure of the first two views; see `InitialGeometry.start`."""
+        return self.two_view.start(pixels_i, pixels_j, intrinsics)
+
+
+def failed_guess(query: PoseQuery, result: GeometryResult) -> PoseGuess:
+    """A guess that says why there is none, at the predicted pose, or at the identity without a prediction."""
+    pose = np.eye(4) if query.predicted is None else query.predicted
+    return PoseGuess(pose, np.zeros(len(query.points), dtype=bool), float("nan"), result)
+
+
+def _errors(pose: np.ndarray, query: PoseQuery) -> np.ndarray:
+    return np.linalg.norm(residuals(pose, query.points, query.pixels, np.asarray(query.intrinsics))[0], axis=1)

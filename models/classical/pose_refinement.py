@@ -1,0 +1,94 @@
+"""The pose that reprojects known points best: weighted, robust Gauss-Newton on SE(3)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+
+def refine_pose(
+    pose: np.ndarray,
+    points: np.ndarray,
+    pixels: np.ndarray,
+    weights: np.ndarray,
+    intrinsics: np.ndarray,
+    delta: float = 1.5,
+    steps: int = 10,
+) -> np.ndarray:
+    """Minimise sum_n w_n rho(|pi(T X_n) - u_n|) over T, with rho Huber's of `delta` pixels.
+
+    Each step solves the 6 x 6 normal equations of J = d pi / d xi for the left perturbation T <- exp(xi) T, and is
+    halved until the energy falls. Cost: O(n) a step.
+
+    pose: [4, 4] world -> camera, the start. points [n, 3], pixels [n, 2], weights [n]. Returns float64 [4, 4].
+    """
+    current, energy = pose, _energy(pose, points, pixels, weights, intrinsics, delta)
+    for _ in range(steps):
+        step = _gauss_newton_step(current, points, pixels, weights, intrinsics, delta)
+        for fraction in (1.0, 0.5, 0.25, 0.125):
+            trial = _exponential(fraction * step) @ current
+            trial_energy = _energy(trial, points, pixels, weights, intrinsics, delta)
+            if trial_energy < energy:
+                break
+        else:
+            return current
+        gained, current, energy = energy - trial_energy, trial, trial_energy
+        if gained < 1e-7 * energy + 1e-12:
+            return current
+    return current
+
+
+def residuals(
+    pose: np.ndarray, points: np.ndarray, pixels: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reprojection errors float [n, 2] in pixels and camera-frame points [n, 3]; errors are inf behind the camera."""
+    fx, fy, cx, cy = intrinsics
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    ahead = local[:, 2] > 1e-3
+    depth = np.where(ahead, local[:, 2], 1.0)
+    error = np.stack([fx * local[:, 0] / depth + cx, fy * local[:, 1] / depth + cy], axis=1) - pixels
+    return np.where(ahead[:, None], error, np.inf), local
+
+
+def _energy(
+    pose: np.ndarray,
+    points: np.ndarray,
+    pixels: np.ndarray,
+    weights: np.ndarray,
+    intrinsics: np.ndarray,
+    delta: float,
+) -> float:
+    size = np.linalg.norm(residuals(pose, points, pixels, intrinsics)[0], axis=1)
+    # A point behind the camera costs as much as one a thousand pixels away, so that the energy stays finite.
+    size = np.minimum(size, 1e3)
+    return float(weights @ np.where(size <= delta, size * size, delta * (2.0 * size - delta)))
+
+
+def _gauss_newton_step(
+    pose: np.ndarray,
+    points: np.ndarray,
+    pixels: np.ndarray,
+    weights: np.ndarray,
+    intrinsics: np.ndarray,
+    delta: float,
+) -> np.ndarray:
+    fx, fy = intrinsics[:2]
+    error, local = residuals(pose, points, pixels, intrinsics)
+    use = np.isfinite(error[:, 0])
+    error, (x, y, z), weights = error[use], local[use].T, weights[use]
+    weights = weights * np.minimum(1.0, delta / np.maximum(np.linalg.norm(error, axis=1), 1e-12))
+    zero, u, v = np.zeros_like(x), x / z, y / z
+    row_x = fx * np.stack([1 / z, zero, -u / z, -u * v, 1 + u * u, -v])
+    row_y = fy * np.stack([zero, 1 / z, -v / z, -1 - v * v, u * v, u])
+    hessian = (row_x * weights) @ row_x.T + (row_y * weights) @ row_y.T
+    gradient = row_x @ (weights * error[:, 0]) + row_y @ (weights * error[:, 1])
+    hessian[np.diag_indices(6)] += 1e-9 * np.trace(hessian) + 1e-12
+    return -np.linalg.solve(hessian, gradient)
+
+
+def _exponential(tangent: np.ndarray) -> np.ndarray:
+    """Exp on SO(3) x R^3: to first order the exponential of SE(3), and as good a retraction."""
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(tangent[3:])[0]
+    pose[:3, 3] = tangent[:3]
+    return pose

@@ -1,0 +1,140 @@
+"""The first two views of a sequence without depth: relative motion and structure up to scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from vggtgeo.models.checks import check_array
+from vggtgeo.models.classical.pinhole import intrinsics_matrix
+from vggtgeo.models.roles import GeometryResult, StartGuess
+
+
+@dataclass(frozen=True)
+class TwoViewStart:
+    """Essential matrix by MAGSAC++, the one of its four motions with points in front, triangulation.
+
+    threshold: largest epipolar error of an inlier, pixels. least: fewest points of a success.
+    parallax: least median angle between the rays of a point, radians; below it depth is mostly noise.
+    """
+
+    threshold: float = 1.5
+    least: int = 40
+    parallax: float = float(np.deg2rad(1.5))
+    confidence: float = 0.9999
+    max_iterations: int = 5000
+
+    def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
+        """Motion and structure from matches float [n, 2] each; see `InitialGeometry.start`."""
+        check_array("pixels_i", pixels_i, (None, 2))
+        check_array("pixels_j", pixels_j, (len(pixels_i), 2))
+        if len(pixels_i) < self.least:
+            return _failed(len(pixels_i), GeometryResult.TOO_FEW_MATCHES)
+        rays_i, rays_j = _rays(pixels_i, intrinsics), _rays(pixels_j, intrinsics)
+        essential, agrees = self._essential(pixels_i, pixels_j, intrinsics)
+        if essential is None:
+            return _failed(len(pixels_i), GeometryResult.DEGENERATE)
+        pose = _motion(essential, rays_i[agrees], rays_j[agrees])
+        points, inliers = _triangulate(pose, rays_i, rays_j, agrees)
+        if np.count_nonzero(inliers) < self.least:
+            turned = self._only_turned(rays_i[agrees], rays_j[agrees], intrinsics)
+            reason = GeometryResult.LOW_PARALLAX if turned else GeometryResult.TOO_FEW_INLIERS
+            return _failed(len(pixels_i), reason)
+        parallax = float(np.median(_angles(points[inliers], pose)))
+        if parallax < self.parallax or self._only_turned(rays_i[inliers], rays_j[inliers], intrinsics):
+            return StartGuess(pose, points, inliers, parallax, GeometryResult.LOW_PARALLAX)
+        return StartGuess(pose, points, inliers, parallax, GeometryResult.SUCCESS)
+
+    def _essential(
+        self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray
+    ) -> tuple[np.ndarray | None, np.ndarray]:
+        try:
+            essential, mask = cv2.findEssentialMat(
+                np.ascontiguousarray(pixels_i, dtype=np.float64),
+                np.ascontiguousarray(pixels_j, dtype=np.float64),
+                intrinsics_matrix(intrinsics),
+                cv2.USAC_MAGSAC,
+                self.confidence,
+                self.threshold,
+                self.max_iterations,
+            )
+        except cv2.error:
+            return None, np.zeros(len(pixels_i), dtype=bool)
+        if essential is None or essential.shape != (3, 3) or not np.isfinite(essential).all():
+            return None, np.zeros(len(pixels_i), dtype=bool)
+        return essential, mask.ravel().astype(bool)
+
+    def _only_turned(self, rays_i: np.ndarray, rays_j: np.ndarray, intrinsics: np.ndarray) -> bool:
+        """Whether a rotation alone maps half of the rays of i onto those of j to within the threshold."""
+        if len(rays_i) < 3:
+            return False
+        rotation = _rotation_between(rays_i, rays_j)
+        off = np.arccos(np.clip(((rays_i @ rotation.T) * rays_j).sum(axis=1), -1.0, 1.0))
+        return bool(np.median(off) * float(intrinsics[0]) < self.threshold)
+
+
+def _rays(pixels: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _motion(essential: np.ndarray, rays_i: np.ndarray, rays_j: np.ndarray) -> np.ndarray:
+    """Of the four motions of an essential matrix, the one that puts most points in front of both cameras."""
+    rotation_1, rotation_2, translation = cv2.decomposeEssentialMat(essential)
+    candidates = []
+    for rotation in (rotation_1, rotation_2):
+        for sign in (1.0, -1.0):
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = rotation, sign * translation.ravel()
+            depth_i, depth_j = _depths_along(pose, rays_i, rays_j)
+            candidates.append((np.count_nonzero((depth_i > 0) & (depth_j > 0)), pose))
+    return max(candidates, key=lambda candidate: candidate[0])[1]
+
+
+def _depths_along(pose: np.ndarray, rays_i: np.ndarray, rays_j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances along the two rays to their closest approach: least squares of s_j f_j = s_i R f_i + t."""
+    turned, translation = rays_i @ pose[:3, :3].T, pose[:3, 3]
+    cosine = (turned * rays_j).sum(axis=1)
+    along_i, along_j = turned @ translation, rays_j @ translation
+    determinant = np.maximum(1.0 - cosine * cosine, 1e-12)
+    depth_i = (cosine * along_j - along_i) / determinant
+    depth_j = (along_j - cosine * along_i) / determinant
+    return depth_i, depth_j
+
+
+def _triangulate(
+    pose: np.ndarray, rays_i: np.ndarray, rays_j: np.ndarray, agrees: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The midpoint of the two rays' closest approach, NaN unless in front of both and not almost parallel."""
+    depth_i, depth_j = _depths_along(pose, rays_i, rays_j)
+    to_first = pose[:3, :3].T
+    midpoint = 0.5 * (depth_i[:, None] * rays_i + (depth_j[:, None] * rays_j - pose[:3, 3]) @ to_first.T)
+    # Beyond 200 baselines the angle of the rays is below 0.3 degrees: the distance is noise.
+    good = agrees & (depth_i > 0) & (depth_j > 0) & (depth_i < 200.0)
+    return np.where(good[:, None], midpoint, np.nan), good
+
+
+def _angles(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    second = points - (-pose[:3, :3].T @ pose[:3, 3])
+    cosine = (points * second).sum(axis=1) / (np.linalg.norm(points, axis=1) * np.linalg.norm(second, axis=1))
+    return np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
+def _rotation_between(rays_i: np.ndarray, rays_j: np.ndarray) -> np.ndarray:
+    """The rotation that best maps unit vectors i to j: Kabsch (1976), reweighted towards least absolute error."""
+    rotation = _kabsch(rays_i, rays_j, np.ones(len(rays_i)))
+    for _ in range(5):
+        off = np.linalg.norm(rays_i @ rotation.T - rays_j, axis=1)
+        rotation = _kabsch(rays_i, rays_j, 1.0 / np.maximum(off, 1e-4))
+    return rotation
+
+
+def _kabsch(rays_i: np.ndarray, rays_j: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    left, _, right = np.linalg.svd((rays_j * weights[:, None]).T @ rays_i)
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+
+
+def _failed(count: int, result: GeometryResult) -> StartGuess:
+    return StartGuess(np.eye(4), np.full((count, 3), np.nan), np.zeros(count, dtype=bool), 0.0, result)

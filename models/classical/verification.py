@@ -1,0 +1,85 @@
+"""Geometric verification of matches between two views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from vggtgeo.models.classical.pinhole import intrinsics_matrix
+
+
+@dataclass(frozen=True)
+class EpipolarVerifier:
+    """Keeps the matches that one epipolar geometry explains, estimated by MAGSAC++ (Barath et al. 2020).
+
+    The model is the essential matrix where `intrinsics` are given, else the fundamental matrix. Where that finds
+    fewer inliers than a homography does (a plane seen alone, or a camera that only turned, where the epipolar
+    geometry is undetermined), the homography decides.
+
+    threshold: largest epipolar (or transfer) error of an inlier, pixels. least: fewest matches that can be verified.
+    """
+
+    threshold: float = 2.0
+    intrinsics: Sequence[float] | None = None
+    confidence: float = 0.999
+    max_iterations: int = 2000
+    least: int = 12
+
+    def __post_init__(self) -> None:
+        if not self.threshold > 0:
+            raise ValueError(f"`threshold` is {self.threshold}, expected a positive number of pixels")
+        if self.least < 8:
+            raise ValueError(f"`least` is {self.least}, expected at least 8, what a fundamental matrix needs")
+
+    def inliers(self, pixels_i: np.ndarray, pixels_j: np.ndarray) -> np.ndarray:
+        """Bool [m]: which of the matches float [m, 2] -> float [m, 2] agree. All False when there are too few."""
+        if len(pixels_i) < self.least:
+            return np.zeros(len(pixels_i), dtype=bool)
+        first = np.ascontiguousarray(pixels_i, dtype=np.float64)
+        second = np.ascontiguousarray(pixels_j, dtype=np.float64)
+        epipolar = self._epipolar(first, second)
+        # A well determined epipolar geometry needs no second opinion, and the homography costs as much again.
+        if np.count_nonzero(epipolar) >= 0.7 * len(first):
+            return epipolar
+        homography = self._homography(first, second)
+        best = max((epipolar, homography), key=np.count_nonzero)
+        return best if np.count_nonzero(best) >= self.least else np.zeros(len(first), dtype=bool)
+
+    def _epipolar(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        settings = (cv2.USAC_MAGSAC, self.confidence, self.threshold, self.max_iterations)
+        if self.intrinsics is not None:
+            mask = _quietly(cv2.findEssentialMat, first, second, intrinsics_matrix(self.intrinsics), *settings)
+        else:
+            method, confidence, threshold, iterations = settings
+            mask = _quietly(cv2.findFundamentalMat, first, second, method, threshold, confidence, iterations)
+        return _as_bool(mask, len(first))
+
+    def _homography(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        mask = _quietly(
+            cv2.findHomography,
+            first,
+            second,
+            cv2.USAC_MAGSAC,
+            self.threshold,
+            None,
+            self.max_iterations,
+            self.confidence,
+        )
+        return _as_bool(mask, len(first))
+
+
+def _quietly(estimate: Callable[..., tuple[Any, np.ndarray | None]], *arguments: Any) -> np.ndarray | None:
+    """The inlier mask of an OpenCV estimator, None where the points defeat it (all equal, collinear)."""
+    try:
+        return estimate(*arguments)[1]
+    except cv2.error:
+        return None
+
+
+def _as_bool(mask: np.ndarray | None, count: int) -> np.ndarray:
+    if mask is None or mask.size != count:
+        return np.zeros(count, dtype=bool)
+    return mask.ravel().astype(bool)

@@ -1,0 +1,80 @@
+"""Bringing a window that a model placed in its own frame and scale into a known metric world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from vggtgeo.models.checks import check_array
+from vggtgeo.models.roles import WindowGuess
+
+
+def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray] = ()) -> WindowGuess | None:
+    """The window in the world in which `poses` are, with metric translations and depths; None if that is undetermined.
+
+    Its scale s is the confidence-weighted median of `depths` / window depth, where depths are given; else, unless the
+    window is metric, the ratio of the spreads of the camera centres. Then X_window = R X_world + t is the rotation
+    closest to all G_k^-1 P_k (chordal mean) and the translation that makes the mean centres coincide.
+
+    poses: float [k, 4, 4], world -> camera, of the first k views of the window. depths: of those views, float [H, W]
+    in metres, NaN = none.
+    """
+    check_array("poses", poses, (None, 4, 4))
+    count = len(poses)
+    if count > len(guess.poses):
+        raise ValueError(f"`poses` has {count} entries, expected at most the window's {len(guess.poses)} views")
+    use = np.flatnonzero(guess.found[:count])
+    scale = _scale(guess, poses, depths, use)
+    if not len(use) or scale is None:
+        return None
+    placed = guess.poses.copy()
+    placed[:, :3, 3] *= scale
+    rotation = _mean_rotation(np.swapaxes(placed[use, :3, :3], 1, 2) @ poses[use, :3, :3])
+    to_window = np.eye(4)
+    to_window[:3, :3] = rotation
+    to_window[:3, 3] = (_centres(placed[use]) - _centres(poses[use]) @ rotation.T).mean(axis=0)
+    depth = (guess.depth * np.float32(scale)).astype(np.float32)
+    return replace(guess, poses=placed @ to_window, depth=depth, metric=True)
+
+
+def _scale(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray], use: np.ndarray) -> float | None:
+    if depths:
+        return _depth_scale(guess, depths, use)
+    if guess.metric:
+        return 1.0
+    spreads = [np.linalg.norm(centres - centres.mean(axis=0)) for centres in _two_centres(guess.poses, poses, use)]
+    # Below a centimetre of movement the noise of the poses would set the scale.
+    return float(spreads[1] / spreads[0]) if len(use) > 1 and spreads[1] > 0.01 and spreads[0] > 1e-9 else None
+
+
+def _two_centres(first: np.ndarray, second: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return (_centres(first[use]), _centres(second[use])) if len(use) else (np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+def _depth_scale(guess: WindowGuess, depths: Sequence[np.ndarray], use: np.ndarray) -> float | None:
+    ratios, weights = [], []
+    for view in use[use < len(depths)]:
+        check_array("depths", depths[view], guess.depth.shape[1:], finite=False)
+        both = (guess.depth[view] > 0) & (depths[view] > 0)
+        ratios.append(depths[view][both] / guess.depth[view][both])
+        weights.append(guess.confidence[view][both])
+    if not ratios:
+        return None
+    ratio, weight = np.concatenate(ratios), np.concatenate(weights)
+    return _weighted_median(ratio, weight) if weight.sum() > 0 else None
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order], dtype=np.float64)
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
+
+
+def _centres(poses: np.ndarray) -> np.ndarray:
+    return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+
+
+def _mean_rotation(rotations: np.ndarray) -> np.ndarray:
+    left, _, right = np.linalg.svd(rotations.sum(axis=0))
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right

@@ -1,0 +1,1 @@
+"""Structured nonlinear least squares on optimistix and lineax. Knows nothing of cameras."""

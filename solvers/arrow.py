@@ -1,0 +1,209 @@
+"""Arrow-shaped normal equations of an edge-factored least-squares problem, and their Schur complement.
+
+Unknowns: `n` nodes of `b` coordinates each, `q` shared coordinates (together `c = n b + q`: the dense part `x`), and
+`s` scalar landmarks `z` hosted by every node. A residual lives on a directed edge `(i, j)` and sees the nodes only
+through the relative coordinates `eta = x_j - A x_i`, one shared block and one landmark of its host i. So
+
+    [ H   W ] [x]     [g]          H = sum_e P_e' G_e P_e + priors,     W = sum_e P_e' C_e,
+    [ W'  V ] [z] = - [h]          P_e = [-A_e  I  .; . . I],           V diagonal,
+
+where `G_e` (Gram matrix) and `C_e` (cross terms with the host's landmarks) are kept in relative coordinates: forming
+them costs `b + q` columns a residual instead of `2 b + q`, and the Schur complement `W V^-1 W'` is one symmetric
+product of `[b k + q + 2, s]` a host, carried to node coordinates as a small matrix afterwards.
+
+Levenberg-Marquardt damping multiplies the diagonal: `V (1 + l)`, `H + l diag(H)`. Hence the Schur complement at damping
+`l` is the undamped one divided by `1 + l`: a rejected step costs a factorisation and a back-substitution only.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+Assembled = tuple[Float[Array, "c c"], Float[Array, " c"]]
+"""A matrix and a vector in node coordinates."""
+
+
+class EdgeGraph(eqx.Module):
+    """Directed edges between nodes; `of_host[i, r]` is the r-th edge that leaves node i (`e` where there is none)."""
+
+    source: Int[Array, " e"]
+    target: Int[Array, " e"]
+    of_host: Int[Array, "n k"]
+
+    def neighbours(self) -> Int[Array, "n k"]:
+        """Target node of each rank of each host; `n` where there is no edge."""
+        padded = jnp.append(self.target, self.of_host.shape[0])
+        return padded[self.of_host]
+
+
+class ArrowVector(eqx.Module):
+    """A step or a gradient: dense part and landmarks."""
+
+    dense: Float[Array, " c"]
+    landmarks: Float[Array, "n s"]
+
+
+class ArrowSystem(eqx.Module):
+    """Second-order model of the energy at one point; `b` coordinates a node, `q` shared ones."""
+
+    graph: EdgeGraph
+    transport: Float[Array, "e b b"]
+    """`A` in `eta = x_j - A x_i`."""
+    gram: Float[Array, "e m m"]
+    """`m = b + q + 1`: second derivatives in `(eta, shared)`; the last row and column hold the gradient."""
+    cross: Float[Array, "n r s"]
+    """`r = b k + q + 2`: second derivatives of `(eta of rank 0 ... k-1, shared)` with each landmark, then the
+    landmark's gradient and its own second derivative. One array, because slicing it would copy it."""
+    twist: Float[Array, "e b b"]
+    """Curvature of `eta` itself, `x_j' twist (-A x_i)`; zero in a Gauss-Newton model."""
+    prior_hessian: Float[Array, "c c"]
+    prior_gradient: Float[Array, " c"]
+    free: Bool[Array, " c"]
+    """False for coordinates that are held."""
+    gauge: Float[Array, "c g"]
+    """Directions along which the energy may be flat for a known reason (a free scale): unit columns, or zero."""
+
+    @property
+    def landmark_gradient(self) -> Float[Array, "n s"]:
+        return self.cross[:, -2]
+
+    @property
+    def landmark_hessian(self) -> Float[Array, "n s"]:
+        return self.cross[:, -1]
+
+
+class Reduced(eqx.Module):
+    """The dense part of an `ArrowSystem` and its undamped Schur complement."""
+
+    hessian: Float[Array, "c c"]
+    gradient: Float[Array, " c"]
+    schur: Float[Array, "c c"]
+    """`W V^-1 W'`."""
+    schur_gradient: Float[Array, " c"]
+    """`W V^-1 h`."""
+
+
+def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "n s"]:
+    """`V^-1`, zero for landmarks that nothing determines (they then stay where they are)."""
+    determined = system.landmark_hessian != 0
+    return jnp.where(determined, 1 / jnp.where(determined, system.landmark_hessian, 1.0), 0.0)
+
+
+def reduce(system: ArrowSystem) -> Reduced:
+    """Assemble the dense Hessian and the undamped Schur complement in node coordinates.
+
+    Cost: one product of `[r, s]` with its transpose a host, the rest is small matrices.
+    """
+    scaled = system.cross * inverse_landmark_hessian(system)[:, None, :]
+    products = jnp.einsum("nrs,nts->nrt", scaled, system.cross)[:, :-1, :-1]
+    schur, schur_gradient = _assemble_hosts(system, products)
+    hessian, gradient = _assemble_edges(system)
+    return Reduced(
+        hessian=hessian + system.prior_hessian,
+        gradient=gradient + system.prior_gradient,
+        schur=schur,
+        schur_gradient=schur_gradient,
+    )
+
+
+def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "n relative"]:
+    """Dense step in the coordinates of each host's cross terms: `(eta of each rank, shared)`."""
+    hosts, ranks = system.graph.of_host.shape
+    block = system.transport.shape[-1]
+    nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
+    eta = nodes[system.graph.target] - jnp.einsum("eab,eb->ea", system.transport, nodes[system.graph.source])
+    eta = jnp.concatenate([eta, jnp.zeros_like(eta[:1])])[system.graph.of_host]
+    return jnp.concatenate([eta.reshape(hosts, ranks * block), jnp.broadcast_to(shared, (hosts, len(shared)))], 1)
+
+
+def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> Float[Array, "n s"]:
+    """`W' dense + gradient * h`, in one pass over the cross terms."""
+    relative = to_relative(system, dense)
+    tail = jnp.broadcast_to(jnp.asarray([gradient, 0.0], dense.dtype), (len(relative), 2))
+    return jnp.einsum("nrs,nr->ns", system.cross, jnp.concatenate([relative, tail], 1))
+
+
+def back_substitute(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "n s"]:
+    """`-V^-1 (h + W' dense)`: the landmarks that minimise the undamped model at a given dense step."""
+    return -inverse_landmark_hessian(system) * couple(system, dense, 1.0)
+
+
+def multiply(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
+    """The undamped matrix times a vector (held coordinates as if free)."""
+    return ArrowVector(
+        dense=reduce(system).hessian @ vector.dense + carry_to_nodes(system, vector.landmarks),
+        landmarks=couple(system, vector.dense, 0.0) + system.landmark_hessian * vector.landmarks,
+    )
+
+
+def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "n s"]) -> Float[Array, " c"]:
+    """`W z`: landmark values carried to the dense coordinates."""
+    hosts, ranks = system.graph.of_host.shape
+    block = system.transport.shape[-1]
+    relative = jnp.einsum("nrs,ns->nr", system.cross, landmarks)[:, :-2]
+    eta = relative[:, : ranks * block].reshape(hosts, ranks, block)
+    eta = jnp.where(system.graph.of_host[..., None] < len(system.graph.source), eta, 0.0)
+    to_host = -jnp.einsum("nkab,nka->nb", _transports(system), eta)
+    nodes = jnp.zeros((hosts + 1, block), eta.dtype).at[system.graph.neighbours()].add(eta)[:-1]
+    return jnp.concatenate([(nodes + to_host).reshape(-1), relative[:, ranks * block :].sum(0)])
+
+
+def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Gradient of the dense coordinates and the diagonal of their Hessian (no landmark eliminated)."""
+    hessian, gradient = _assemble_edges(system)
+    return gradient + system.prior_gradient, jnp.diagonal(hessian + system.prior_hessian)
+
+
+def _transports(system: ArrowSystem) -> Float[Array, "n k b b"]:
+    """`A` of each rank of each host, zero where there is no edge."""
+    padded = jnp.concatenate([system.transport, jnp.zeros_like(system.transport[:1])])
+    return padded[system.graph.of_host]
+
+
+def _assemble_hosts(system: ArrowSystem, products: Float[Array, "n r r"]) -> Assembled:
+    """Carry each host's matrix from relative to node coordinates and add them all up."""
+    hosts, ranks = system.graph.of_host.shape
+    block = system.transport.shape[-1]
+    wide = ranks * block
+    transports = _transports(system).reshape(hosts, wide, block)
+    own = -jnp.einsum("nrw,nwb->nrb", products[:, :, :wide], transports)
+    corner = -jnp.einsum("nwa,nwb->nab", transports, own[:, :wide])
+    # Local order: neighbours (k blocks), the host itself, then shared coordinates and the gradient.
+    to_neighbour = jnp.swapaxes(own[:, :wide], 1, 2)
+    top = jnp.concatenate([products[:, :wide, :wide], own[:, :wide]], 2)
+    bottom = jnp.concatenate([to_neighbour, corner], 2)
+    local = jnp.concatenate([top, bottom], 1).reshape(hosts, ranks + 1, block, ranks + 1, block)
+    index = jnp.concatenate([system.graph.neighbours(), jnp.arange(hosts)[:, None]], 1)
+    blocks = jnp.zeros((hosts + 1, hosts + 1, block, block), products.dtype)
+    blocks = blocks.at[index[:, :, None], index[:, None, :]].add(local.transpose(0, 1, 3, 2, 4))[:-1, :-1]
+    border = jnp.concatenate([products[:, wide:, :wide], own[:, wide:]], 2)
+    border = border.reshape(hosts, -1, ranks + 1, block).transpose(0, 2, 3, 1)
+    borders = jnp.zeros((hosts + 1, block, border.shape[-1]), products.dtype).at[index].add(border)[:-1]
+    return _dense(blocks, borders, products[:, wide:, wide:].sum(0))
+
+
+def _assemble_edges(system: ArrowSystem) -> Assembled:
+    """Hessian and gradient of all edges in node coordinates."""
+    hosts = system.graph.of_host.shape[0]
+    block = system.transport.shape[-1]
+    source, target = system.graph.source, system.graph.target
+    eta, border = system.gram[:, :block, :block], system.gram[:, :block, block:]
+    own = jnp.einsum("eba,ebc,ecd->ead", system.transport, eta, system.transport)
+    mixed = -jnp.einsum("eab,ebc->eac", eta + system.twist, system.transport)
+    blocks = jnp.zeros((hosts, hosts, block, block), eta.dtype)
+    blocks = blocks.at[target, target].add(eta).at[source, source].add(own)
+    blocks = blocks.at[target, source].add(mixed).at[source, target].add(jnp.swapaxes(mixed, 1, 2))
+    borders = jnp.zeros((hosts, block, border.shape[-1]), eta.dtype).at[target].add(border)
+    borders = borders.at[source].add(-jnp.einsum("eba,ebc->eac", system.transport, border))
+    return _dense(blocks, borders, system.gram[:, block:, block:].sum(0))
+
+
+def _dense(blocks: Float[Array, "n n b b"], borders: Float[Array, "n b o"], corner: Float[Array, "o o"]) -> Assembled:
+    """Lay blocks out as one matrix; the last shared coordinate is the gradient, returned apart."""
+    nodes = blocks.shape[0] * blocks.shape[2]
+    square = blocks.transpose(0, 2, 1, 3).reshape(nodes, nodes)
+    border = borders.reshape(nodes, -1)
+    whole = jnp.block([[square, border], [border.T, corner]])
+    return whole[:-1, :-1], whole[:-1, -1]

@@ -1,0 +1,125 @@
+"""Robust kernels `rho(s)` of a squared, weighted residual norm `s`; the energy of a residual is `rho(s) / 2`.
+
+A kernel is normalised so that `rho(0) = 0` and `rho'(0) = 1`: near zero every kernel is the plain square.
+References: Huber 1964; Black & Anandan 1996; Barron, "A General and Adaptive Robust Loss Function", CVPR 2019.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+Values = Float[Array, "*n"]
+
+
+class AbstractKernel(eqx.Module):
+    """A robust kernel; `s` is the squared norm, any shape, `s >= 0`."""
+
+    @abc.abstractmethod
+    def rho(self, s: Values) -> Values:
+        """The kernel's value, same shape and unit as `s`."""
+
+    @abc.abstractmethod
+    def weight(self, s: Values) -> Values:
+        """The first derivative `rho'(s)`: the factor by which iteratively reweighted least squares scales `s`."""
+
+    @abc.abstractmethod
+    def curvature(self, s: Values) -> Values:
+        """The second derivative `rho''(s)`, never positive for the kernels of this file."""
+
+
+class Square(AbstractKernel):
+    """No robustness: `rho(s) = s`."""
+
+    def rho(self, s: Values) -> Values:
+        return s
+
+    def weight(self, s: Values) -> Values:
+        return jnp.ones_like(s)
+
+    def curvature(self, s: Values) -> Values:
+        return jnp.zeros_like(s)
+
+
+class Huber(AbstractKernel):
+    """`rho(s) = s` up to `delta^2`, then `2 delta sqrt(s) - delta^2`: outliers pull with a constant force."""
+
+    delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
+
+    def _root(self, s: Values) -> tuple[Bool[Array, "*n"], Values]:
+        """`sqrt(s)`, made safe below `delta` so that neither branch of `where` makes a NaN gradient."""
+        beyond = s > self.delta**2
+        return beyond, jnp.sqrt(jnp.where(beyond, s, 1.0))
+
+    def rho(self, s: Values) -> Values:
+        beyond, root = self._root(s)
+        return jnp.where(beyond, 2 * self.delta * root - self.delta**2, s)
+
+    def weight(self, s: Values) -> Values:
+        beyond, root = self._root(s)
+        return jnp.where(beyond, self.delta / root, 1.0)
+
+    def curvature(self, s: Values) -> Values:
+        beyond, root = self._root(s)
+        return jnp.where(beyond, -0.5 * self.delta / (root * root * root), 0.0)
+
+
+class Cauchy(AbstractKernel):
+    """`rho(s) = delta^2 log(1 + s / delta^2)`: the pull of an outlier falls with its distance."""
+
+    delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
+
+    def rho(self, s: Values) -> Values:
+        return self.delta**2 * jnp.log1p(s / self.delta**2)
+
+    def weight(self, s: Values) -> Values:
+        return 1 / (1 + s / self.delta**2)
+
+    def curvature(self, s: Values) -> Values:
+        return -1 / (self.delta * (1 + s / self.delta**2)) ** 2
+
+
+class GemanMcClure(AbstractKernel):
+    """`rho(s) = s / (1 + s / delta^2)`: redescending, bounded by `delta^2`."""
+
+    delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
+
+    def rho(self, s: Values) -> Values:
+        return s / (1 + s / self.delta**2)
+
+    def weight(self, s: Values) -> Values:
+        return 1 / (1 + s / self.delta**2) ** 2
+
+    def curvature(self, s: Values) -> Values:
+        return -2 / (self.delta**2 * (1 + s / self.delta**2) ** 3)
+
+
+class Barron(AbstractKernel):
+    """Barron's general kernel for a shape `alpha < 2`, `alpha != 0`; -2 is Geman-McClure, 1 a smooth Huber.
+
+    `rho(s) = (2 b delta^2 / alpha) ((s / (delta^2 b) + 1)^(alpha / 2) - 1)` with `b = 2 - alpha`
+    (Barron 2019, eq. 8, times 2, for `rho'(0) = 1`).
+    """
+
+    delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
+    alpha: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+
+    def _base(self, s: Values) -> tuple[Float[Array, ""], Values]:
+        breadth = self.delta**2 * (2 - self.alpha)
+        return breadth, s / breadth + 1
+
+    def rho(self, s: Values) -> Values:
+        breadth, _ = self._base(s)
+        # Not `base ** (alpha / 2) - 1`, which loses all digits of a small `s`.
+        return 2 * breadth / self.alpha * jnp.expm1(self.alpha / 2 * jnp.log1p(s / breadth))
+
+    def weight(self, s: Values) -> Values:
+        _, base = self._base(s)
+        return base ** (self.alpha / 2 - 1)
+
+    def curvature(self, s: Values) -> Values:
+        breadth, base = self._base(s)
+        return (self.alpha / 2 - 1) / breadth * base ** (self.alpha / 2 - 2)

@@ -1,0 +1,222 @@
+"""Levenberg-Marquardt for arrow-shaped problems, as an optimistix least-squares solver.
+
+An optimistix step linearises once, then tries dampings until one is accepted: a rejected try costs one factorisation
+of the reduced system, one back-substitution and one energy, never a linearisation. `iterations` counts the tries, as
+Ceres counts its iterations. Damping follows the gain ratio (Nielsen 1999; the rule and constants of Ceres).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_gradient
+from vggtgeo.solvers.problem import AbstractArrowProblem, Point
+from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+
+
+class Termination(eqx.Enumeration):
+    """Why the iteration ended; the message says what to do."""
+
+    running = "The iteration has not ended."
+    energy_converged = "Converged: the last accepted step lowered the energy by less than `rtol`, relatively."
+    gradient_converged = "Converged: the gradient vanished (nothing in the problem asks for a step)."
+    step_converged = "Converged: no step that can be told from zero in this precision lowers the energy."
+    max_iterations = (
+        "Not converged: `max_iterations` was reached. Start nearer to the solution or raise `max_iterations`."
+    )
+    nonfinite_input = (
+        "Failed: the energy of the initial state is not finite. Look for NaN or infinite poses, intrinsics, inverse "
+        "depths, targets or weights; the initial state was returned."
+    )
+
+
+CONVERGED = (Termination.energy_converged, Termination.gradient_converged, Termination.step_converged)
+
+
+_CODES: Any = Termination
+"""The same class; to a type checker its members would be the messages."""
+
+
+def termination_message(termination: Termination) -> str:
+    """Why the iteration ended and what to do, of a concrete code."""
+    message: str = _CODES[termination]
+    return message
+
+
+def termination_name(termination: Termination) -> str:
+    """Name of a concrete code, as `energy_converged`."""
+    return next(name for name, code in Termination._name_to_item.items() if termination == code)
+
+
+class LevenbergMarquardtState(eqx.Module):
+    """Loop state; `history[i]` is the energy after try i (NaN beyond the last)."""
+
+    energy: Float[Array, ""]
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]
+    iterations: Int[Array, ""]
+    linearisations: Int[Array, ""]
+    gradient_norm: Float[Array, ""]
+    history: Float[Array, " h"]
+    termination: Termination
+
+
+class _Try(eqx.Module):
+    point: Any
+    energy: Float[Array, ""]
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]
+    iterations: Int[Array, ""]
+    history: Float[Array, " h"]
+    accepted: Bool[Array, ""]
+    stuck: Bool[Array, ""]
+
+
+class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt with Schur elimination of the landmarks.
+
+    Use with `optimistix.least_squares(residuals, solver, y0, args=problem)`: `args` is an `AbstractArrowProblem`, `y0`
+    one of its points; the residual function is only asked for its shape.
+    """
+
+    rtol: float = 1e-9
+    """Relative decrease of the energy that ends the iteration."""
+    atol: float = 1e-12
+    """Gradient norm, in units of the scaled step, that ends the iteration."""
+    norm: Callable = optx.max_norm
+    max_iterations: int = 50
+    """Tries in all, accepted or not."""
+    initial_damping: float = 1e-4
+    max_damping: float = 1e12
+    min_damping: float = 1e-16
+    reduced_solver: AbstractReducedSolver = DenseCholesky()
+    differentiable_loop: bool = False
+    """Make the inner loop reverse-differentiable (bounded, slower), for unrolled differentiation."""
+
+    def init(
+        self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> LevenbergMarquardtState:
+        energy = args.energy(y)
+        finite = jnp.isfinite(energy)
+        history = jnp.full(self.max_iterations + 1, jnp.nan, energy.dtype).at[0].set(energy)
+        return LevenbergMarquardtState(
+            energy=energy,
+            damping=jnp.asarray(self.initial_damping, energy.dtype),
+            growth=jnp.asarray(2.0, energy.dtype),
+            iterations=jnp.asarray(0),
+            linearisations=jnp.asarray(0),
+            gradient_norm=jnp.asarray(jnp.inf, energy.dtype),
+            history=history,
+            termination=_CODES.where(finite, _CODES.running, _CODES.nonfinite_input),
+        )
+
+    def step(
+        self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, state: LevenbergMarquardtState, tags: Any
+    ) -> tuple[Any, LevenbergMarquardtState, None]:
+        system = args.linearise(y)
+        prepared = self.reduced_solver.prepare(system)
+
+        def attempt(trial: _Try) -> _Try:
+            step, predicted = self.reduced_solver.step(system, prepared, trial.damping)
+            return self._judge(args, y, state.energy, trial, step, predicted)
+
+        first = _Try(y, state.energy, state.damping, state.growth, state.iterations, state.history, *_both_false())
+        last = self._loop(attempt, first)
+        gradient_norm = _gradient_norm(system)
+        new = LevenbergMarquardtState(
+            energy=last.energy,
+            damping=last.damping,
+            growth=last.growth,
+            iterations=last.iterations,
+            linearisations=state.linearisations + 1,
+            gradient_norm=gradient_norm,
+            history=last.history,
+            termination=self._terminate(state.energy, last, gradient_norm),
+        )
+        return last.point, new, None
+
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: LevenbergMarquardtState, tags: Any
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        results: Any = optx.RESULTS
+        return state.termination != _CODES.running, results.successful
+
+    def postprocess(
+        self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        return y, aux, {}
+
+    def _loop(self, attempt: Callable[[_Try], _Try], first: _Try) -> _Try:
+        go_on: Callable[[_Try], Any] = lambda trial: (
+            ~(trial.accepted | trial.stuck) & (trial.iterations < self.max_iterations)
+        )
+        if not self.differentiable_loop:
+            return jax.lax.while_loop(go_on, attempt, first)
+        bounded: _Try = eqxi.while_loop(go_on, attempt, first, max_steps=8, kind="bounded")
+        return bounded
+
+    def _judge(
+        self,
+        problem: AbstractArrowProblem[Point],
+        point: Point,
+        energy: Float[Array, ""],
+        trial: _Try,
+        step: ArrowVector,
+        predicted: Float[Array, ""],
+    ) -> _Try:
+        """Take the step if it keeps its promise, else shrink the trust region."""
+        candidate = problem.retract(point, step)
+        new_energy = problem.energy(candidate)
+        gain = (energy - new_energy) / jnp.where(predicted > 0, predicted, 1.0)
+        accepted = jnp.isfinite(new_energy) & (predicted > 0) & (gain > 1e-3)
+        shrink = jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
+        damping = jnp.where(accepted, trial.damping * shrink, trial.damping * trial.growth)
+        iterations = trial.iterations + 1
+        kept = jnp.where(accepted, new_energy, energy)
+        return _Try(
+            point=jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, point),
+            energy=kept,
+            damping=jnp.clip(damping, self.min_damping, self.max_damping),
+            growth=jnp.where(accepted, 2.0, trial.growth * 2),
+            iterations=iterations,
+            history=trial.history.at[iterations].set(kept),
+            accepted=accepted,
+            stuck=~accepted & (_negligible(predicted, energy) | (damping > self.max_damping)),
+        )
+
+    def _terminate(self, energy: Float[Array, ""], last: _Try, gradient_norm: Float[Array, ""]) -> Termination:
+        small = last.accepted & (energy - last.energy <= self.rtol * energy)
+        options = [
+            (last.iterations >= self.max_iterations, _CODES.max_iterations),
+            (small, _CODES.energy_converged),
+            (last.stuck, _CODES.step_converged),
+            (gradient_norm <= self.atol, _CODES.gradient_converged),
+        ]
+        termination: Termination = _CODES.running
+        for happened, code in options:
+            termination = _CODES.where(happened, code, termination)
+        return termination
+
+
+def _both_false() -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    return jnp.asarray(False), jnp.asarray(False)
+
+
+def _negligible(predicted: Float[Array, ""], energy: Float[Array, ""]) -> Bool[Array, ""]:
+    """The model itself promises less than the energy's last digits."""
+    return jnp.isfinite(predicted) & (jnp.abs(predicted) <= jnp.finfo(energy.dtype).eps * energy)
+
+
+def _gradient_norm(system: ArrowSystem) -> Float[Array, ""]:
+    """Largest gradient entry, each scaled by the root of its own curvature (the unit of `sqrt(energy)`)."""
+    scaled = lambda gradient, curvature: gradient * jax.lax.rsqrt(jnp.where(curvature > 0, curvature, jnp.inf))
+    landmarks = scaled(system.landmark_gradient, system.landmark_hessian)
+    dense = jnp.where(system.free, scaled(*dense_gradient(system)), 0.0)
+    return jnp.maximum(jnp.max(jnp.abs(landmarks), initial=0.0), jnp.max(jnp.abs(dense), initial=0.0))

@@ -1,0 +1,40 @@
+"""What the arrow solvers ask of a problem. An implementation is a pytree: its leaves are what can be differentiated."""
+
+from __future__ import annotations
+
+import abc
+from typing import Generic, TypeVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
+
+Point = TypeVar("Point")
+
+
+class AbstractArrowProblem(eqx.Module, Generic[Point]):
+    """A sum of robustified squares over a manifold whose second derivatives have the arrow shape of `arrow.py`."""
+
+    @abc.abstractmethod
+    def energy(self, point: Point) -> Float[Array, ""]:
+        """The energy to minimise."""
+
+    @abc.abstractmethod
+    def linearise(self, point: Point) -> ArrowSystem:
+        """Exact gradient and the Gauss-Newton (reweighted) approximation of the Hessian at `point`."""
+
+    @abc.abstractmethod
+    def hessian(self, point: Point) -> ArrowSystem:
+        """Exact gradient and exact Hessian at `point`, in the coordinates of `retract`."""
+
+    @abc.abstractmethod
+    def retract(self, point: Point, step: ArrowVector) -> Point:
+        """Move on the manifold; a zero step is the identity and the derivative there is the tangent map."""
+
+    @abc.abstractmethod
+    def hold(self, point: Point, initial: Point) -> Point:
+        """`point` with every held coordinate taken from `initial`."""
+
+    @abc.abstractmethod
+    def zero_step(self, point: Point) -> ArrowVector:
+        """The zero of the tangent space at `point`."""

@@ -1,0 +1,36 @@
+"""What all tests share: JAX's global flags, checks of shapes and types, and where the real clips lie."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared"
+
+jax.config.update("jax_enable_x64", True)  # oracles need it; a test of float32 says so in its arrays
+# From here on every annotated function of the package checks its arguments and results; see typechecker.py.
+install_import_hook("vggtgeo", "typechecker.check")
+
+
+def _shared(folder: str) -> Path:
+    path = SHARED / folder
+    if not path.is_dir():
+        pytest.skip(f"needs `../shared/{folder}` beside the repository, which is not there")
+    return path
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of the real clips (`redkitchen/`, `corridor-office/`), or a skip."""
+    return _shared("data")
+
+
+@pytest.fixture(scope="session")
+def shared_bench() -> Path:
+    """The folder of the benchmark problems and their numpy oracle (`problems.py`), or a skip."""
+    return _shared("bench")

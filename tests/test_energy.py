@@ -1,0 +1,137 @@
+"""The energy: its readable and its fast form against sums written out in numpy, and its blindness to padding."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scenes import Scene, make_scene, matrix
+
+from vggtgeo.bundle_adjustment import BundleAdjustment
+from vggtgeo.energy import EnergyTerms, energy_terms
+from vggtgeo.packing import PaddedSize
+from vggtgeo.problem import Problem, State
+
+NOISY = make_scene(noise=0.7, outliers=0.2, depth_error=0.1, seed=1)
+
+
+def huber(s: float, delta: float = 1.5) -> float:
+    return s if s <= delta**2 else 2 * delta * s**0.5 - delta**2
+
+
+def numpy_terms(scene: Scene) -> EnergyTerms:
+    """Every observation of the scene at its start with the true intrinsics, one at a time, from the flat lists."""
+    seen, (rotation, translation) = scene.observations, matrix(scene.start_poses)
+    fx, fy, cx, cy = scene.intrinsics
+
+    def projection(edge: int, landmark: int) -> np.ndarray:
+        i, j = seen.edges[edge]
+        u, v = seen.pixel[landmark]
+        host = np.array([(u - cx) / fx, (v - cy) / fy, 1.0]) / scene.start_inverse_depth[landmark]
+        x, y, z = rotation[j] @ (rotation[i].T @ (host - translation[i])) + translation[j]
+        return np.array([fx * x / z + cx, fy * y / z + cy])
+
+    points = [
+        huber(weight * np.sum((projection(edge, landmark) - target) ** 2))
+        for edge, landmark, target, weight in zip(
+            seen.point_edge, seen.point_landmark, seen.point_target, seen.point_weight, strict=True
+        )
+    ]
+    lines = [
+        huber(weight * (abc[:2] @ projection(edge, landmark) + abc[2]) ** 2)
+        for edge, landmark, abc, weight in zip(
+            seen.line_edge, seen.line_landmark, seen.line_coefficients, seen.line_weight, strict=True
+        )
+    ]
+    offset = (scene.start_inverse_depth - seen.depth_mean) / seen.depth_sigma
+    depth = [huber(s) for s in seen.alpha * seen.depth_weight * offset**2]
+    intrinsics = ((scene.intrinsics - scene.start_intrinsics) / 5.0) ** 2
+    return EnergyTerms(*(np.sum(kind) / 2 for kind in (points, lines, depth, intrinsics)), 0.0)
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    terms: EnergyTerms
+    fast: float
+    by_pose: np.ndarray
+    by_depth: np.ndarray
+
+
+def evaluate(scene: Scene, size: PaddedSize | None) -> Evaluated:
+    """Energies and the gradient of the readable form, per keyframe and per landmark."""
+    problem, state, index = scene.pack(size=size)
+    intrinsics = jnp.asarray(scene.intrinsics)
+
+    def total(poses: jax.Array, depth: jax.Array) -> tuple[jax.Array, EnergyTerms]:
+        terms = energy_terms(problem, State(jaxlie.SE3(poses), intrinsics, depth))
+        return sum(terms, jnp.zeros(())), terms
+
+    gradient, terms = jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))(state.poses.wxyz_xyz, state.inverse_depth)
+    fast = jax.jit(lambda problem, state: BundleAdjustment(problem).energy(state))(
+        problem, State(state.poses, intrinsics, state.inverse_depth)
+    )
+    poses = np.asarray(gradient[0])[: len(scene.poses)]
+    return Evaluated(EnergyTerms(*map(float, terms)), float(fast), poses, index.gather(gradient[1]))
+
+
+@pytest.fixture(scope="module")
+def tight() -> Evaluated:
+    return evaluate(NOISY, None)
+
+
+def test_energy_is_the_sum_written_out(tight: Evaluated) -> None:
+    # Proves each term of the energy: points, lines and depths, on both branches of Huber. Oracle: loops in numpy.
+    expected = numpy_terms(NOISY)
+    for name, found, oracle in zip(EnergyTerms._fields, tight.terms, expected, strict=True):
+        assert found == pytest.approx(oracle, rel=1e-11, abs=1e-12), name
+    assert min(expected[:4]) > 1.0
+    assert expected.points > len(NOISY.observations.point_edge) * huber(1.5**2) / 2  # the linear branch matters
+
+
+def test_the_fast_energy_is_the_same(tight: Evaluated) -> None:
+    # Proves that the solver minimises the readable energy. Oracle: `energy_terms`.
+    assert tight.fast == pytest.approx(sum(tight.terms), rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    "size",
+    [PaddedSize(3, 9, 5, 3), PaddedSize(5, 6, 3, 4)],
+    ids=["slots and edges", "keyframes and edges"],
+)
+def test_padding_changes_nothing(tight: Evaluated, size: PaddedSize) -> None:
+    # Proves that empty slots, edges and keyframes change neither energy nor gradient. Oracle: the tight packing.
+    padded = evaluate(NOISY, size)
+    assert padded.fast == pytest.approx(tight.fast, rel=1e-13)
+    assert padded.terms == pytest.approx(tight.terms, rel=1e-13)
+    scale = np.abs(tight.by_depth).max()
+    np.testing.assert_allclose(padded.by_depth, tight.by_depth, atol=1e-12 * scale)
+    np.testing.assert_allclose(padded.by_pose, tight.by_pose, atol=1e-12 * np.abs(tight.by_pose).max())
+
+
+def test_absent_observations_may_hold_anything() -> None:
+    # Proves that NaN behind a zero weight reaches neither the value nor the gradient. Oracle: zeros there instead.
+    problem, state, _ = NOISY.pack(size=PaddedSize(3, 9, 5, 3))
+    nan_where = lambda values, weight: jnp.where(weight > 0, values, jnp.nan)
+    spoilt = Problem(
+        **{
+            **vars(problem),
+            "points": type(problem.points)(
+                nan_where(problem.points.target, problem.points.weight[..., None]), problem.points.weight
+            ),
+            "lines": type(problem.lines)(
+                nan_where(problem.lines.coefficients, problem.lines.weight[..., None]), problem.lines.weight
+            ),
+        }
+    )
+    total = lambda problem, depth: sum(
+        energy_terms(problem, State(state.poses, state.intrinsics, depth)), jnp.zeros(())
+    )
+    both = jax.jit(jax.value_and_grad(total, argnums=1))
+    clean_value, clean_gradient = both(problem, state.inverse_depth)
+    value, gradient = both(spoilt, state.inverse_depth)
+    fast = jax.jit(lambda problem, state: BundleAdjustment(problem).energy(state))(spoilt, state)
+    assert float(value) == float(clean_value)
+    assert float(fast) == pytest.approx(float(clean_value), rel=1e-13)
+    np.testing.assert_array_equal(gradient, clean_gradient)

@@ -1,0 +1,79 @@
+"""`vggtgeo evaluate`: what it prints is what the metrics say."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_sequences as tiny
+import typer
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from vggtgeo.cli.evaluate import evaluate
+from vggtgeo.datasets import open_sequence
+from vggtgeo.errors import InputError
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.trajectory import Trajectory
+
+app = typer.Typer()
+app.command()(evaluate)
+
+
+def _files(folder: Path) -> tuple[Path, Path]:
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(30, 3)).cumsum(axis=0)
+    noisy = poses.copy()
+    noisy[:, :3, 3] += rng.normal(scale=0.05, size=(30, 3))
+    noisy[:, :3, :3] = Rotation.from_rotvec(rng.normal(scale=0.02, size=(30, 3))).as_matrix()
+    times = np.arange(30) / 10.0
+    Trajectory(times, noisy).save_tum(folder / "trajectory.txt")
+    Trajectory(times, poses).save_tum(folder / "truth.txt")
+    return folder / "trajectory.txt", folder / "truth.txt"
+
+
+def _load(files: tuple[Path, Path]) -> tuple[Trajectory, Trajectory]:
+    return Trajectory.load_tum(files[0]), Trajectory.load_tum(files[1])
+
+
+def test_json_has_the_metrics(tmp_path: Path) -> None:
+    # Proves that the numbers printed are those of the metrics on the same files, with the options passed on.
+    files = _files(tmp_path)
+    result = CliRunner().invoke(app, [*map(str, files), "--json", "--delta", "3", "--all-pairs", "--max-dt", "0.02"])
+    assert result.exit_code == 0, result.output
+    expected = evaluate_trajectory(*_load(files), max_dt=0.02, delta=3, all_pairs=True)
+    assert json.loads(result.output) == json.loads(json.dumps(expected.as_dict()))
+
+
+def test_the_table_has_every_metric(tmp_path: Path) -> None:
+    # Proves that a person reads ATE after either alignment and RPE, in centimetres and degrees.
+    files = _files(tmp_path)
+    result = CliRunner().invoke(app, list(map(str, files)))
+    assert result.exit_code == 0, result.output
+    report = evaluate_trajectory(*_load(files))
+    for value in (report.se3.statistics.rmse, report.sim3.statistics.rmse):
+        assert f"{100 * value:.3f} cm" in result.output
+    assert f"{np.degrees(report.relative.rotation_statistics.rmse):.3f} deg" in result.output
+    assert "30 poses matched, of 30 estimated and 30 true" in " ".join(result.output.split())
+
+
+def test_folders_stand_for_their_trajectories(tmp_path: Path) -> None:
+    # Proves that a run's folder and a dataset's folder can be given. Oracle: a perfect estimate of a tiny dataset.
+    dataset = tiny.seven_scenes(tmp_path / "dataset", (0, 1, 2, 3))
+    truth = open_sequence(dataset).ground_truth()
+    assert truth is not None
+    truth.save_tum(tmp_path / "run" / "trajectory.txt")
+    result = CliRunner().invoke(app, [str(tmp_path / "run"), str(dataset), "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["ate_se3_m"]["rmse"] == pytest.approx(0.0, abs=1e-8)
+
+
+def test_what_the_user_gave_wrong_is_an_input_error(tmp_path: Path) -> None:
+    # Proves that bad input leaves as `InputError`, which the program's entry turns into one line, not a traceback.
+    estimate, _ = _files(tmp_path)
+    tiny.images(tmp_path / "images")
+    for truth, message in ((tmp_path / "no.txt", "is not there"), (tmp_path / "images", "has no truth")):
+        result = CliRunner().invoke(app, [str(estimate), str(truth)])
+        assert isinstance(result.exception, InputError)
+        assert message in str(result.exception)

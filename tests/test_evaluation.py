@@ -1,0 +1,239 @@
+"""Metrics against the `evo` package, closed forms and brute force."""
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.core import metrics, sync
+from evo.core.trajectory import PoseTrajectory3D
+from evo.core.units import Unit
+from scipy.spatial.transform import Rotation
+
+from vggtgeo.datasets import open_sequence
+from vggtgeo.errors import InputError
+from vggtgeo.evaluation import absolute_error, associate, evaluate_trajectory, relative_error, rotation_angle, umeyama
+from vggtgeo.trajectory import Trajectory
+
+TOLERANCE = 1e-9
+
+
+def _truth(count: int = 120, rate: float = 30.0, seed: int = 0) -> Trajectory:
+    """A smooth path with smooth turns, at an uneven clock."""
+    rng = np.random.default_rng(seed)
+    times = 100.0 + np.arange(count) / rate + rng.uniform(-0.2, 0.2, count) / rate
+    phase = times[:, None] * np.array([0.9, 1.3, 0.7]) + rng.uniform(0, 6, 3)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(np.sin(phase)).as_matrix()
+    poses[:, :3, 3] = np.cos(1.7 * phase) * [2.0, 0.5, 1.0]
+    return Trajectory(times, poses)
+
+
+def _estimate(truth: Trajectory, scale: float = 1.0, seed: int = 1) -> Trajectory:
+    """The truth with noise, drift, another clock, another frame, and another scale."""
+    rng = np.random.default_rng(seed)
+    count = len(truth)
+    poses = truth.poses.copy()
+    poses[:, :3, 3] += rng.normal(scale=0.02, size=(count, 3)) + np.linspace(0, 0.1, count)[:, None]
+    poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(rng.normal(scale=0.01, size=(count, 3))).as_matrix()
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
+    frame[:3, 3] = [5.0, -3.0, 1.0]
+    poses = frame @ poses
+    poses[:, :3, 3] *= scale
+    return Trajectory(truth.timestamps + rng.uniform(-0.004, 0.004, count), poses)
+
+
+def _evo(path: Path) -> PoseTrajectory3D:
+    rows = np.loadtxt(path, ndmin=2)
+    return PoseTrajectory3D(rows[:, 1:4], rows[:, [7, 4, 5, 6]], rows[:, 0])
+
+
+def _evo_pair(tmp_path: Path, estimate: Trajectory, truth: Trajectory, max_dt: float = 0.01) -> tuple:
+    estimate.save_tum(tmp_path / "estimate.txt")
+    truth.save_tum(tmp_path / "truth.txt")
+    return sync.associate_trajectories(_evo(tmp_path / "truth.txt"), _evo(tmp_path / "estimate.txt"), max_diff=max_dt)
+
+
+def _evo_statistics(metric: metrics.PE, truth: PoseTrajectory3D, estimate: PoseTrajectory3D) -> dict[str, float]:
+    metric.process_data((truth, estimate))
+    return metric.get_all_statistics()
+
+
+def _both_loaded(tmp_path: Path) -> tuple[Trajectory, Trajectory]:
+    return Trajectory.load_tum(tmp_path / "estimate.txt"), Trajectory.load_tum(tmp_path / "truth.txt")
+
+
+CASES = {
+    "same clock": (slice(None), slice(None)),
+    "longer truth": (slice(0, None, 3), slice(None)),
+    "longer estimate": (slice(None), slice(5, 90, 2)),
+    "parts": (slice(0, 80), slice(40, None)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("scale", [1.0, 3.7])
+def test_ate_agrees_with_evo(tmp_path: Path, case: str, scale: float) -> None:
+    # Proves that ATE (rmse, mean, median, max) after SE(3) and Sim(3) is evo's on the same files, to 1e-9.
+    full = _truth()
+    estimate, truth = _estimate(full, scale).select(CASES[case][0]), full.select(CASES[case][1])
+    reference, evo_estimate = _evo_pair(tmp_path, estimate, truth)
+    report = evaluate_trajectory(*_both_loaded(tmp_path))
+    assert report.matched == evo_estimate.num_poses
+    for with_scale, result in ((False, report.se3), (True, report.sim3)):
+        aligned = copy.deepcopy(evo_estimate)
+        aligned.align(reference, correct_scale=with_scale)
+        expected = _evo_statistics(metrics.APE(), reference, aligned)
+        found = result.statistics
+        errors = [
+            abs(found.rmse - expected["rmse"]),
+            abs(found.mean - expected["mean"]),
+            abs(found.median - expected["median"]),
+            abs(found.maximum - expected["max"]),
+        ]
+        assert max(errors) < TOLERANCE, f"differs from evo by {errors} (scale: {with_scale})"
+
+
+@pytest.mark.parametrize("delta", [1, 7])
+@pytest.mark.parametrize("all_pairs", [False, True])
+def test_rpe_agrees_with_evo(tmp_path: Path, delta: int, all_pairs: bool) -> None:
+    # Proves that RPE of translation and rotation, with either kind of pairs, is evo's on the same files, to 1e-9.
+    truth = _truth()
+    reference, evo_estimate = _evo_pair(tmp_path, _estimate(truth), truth)
+    found = evaluate_trajectory(*_both_loaded(tmp_path), delta=delta, all_pairs=all_pairs).relative
+    for relation, errors in (
+        (metrics.PoseRelation.translation_part, found.translation),
+        (metrics.PoseRelation.rotation_angle_rad, found.rotation),
+    ):
+        metric = metrics.RPE(relation, delta, Unit.frames, all_pairs=all_pairs)
+        metric.process_data((reference, evo_estimate))
+        error = np.abs(errors - metric.error).max()
+        assert error < TOLERANCE, f"{relation}: differs from evo by {error}"
+
+
+def test_rpe_after_sim3_agrees_with_evo(tmp_path: Path) -> None:
+    # Proves that the RPE of an estimate without scale, after its Sim(3) alignment, is evo's, to 1e-9.
+    truth = _truth()
+    reference, evo_estimate = _evo_pair(tmp_path, _estimate(truth, scale=0.2), truth)
+    evo_estimate.align(reference, correct_scale=True)
+    expected = _evo_statistics(metrics.RPE(), reference, evo_estimate)["rmse"]
+    found = evaluate_trajectory(*_both_loaded(tmp_path)).relative_sim3.translation_statistics.rmse
+    assert abs(found - expected) < TOLERANCE, f"{found} against evo's {expected}"
+
+
+@pytest.mark.parametrize("max_dt", [0.0, 0.002, 0.01, 0.05])
+@pytest.mark.parametrize("swap", [False, True])
+def test_association_agrees_with_evo(tmp_path: Path, max_dt: float, swap: bool) -> None:
+    # Proves that the same poses are matched as by evo, shorter and longer trajectories both ways round.
+    slow, fast = _truth(60, rate=20.0, seed=2), _truth(200, rate=70.0, seed=3)
+    times = slow.timestamps.copy()
+    times[30] = fast.timestamps[np.abs(fast.timestamps - times[30]).argmin()]  # one exact match
+    slow = Trajectory(times, slow.poses)
+    estimate, truth = (fast, slow) if swap else (slow, fast)
+    evo_truth, evo_estimate = _evo_pair(tmp_path, estimate, truth, max_dt)
+    found_estimate, found_truth = associate(*_both_loaded(tmp_path), max_dt)
+    np.testing.assert_allclose(found_estimate.positions, evo_estimate.positions_xyz, atol=TOLERANCE)
+    np.testing.assert_allclose(found_truth.positions, evo_truth.positions_xyz, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01, 250.0])
+def test_umeyama_finds_the_transform_that_was_applied(scale: float) -> None:
+    # Proves that a similarity is recovered from points it moved, a flat set included. Oracle: the similarity.
+    rng = np.random.default_rng(4)
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([3.0, -2.0, 9.0])
+    for flatness in (1.0, 0.0):
+        source = rng.normal(size=(30, 3)) * [1.0, 2.0, flatness]
+        found = umeyama(source, scale * source @ rotation.T + translation, with_scale=True)
+        error = max(np.abs(found.rotation - rotation).max(), abs(found.scale / scale - 1))
+        assert error < 1e-12, f"flatness {flatness}: off by {error}"
+        np.testing.assert_allclose(found.translation, translation, atol=1e-10)
+        assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+
+
+def test_a_mirrored_set_is_not_mirrored_back() -> None:
+    # Proves that the result is a rotation even where a reflection would fit better. Oracle: the determinant, and that
+    # no rotation near by fits better.
+    rng = np.random.default_rng(5)
+    source = rng.normal(size=(20, 3))
+    target = source * [1.0, 1.0, -1.0]
+    found = umeyama(source, target)
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+    best = np.sum((found.points(source) - target) ** 2)
+    for turn in Rotation.from_rotvec(rng.normal(scale=0.05, size=(50, 3))).as_matrix():
+        other = source @ (turn @ found.rotation).T
+        assert np.sum((other - other.mean(0) - target + target.mean(0)) ** 2) >= best
+
+
+def test_a_still_camera_has_an_ate() -> None:
+    # Proves that positions that all coincide (rotation and scale undetermined) give finite results. Oracle: the
+    # spread of the other set.
+    truth = _truth(20)
+    still = Trajectory(truth.timestamps, np.tile(np.eye(4), (20, 1, 1)))
+    spread = np.sqrt(((truth.positions - truth.positions.mean(0)) ** 2).sum(1).mean())
+    for with_scale in (False, True):
+        assert absolute_error(still, truth, with_scale).statistics.rmse == pytest.approx(spread)
+        assert absolute_error(still, still, with_scale).statistics.rmse == pytest.approx(0.0, abs=1e-12)
+
+
+def test_rotation_angle_is_accurate_at_both_ends() -> None:
+    # Proves the angle from 1e-9 rad to pi - 1e-9. Oracle: scipy's rotation vectors.
+    angles = np.array([0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-9])
+    axis = np.array([1.0, -2.0, 0.5]) / np.linalg.norm([1.0, -2.0, 0.5])
+    found = rotation_angle(Rotation.from_rotvec(angles[:, None] * axis).as_matrix())
+    assert np.abs(found - angles).max() < 1e-14 * 100, f"off by {np.abs(found - angles)}"
+
+
+def test_direction_error_knows_no_scale() -> None:
+    # Proves that the error of direction is the same at any scale, and NaN where the camera stood. Oracle: invariance.
+    truth, estimate = _truth(), _estimate(_truth())
+    found = [
+        relative_error(Trajectory(truth.timestamps, _scaled(estimate.poses, scale)), truth).direction
+        for scale in (1.0, 9.0)
+    ]
+    np.testing.assert_allclose(found[0], found[1], atol=1e-12)
+    assert np.median(found[0]) < 0.8
+    still = Trajectory(truth.timestamps, np.tile(np.eye(4), (len(truth), 1, 1)))
+    assert np.isnan(relative_error(still, truth).direction).all()
+
+
+def _scaled(poses: np.ndarray, scale: float) -> np.ndarray:
+    result = poses.copy()
+    result[:, :3, 3] *= scale
+    return result
+
+
+def test_what_cannot_be_compared_is_said() -> None:
+    # Proves the errors: no common time, too few poses, other lengths, impossible tolerances.
+    truth = _truth(30)
+    later = Trajectory(truth.timestamps + 500.0, truth.poses)
+    with pytest.raises(InputError, match=r"no pose of the two trajectories matches.*same clock"):
+        associate(truth, later)
+    with pytest.raises(InputError, match=r"2 poses match.*at least 3"):
+        evaluate_trajectory(truth.select(slice(0, 2)), truth)
+    with pytest.raises(InputError, match="`max_dt` is nan"):
+        associate(truth, truth, max_dt=np.nan)
+    with pytest.raises(InputError, match="`delta` is 0"):
+        relative_error(truth, truth, delta=0)
+    with pytest.raises(InputError, match="match them first"):
+        absolute_error(truth, truth.select(slice(0, 5)))
+    with pytest.raises(InputError, match="NaN"):
+        umeyama(np.full((4, 3), np.nan), np.zeros((4, 3)))
+
+
+def test_a_delta_beyond_the_trajectory_gives_no_pairs() -> None:
+    # Proves that a delta longer than the trajectory is nothing to measure, not a crash; the report has None for it.
+    truth = _truth(10)
+    report = evaluate_trajectory(truth, truth, delta=50)
+    assert report.relative.translation_statistics.count == 0
+    assert report.as_dict()["rpe_translation_m"]["rmse"] is None
+
+
+def test_two_published_truths_of_a_clip(shared_data: Path) -> None:
+    # Proves association, alignment and ATE on real files: COLMAP against the published poses, 5.0 cm after Sim(3).
+    estimate = Trajectory.load_tum(shared_data / "redkitchen" / "reference-colmap.txt")
+    truth = open_sequence(shared_data / "redkitchen").ground_truth()
+    assert truth is not None
+    report = evaluate_trajectory(estimate, truth)
+    assert report.matched == 500
+    assert report.sim3.statistics.rmse == pytest.approx(0.0502, abs=1e-4)

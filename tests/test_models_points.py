@@ -1,0 +1,200 @@
+"""Point matches: descriptors, nearest neighbours, verification, sub-pixel refinement."""
+
+import numpy as np
+import plane_views as views
+import pytest
+from vggtgeo.models import roles
+from vggtgeo.models.classical import EpipolarVerifier, OrbMatcher, PatchAlignment, SiftMatcher
+from vggtgeo.models.classical.key_points import spread
+from vggtgeo.models.classical.nearest import exclude_far, mutual_nearest
+
+MATCHERS = {"sift": SiftMatcher(count=500), "orb": OrbMatcher(count=500)}
+MOTION = views.pose((3.0, -4.0, 6.0), (0.15, -0.1, 0.1))
+
+
+def _errors(matches: roles.PointMatches, homography: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(views.move(homography, matches.pixels_i) - matches.pixels_j, axis=1)
+
+
+@pytest.mark.parametrize(("name", "median"), [("sift", 0.15), ("orb", 0.8)])
+def test_matches_follow_the_known_motion(name: str, median: float) -> None:
+    # Proves that matches of a moved plane lie where its homography says, all over the image. Oracle: the homography.
+    first, second, homography = views.plane_pair(MOTION)
+    matcher: roles.PointMatcher = MATCHERS[name]
+    matches = matcher.match(matcher.describe(first), matcher.describe(second))
+    errors = _errors(matches, homography)
+    measured = (
+        f"{name}: {len(matches)} matches, median error {np.median(errors):.3f} px, {np.mean(errors > 3):.1%} wrong"
+    )
+    assert len(matches) > 100, measured
+    assert np.median(errors) < median, measured
+    assert np.mean(errors > 3) < 0.03, measured
+    assert len(np.unique(matches.index_i)) == len(matches), measured
+    quarters = (matches.pixels_i > np.array(views.SIZE) / 2) @ [1, 2]
+    assert np.bincount(quarters, minlength=4).min() > 10, measured
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_confident_matches_are_better(name: str) -> None:
+    # Proves that confidence orders matches by error. Oracle: errors against the known homography, with image noise.
+    first, second, homography = views.plane_pair(MOTION)
+    generator = np.random.default_rng(0)
+    noisy = np.clip(second + generator.normal(0, 12, second.shape), 0, 255).astype(np.uint8)
+    matcher = MATCHERS[name]
+    matches = matcher.match(matcher.describe(first), matcher.describe(noisy))
+    errors = _errors(matches, homography)
+    half = matches.confidence > np.median(matches.confidence)
+    measured = (
+        f"{name}: mean error {errors[half].mean():.3f} px where confident, {errors[~half].mean():.3f} px elsewhere"
+    )
+    assert errors[half].mean() < errors[~half].mean(), measured
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_blank_images_have_no_matches(name: str) -> None:
+    # Proves that images without texture give empty answers, never an exception. Oracle: there is nothing to find.
+    matcher = MATCHERS[name]
+    blank = [matcher.describe(np.full((240, 320, 3), grey, np.uint8)) for grey in (0, 128)]
+    full = matcher.describe(views.plane_pair(MOTION)[0])
+    assert len(blank[0]) == len(blank[1]) == 0
+    for pair in ((blank[0], blank[1]), (blank[0], full), (full, blank[0])):
+        assert len(matcher.match(*pair)) == 0
+    assert len(matcher.match(blank[0], full, np.zeros((0, 2)))) == 0
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_unrelated_images_have_almost_no_matches(name: str) -> None:
+    # Proves that verification rejects chance matches. Oracle: two textures that share nothing.
+    matcher = MATCHERS[name]
+    first, second = (matcher.describe(views.plane_pair(MOTION, seed)[0]) for seed in (0, 1))
+    assert len(matcher.match(first, second)) < 20
+
+
+def test_shrinking_for_detection_moves_no_key_point() -> None:
+    # Proves that key points of a shrunk image have no offset. Oracle: key points of the image as it is.
+    image = views.texture(5, (401, 301))
+    full, shrunk = (SiftMatcher(area=area).describe(image).pixels for area in (400_000, 60_000))
+    gap = shrunk[:, None] - full
+    nearest = np.take_along_axis(gap, np.linalg.norm(gap, axis=2).argmin(axis=1)[:, None, None], axis=1)[:, 0]
+    offset = np.median(nearest[np.linalg.norm(nearest, axis=1) < 1.0], axis=0)
+    assert np.abs(offset).max() < 0.03, f"median offset {offset} px"
+
+
+def test_a_prediction_resolves_repeated_texture() -> None:
+    # Proves that a predicted place recovers matches the ratio test rejects. Oracle: a picture made of two equal halves.
+    half = views.texture(3, (160, 240))
+    picture = np.concatenate([half, half], axis=1)
+    generator = np.random.default_rng(0)
+    noisy = np.clip(picture + generator.normal(0, 8, picture.shape), 0, 255).astype(np.uint8)
+    matcher = SiftMatcher(radius=40.0, count=500)
+    first, second = matcher.describe(picture), matcher.describe(noisy)
+    alone = matcher.match(first, second)
+    guided = matcher.match(first, second, first.pixels + 5.0)
+    errors = np.linalg.norm(guided.pixels_i - guided.pixels_j, axis=1)
+    measured = f"{len(alone)} matches alone, {len(guided)} guided, of {len(first)}"
+    assert len(guided) > 150, measured
+    assert len(alone) < 0.7 * len(guided), measured
+    assert np.median(errors) < 0.3, measured
+
+
+def test_an_unknown_prediction_excludes_nothing() -> None:
+    # Proves that a row of NaN leaves its similarities alone. Oracle: the matrix before.
+    similarity = np.ones((2, 3), np.float32)
+    exclude_far(similarity, np.array([[np.nan, np.nan], [0.0, 0.0]]), np.array([[0.0, 1], [0, 5], [30, 0]]), 6.0)
+    np.testing.assert_array_equal(similarity, [[1, 1, 1], [1, 1, -np.inf]])
+
+
+def test_mutual_nearest_is_the_brute_force_answer() -> None:
+    # Proves mutual nearest neighbours with the ratio test. Oracle: Euclidean distances, two loops.
+    generator = np.random.default_rng(0)
+    first, second = (generator.normal(size=(n, 5)) for n in (40, 50))
+    first, second = (array / np.linalg.norm(array, axis=1, keepdims=True) for array in (first, second))
+    distance = np.linalg.norm(first[:, None] - second[None], axis=2)
+    expected = []
+    for i in range(40):
+        j = int(distance[i].argmin())
+        second_best = np.sort(distance[i])[1]
+        if distance[:, j].argmin() == i and distance[i, j] < 0.8 * second_best:
+            expected.append((i, j, distance[i, j] / second_best))
+    index_i, index_j, clarity = mutual_nearest(first @ second.T, 0.8)
+    assert len(expected) > 5
+    np.testing.assert_array_equal(np.stack([index_i, index_j], axis=1), [pair[:2] for pair in expected])
+    np.testing.assert_allclose(clarity, [pair[2] for pair in expected], rtol=1e-6)
+
+
+def test_spread_takes_the_best_of_every_cell_first() -> None:
+    # Proves that a poor corner keeps its key points. Oracle: the strongest point of each cell, found one by one.
+    generator = np.random.default_rng(1)
+    pixels = generator.uniform((0, 0), (320, 240), (500, 2))
+    scores = generator.uniform(0, 1, 500) + (pixels[:, 0] > 160)
+    chosen = spread(pixels, scores, 80, (320, 240), cells=10)
+    best: dict[tuple[int, int], int] = {}
+    for n, (x, y) in enumerate(pixels):
+        cell = (int(x // 32), int(y // 32))
+        if cell not in best or scores[n] > scores[best[cell]]:
+            best[cell] = n
+    assert len(best) == 80
+    assert set(chosen) == set(best.values())
+    np.testing.assert_array_equal(np.sort(spread(pixels, scores, 900, (320, 240))), np.arange(500))
+
+
+def _two_views(count: int, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    generator = np.random.default_rng(2)
+    points = views.cloud(count)
+    first, second = views.project(points, np.eye(4)), views.project(points, motion)
+    wrong = np.arange(count) % 3 == 0
+    second[wrong] = generator.uniform((0, 0), views.SIZE, (wrong.sum(), 2))
+    return first, second + generator.normal(0, 0.3, second.shape), ~wrong
+
+
+@pytest.mark.parametrize("intrinsics", [None, tuple(views.INTRINSICS)], ids=["fundamental", "essential"])
+@pytest.mark.parametrize("translation", [(0.3, 0.1, 0.1), (0.0, 0.0, 0.0)], ids=["moving", "turning"])
+def test_verification_separates_planted_outliers(intrinsics, translation) -> None:
+    # Proves that true matches pass and planted ones fail, also when the camera only turns. Oracle: which were planted.
+    first, second, right = _two_views(300, views.pose((2.0, 8.0, -3.0), translation))
+    inliers = EpipolarVerifier(intrinsics=intrinsics).inliers(first, second)
+    measured = f"kept {inliers[right].mean():.1%} of the right, {inliers[~right].mean():.1%} of the wrong"
+    assert inliers[right].mean() > 0.95, measured
+    assert inliers[~right].mean() < 0.15, measured
+
+
+@pytest.mark.parametrize(
+    "pixels", [np.zeros((0, 2)), np.ones((5, 2)), np.ones((50, 2))], ids=["none", "few", "one place"]
+)
+def test_verification_survives_degenerate_matches(pixels: np.ndarray) -> None:
+    # Proves that too few or coincident matches give a mask, never an exception. Oracle: the shape of the mask.
+    assert EpipolarVerifier().inliers(pixels, pixels).shape == (len(pixels),)
+
+
+def test_alignment_reduces_the_error_of_targets() -> None:
+    # Proves that photometric alignment brings shifted targets back. Oracle: the homography the images were made with.
+    first, second, homography = views.plane_pair(views.pose((1.0, 2.0, 2.0), (0.05, 0.0, 0.03)))
+    plain = SiftMatcher(count=300)
+    features = plain.describe(first), plain.describe(second)
+    matches = plain.match(*features)
+    shifted = matches.pixels_j + np.random.default_rng(0).normal(0, 0.5, (len(matches), 2))
+    gray = features[0].descriptors.gray, features[1].descriptors.gray
+    refined, _ = PatchAlignment().refine(*gray, matches.pixels_i, shifted)
+    truth = views.move(homography, matches.pixels_i)
+    before, after = (np.median(np.linalg.norm(pixels - truth, axis=1)) for pixels in (shifted, refined))
+    measured = f"median error {before:.3f} px before, {after:.3f} px after"
+    assert after < 0.2 * before, measured
+
+
+@pytest.mark.parametrize(
+    ("build", "name"),
+    [
+        (lambda: SiftMatcher(count=0), "count"),
+        (lambda: SiftMatcher(ratio=1.5), "ratio"),
+        (lambda: SiftMatcher(area=5), "area"),
+        (lambda: OrbMatcher(ratio=0.0), "ratio"),
+        (lambda: EpipolarVerifier(threshold=-1.0), "threshold"),
+        (lambda: EpipolarVerifier(least=3), "least"),
+        (lambda: SiftMatcher().describe(np.zeros((10, 10), np.uint8)), "image"),
+        (lambda: SiftMatcher().describe(np.zeros((10, 10, 3))), "image"),
+    ],
+)
+def test_wrong_arguments_are_named(build, name: str) -> None:
+    # Proves that a setting or an image out of range is refused by name. Oracle: the broken argument.
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        build()

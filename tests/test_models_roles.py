@@ -1,0 +1,67 @@
+"""The typed outputs of the roles refuse what no implementation may return."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from vggtgeo.models import roles
+
+INDEX = np.arange(3)
+PIXELS = np.zeros((3, 2))
+ONES = np.ones(3)
+IMAGE = np.zeros((4, 5, 3), np.uint8)
+MAP = np.ones((4, 5), np.float32)
+
+
+def _pose_query(**changes: Any) -> roles.PoseQuery:
+    fields: dict[str, Any] = {
+        "image": IMAGE,
+        "intrinsics": np.ones(4),
+        "points": np.ones((3, 3)),
+        "pixels": PIXELS,
+        "confidence": ONES,
+    }
+    return roles.PoseQuery(**(fields | changes))
+
+
+WRONG = {
+    "pixels": lambda: roles.Features(np.zeros((3, 3)), ONES),
+    "scores": lambda: roles.Features(PIXELS, np.ones(2)),
+    "pixels_j": lambda: roles.PointMatches(INDEX, INDEX, PIXELS, PIXELS * np.nan, ONES),
+    "index_i": lambda: roles.PointMatches(INDEX - 1, INDEX, PIXELS, PIXELS, ONES),
+    "index_j": lambda: roles.PointMatches(INDEX, INDEX - 2, PIXELS, PIXELS, ONES),
+    "confidence": lambda: roles.PointMatches(INDEX, INDEX, PIXELS, PIXELS, 2 * ONES),
+    "endpoints": lambda: roles.Segments(np.zeros((3, 4)), ONES),
+    "pose": lambda: roles.RelativeView(2 * np.eye(4), np.ones(4)),
+    "depths": lambda: roles.RelativeView(np.eye(4), np.ones(4), np.ones(3)),
+    "sigma_rel": lambda: roles.DepthEstimate(MAP, MAP, MAP[:2]),
+    "points": lambda: _pose_query(points=np.ones((3, 2))),
+    "predicted": lambda: _pose_query(predicted=np.zeros((4, 4))),
+    "window_images": lambda: _pose_query(window_images=(IMAGE,)),
+    "inliers": lambda: roles.StartGuess(
+        np.eye(4), np.ones((3, 3)), np.ones(2, bool), 0.1, roles.GeometryResult.SUCCESS
+    ),
+    "found": lambda: roles.WindowGuess(np.eye(4)[None], np.ones(4), MAP[None], MAP[None], np.ones(2, bool)),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_output_is_refused_by_name(name: str) -> None:
+    # Proves that an array of wrong shape, range or value raises an error that names it. Oracle: the broken argument.
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        WRONG[name]()
+
+
+def test_refined_targets_need_no_key_point() -> None:
+    # Proves that index_j = -1 (MASt3R's targets) is accepted and that select keeps rows together. Oracle: indexing.
+    matches = roles.PointMatches(INDEX, np.array([-1, 4, -1]), PIXELS + 1.0, PIXELS + 2.0, ONES * 0.5)
+    some = matches.select(np.array([True, False, True]))
+    assert len(some) == 2
+    np.testing.assert_array_equal(some.index_i, [0, 2])
+    np.testing.assert_array_equal(some.index_j, [-1, -1])
+
+
+@pytest.mark.parametrize("result", roles.GeometryResult)
+def test_every_result_says_what_it_means(result: roles.GeometryResult) -> None:
+    # Proves that no result code lacks its message. Oracle: the enumeration itself.
+    assert len(result.message) > 20

@@ -1,0 +1,96 @@
+"""A window placed by a model in its own frame and scale finds its way into the known world."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import plane_views as views
+import pytest
+from vggtgeo.models import roles
+from vggtgeo.models.classical import PnpGeometry
+from vggtgeo.models.roles import GeometryResult
+from vggtgeo.models.window_alignment import align_window
+from vggtgeo.models.window_locator import WindowLocator
+
+POSES = np.stack([views.pose((0, 3.0 * n, n), (-0.1 * n, 0.02 * n, 0.0)) for n in range(4)])
+IMAGES = tuple(np.full((4, 5, 3), n, np.uint8) for n in range(4))
+DEPTHS = tuple(np.full((4, 5), 2.0 + n, np.float32) for n in range(4))
+ELSEWHERE = views.pose((20.0, -50.0, 10.0), (1.0, 2.0, 3.0))
+SCALE = 0.3
+
+
+def _guess(found: Sequence[bool] = (True,) * 4, bad_depth: float = 0.0) -> roles.WindowGuess:
+    """The true window in another frame, 1 / SCALE smaller; `bad_depth` of each view's pixels are ten times off."""
+    poses = POSES @ ELSEWHERE
+    poses[:, :3, 3] *= SCALE
+    depth = np.stack(DEPTHS) * np.float32(SCALE)
+    confidence = np.ones_like(depth)
+    wrong = round(bad_depth * 20)
+    depth.reshape(4, -1)[:, :wrong] *= 10
+    confidence.reshape(4, -1)[:, :wrong] = 0.1
+    return roles.WindowGuess(poses, views.INTRINSICS, depth, confidence, np.array(found))
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A `WindowGeometry` that always answers the same."""
+
+    guess: roles.WindowGuess
+
+    def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> roles.WindowGuess:
+        return self.guess
+
+
+@pytest.mark.parametrize("depths", [(), DEPTHS[:3]], ids=["by distance", "by depth"])
+def test_a_window_comes_home(depths: tuple[np.ndarray, ...]) -> None:
+    # Proves scale, rotation and translation from three known views. Oracle: the world the window was taken from.
+    aligned = align_window(_guess(bad_depth=0.6 if depths else 0.0), POSES[:3], depths)
+    assert aligned is not None
+    np.testing.assert_allclose(aligned.poses, POSES, atol=1e-6)
+    np.testing.assert_allclose(aligned.depth[:, -1], np.stack(DEPTHS)[:, -1], rtol=1e-6)
+    assert aligned.metric
+
+
+def test_what_is_undetermined_is_none() -> None:
+    # Proves that no scale is invented. Oracle: one view, views never found, or a camera that stood still.
+    assert align_window(_guess(), POSES[:1]) is None
+    assert align_window(_guess(found=(False,) * 4), POSES[:3], DEPTHS[:3]) is None
+    assert align_window(_guess(), np.stack([POSES[0]] * 3)) is None
+
+
+def _query(points: np.ndarray, window: int = 3) -> roles.PoseQuery:
+    return roles.PoseQuery(
+        image=IMAGES[3],
+        intrinsics=views.INTRINSICS,
+        points=points,
+        pixels=views.project(points, POSES[3]),
+        confidence=np.ones(len(points)),
+        window_images=IMAGES[:window],
+        window_poses=tuple(POSES[:window]),
+        window_depths=DEPTHS[:window],
+    )
+
+
+def test_a_frame_without_matches_is_placed_by_the_model() -> None:
+    # Proves that the window model alone places a frame. Oracle: the frame's true pose.
+    locator: roles.InitialGeometry = WindowLocator(_Model(_guess()), PnpGeometry())
+    guess = locator.locate(_query(np.zeros((0, 3))))
+    assert guess.result is GeometryResult.SUCCESS
+    np.testing.assert_allclose(guess.pose, POSES[3], atol=1e-6)
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_matches_have_the_last_word(found: bool) -> None:
+    # Proves that the judge improves a poor window, and stands in for a failed one. Oracle: the frame's true pose.
+    guess = _guess(found=(True, True, True, found))
+    guess.poses[3, :3, 3] += 0.05
+    located = WindowLocator(_Model(guess), PnpGeometry()).locate(_query(views.cloud(80)))
+    assert located.result is GeometryResult.SUCCESS
+    np.testing.assert_allclose(located.pose, POSES[3], atol=1e-6)
+
+
+def test_without_keyframes_the_judge_works_alone() -> None:
+    # Proves that an empty window is no error. Oracle: the judge's own answer.
+    query = _query(views.cloud(80), window=0)
+    alone = PnpGeometry().locate(query)
+    np.testing.assert_array_equal(WindowLocator(_Model(_guess()), PnpGeometry()).locate(query).pose, alone.pose)

@@ -1,0 +1,95 @@
+"""The picture of a trajectory: what can be proved of it without looking."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vggtgeo import plots
+from vggtgeo.errors import InputError
+from vggtgeo.trajectory import Trajectory
+
+
+def _walk(count: int = 40) -> Trajectory:
+    """A level walk along x then z, looking ahead, the camera pitched down by 20 degrees; world y points down."""
+    half = count // 2
+    yaw = np.concatenate([np.full(half, np.pi / 2), np.linspace(np.pi / 2, -0.5, count - half)])
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("YX", np.column_stack([yaw, np.full(count, -0.35)])).as_matrix()
+    steps = np.column_stack([np.sin(yaw), np.zeros(count), np.cos(yaw)])
+    poses[:, :3, 3] = 0.2 * steps.cumsum(axis=0)
+    return Trajectory(np.arange(count) / 30.0, poses)
+
+
+def _turned(trajectory: Trajectory, seed: int) -> Trajectory:
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    return Trajectory(trajectory.timestamps, frame @ trajectory.poses)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_up_is_found_in_any_frame_although_the_camera_looks_down(seed: int) -> None:
+    # Proves that the views are level whatever the world frame. Oracle: the walk is level, so it has no height.
+    turned = _turned(_walk(), seed)
+    view = plots._view_axes(turned)
+    np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view) == pytest.approx(1.0)
+    heights = turned.positions @ view[2]
+    assert np.ptp(heights) < 0.02 * turned.length, f"a level walk rises by {np.ptp(heights):.3f} m"
+    assert (-turned.rotations[:, :, 1] @ view[2] > 0).all(), "up is down"
+
+
+def test_up_of_a_camera_that_never_turns_is_its_own() -> None:
+    # Proves that up is defined where image rows all have one direction. Oracle: the camera's own up direction.
+    turned = _turned(_walk().select(slice(0, 15)), 0)
+    np.testing.assert_allclose(plots._view_axes(turned)[2], -turned.rotations[0, :, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("with_truth", [False, True])
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_a_picture_is_written(tmp_path: Path, count: int, with_truth: bool) -> None:
+    # Proves that short and long trajectories, with and without truth, give a readable PNG with the colours of what
+    # must be seen. Oracle: the decoded picture.
+    walk = _walk()
+    estimate = walk.select(slice(0, count))
+    bent = walk.poses.copy()
+    bent[:, 0, 3] += 0.2 * np.sin(walk.timestamps * 5.0)
+    truth = _turned(Trajectory(walk.timestamps, bent), 0) if with_truth else None
+    plots.plot_trajectory(tmp_path / "trajectory.png", estimate, truth, estimate, title="a walk")
+    image = cv2.imread(str(tmp_path / "trajectory.png"))
+    assert image is not None
+    assert min(image.shape[:2]) > 300
+    if count == 40:
+        assert _has(image, plots._ESTIMATE)
+        assert _has(image, plots._TRUTH) or not with_truth
+
+
+def test_truth_without_common_times_is_left_out(tmp_path: Path) -> None:
+    # Proves that a truth that does not match costs the truth, not the picture.
+    walk = _walk()
+    later = Trajectory(walk.timestamps + 100.0, walk.poses)
+    plots.plot_trajectory(tmp_path / "trajectory.png", walk, later)
+    assert (tmp_path / "trajectory.png").stat().st_size > 1000
+
+
+def test_the_title_tells_the_error() -> None:
+    # Proves that the title has the ATE of the alignment it names. Oracle: a truth moved rigidly, and one scaled.
+    walk = _walk()
+    drawn = plots._align(walk, _turned(walk, 1), None, with_scale=False)
+    assert plots._title(drawn, "clip", with_scale=False) == "clip:  ATE 0.00 cm after SE(3) (40 poses)"
+    drawn = plots._align(walk, _turned(walk, 1), None, with_scale=True)
+    assert "after Sim(3)" in plots._title(drawn, "", with_scale=True)
+
+
+def test_an_empty_trajectory_is_refused(tmp_path: Path) -> None:
+    # Proves that nothing to draw is an error, and leaves no file.
+    with pytest.raises(InputError, match="`estimate` has no pose"):
+        plots.plot_trajectory(tmp_path / "trajectory.png", _walk().select(slice(0, 0)))
+    assert not list(tmp_path.iterdir())
+
+
+def _has(image: np.ndarray, colour: str) -> bool:
+    wanted = [int(colour[k : k + 2], 16) for k in (5, 3, 1)]
+    return bool((np.abs(image.astype(int) - wanted).max(axis=2) < 25).sum() > 100)

@@ -1,0 +1,60 @@
+"""Point clouds and their files."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vggtgeo.errors import InputError
+from vggtgeo.point_cloud import PointCloud
+
+
+def _cloud(count: int = 100) -> PointCloud:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(count, 3)).astype(np.float32)
+    return PointCloud(points, rng.integers(0, 256, (count, 3), dtype=np.uint8), rng.random(count, dtype=np.float32))
+
+
+def test_file_round_trip(tmp_path: Path) -> None:
+    # Proves that points, colours and confidence survive the file exactly. Oracle: the original.
+    cloud = _cloud()
+    cloud.save_ply(tmp_path / "map.ply")
+    loaded = PointCloud.load_ply(tmp_path / "map.ply")
+    np.testing.assert_array_equal(loaded.points, cloud.points)
+    np.testing.assert_array_equal(loaded.colours, cloud.colours)
+    assert loaded.confidence is not None
+    np.testing.assert_array_equal(loaded.confidence, cloud.confidence)
+
+
+def test_file_is_binary_and_as_viewers_expect(tmp_path: Path) -> None:
+    # Proves header, order and size of the fields. Oracle: the PLY format, read by hand.
+    cloud = PointCloud(np.array([[1.0, 2.0, 3.0]]), np.array([[10, 20, 30]], np.uint8))
+    cloud.save_ply(tmp_path / "map.ply")
+    header, _, body = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    fields = [f"property float {name}" for name in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    expected = ["ply", "format binary_little_endian 1.0", "element vertex 1", *fields]
+    assert header.decode().splitlines() == expected
+    assert np.frombuffer(body[:12], "<f4").tolist() == [1, 2, 3]
+    assert list(body[12:]) == [10, 20, 30]
+
+
+def test_an_empty_cloud_can_be_saved(tmp_path: Path) -> None:
+    # Proves that a run which mapped nothing still writes its file.
+    PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)).save_ply(tmp_path / "map.ply")
+    assert len(PointCloud.load_ply(tmp_path / "map.ply")) == 0
+
+
+def test_nan_never_reaches_a_map() -> None:
+    # Proves that a cloud with NaN is refused when it is made.
+    with pytest.raises(InputError, match="`points` has a NaN"):
+        PointCloud(np.full((1, 3), np.nan), np.zeros((1, 3), np.uint8))
+
+
+def test_what_is_no_cloud_is_named(tmp_path: Path) -> None:
+    # Proves the errors of a missing file and of one that is no PLY; nothing is left behind.
+    (tmp_path / "text.ply").write_text("hello")
+    for name in ("missing.ply", "text.ply"):
+        with pytest.raises(InputError, match=f"{name}` cannot be read as a PLY"):
+            PointCloud.load_ply(tmp_path / name)
+    assert os.listdir(tmp_path) == ["text.ply"]

@@ -1,0 +1,56 @@
+"""Bundle adjustment as an arrow problem: the bridge between `problem.py` and `solvers/`."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from vggtgeo import lie
+from vggtgeo.linearise import EdgeObservations, edge_observations, fast_energy, free_coordinates, linearise
+from vggtgeo.problem import Problem, State
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
+from vggtgeo.solvers.problem import AbstractArrowProblem
+
+MIN_SHRINK = 0.1
+"""An inverse depth falls at most to this fraction in one step, so it stays positive."""
+
+
+class BundleAdjustment(AbstractArrowProblem[State]):
+    """`problem` with its observations laid out for the solver."""
+
+    problem: Problem
+    observations: EdgeObservations
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self.observations = edge_observations(problem)
+
+    def energy(self, point: State) -> Float[Array, ""]:
+        return fast_energy(self.problem, self.observations, point)
+
+    def linearise(self, point: State) -> ArrowSystem:
+        return linearise(self.problem, self.observations, point)
+
+    def hessian(self, point: State) -> ArrowSystem:
+        return linearise(self.problem, self.observations, point, exact=True)
+
+    def retract(self, point: State, step: ArrowVector) -> State:
+        """Poses move by `exp(xi) T`, intrinsics and inverse depths by addition."""
+        return State(
+            poses=lie.move(point.poses, step.dense[:-4].reshape(-1, 6)),
+            intrinsics=point.intrinsics + step.dense[-4:],
+            inverse_depth=jnp.maximum(point.inverse_depth + step.landmarks, MIN_SHRINK * point.inverse_depth),
+        )
+
+    def hold(self, point: State, initial: State) -> State:
+        fixed_pose = self.problem.fixed_pose[:, None]
+        poses = jnp.where(fixed_pose, initial.poses.wxyz_xyz, point.poses.wxyz_xyz)
+        intrinsics = jnp.where(self.problem.fixed_intrinsics, initial.intrinsics, point.intrinsics)
+        return State(jaxlie.SE3(poses), intrinsics, point.inverse_depth)
+
+    def zero_step(self, point: State) -> ArrowVector:
+        return ArrowVector(
+            jnp.zeros(free_coordinates(self.problem).shape, point.inverse_depth.dtype),
+            jnp.zeros_like(point.inverse_depth),
+        )

@@ -1,0 +1,178 @@
+"""The camera: intrinsics, lens distortion, image size, and the way to an ideal pinhole image.
+
+Model (Brown-Conrady, as OpenCV has it). With `x = X / Z`, `y = Y / Z`, `r2 = x^2 + y^2`:
+
+    g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)
+    xd = x g + 2 p1 x y + p2 (r2 + 2 x^2)
+    yd = y g + p1 (r2 + 2 y^2) + 2 p2 x y
+    u  = fx xd + cx,   v = fy yd + cy
+
+with pixel (0, 0) at the centre of the top-left pixel. The geometry of the library knows the ideal pinhole
+(`xd = x`, `yd = y`) only, so images and depth of a lens with distortion are resampled once, on the way in.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Self
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from vggtgeo.errors import InputError
+
+GUESSED_FIELD_OF_VIEW = math.radians(60.0)
+"""Of the longer image side: between phones (about 70 deg) and narrower depth and headset cameras (57 deg)."""
+
+_DISTORTION_LENGTHS = (0, 4, 5, 8)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera with one set of intrinsics for the whole sequence.
+
+    Fields:
+        intrinsics: fx, fy, cx, cy in pixels; fx, fy > 0.
+        width, height: of the image, pixels.
+        distortion: k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order; () for none.
+        known: False for a starting guess, which is to be optimised and reported.
+
+    Raises InputError where a number is missing, not finite, or not positive where it must be.
+    """
+
+    intrinsics: tuple[float, float, float, float]
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+    known: bool = True
+
+    def __post_init__(self) -> None:
+        fx, fy, cx, cy = check_intrinsics(self.intrinsics)
+        object.__setattr__(self, "intrinsics", (fx, fy, cx, cy))
+        object.__setattr__(self, "distortion", check_distortion(self.distortion))
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"image size is {self.width} x {self.height}; both must be at least 1 pixel")
+
+    @classmethod
+    def guess(cls, width: int, height: int) -> Self:
+        """A starting guess for an unknown lens: 60 degrees across the longer side, centred, square pixels."""
+        focal = 0.5 * max(width, height) / math.tan(0.5 * GUESSED_FIELD_OF_VIEW)
+        centre = 0.5 * (width - 1), 0.5 * (height - 1)
+        return cls((focal, focal, *centre), width, height, known=False)
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """The calibration matrix K, float64, pixels."""
+        fx, fy, cx, cy = self.intrinsics
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def pinhole(self) -> Self:
+        """The ideal camera that undistorted images belong to: the same intrinsics, no distortion."""
+        return replace(self, distortion=())
+
+    def undistorter(self) -> "Undistorter":
+        """Prepares the maps from this camera's images to those of `pinhole`: make it once (40 ms for 640 x 480)."""
+        return Undistorter.of(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Undistorter:
+    """Resamples images and depth of a lens with distortion to the ideal pinhole of the same intrinsics.
+
+    Pixels that looked outside the original repeat its nearest border pixel (no artificial edge for detectors)
+    and have no depth; `valid` is False there. Without distortion, inputs are handed back as they are,
+    uncopied.
+
+    Fields:
+        camera: the ideal pinhole of what comes out.
+        valid: bool [H, W], or None where every pixel is valid.
+        maps: OpenCV's fixed-point maps for bilinear interpolation, or None for the identity.
+        nearest: int16 [H, W, 2] source pixel (x, y) for nearest-neighbour interpolation, or None.
+    """
+
+    camera: Camera
+    valid: Bool[np.ndarray, "h w"] | None = None
+    maps: tuple[np.ndarray, np.ndarray] | None = None
+    nearest: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, camera: Camera) -> Self:
+        """The undistorter of `camera`."""
+        if not any(camera.distortion):
+            return cls(camera.pinhole)
+        x, y = cv2.initUndistortRectifyMap(
+            camera.matrix,
+            np.array(camera.distortion),
+            np.eye(3),
+            camera.matrix,
+            (camera.width, camera.height),
+            cv2.CV_32FC1,
+        )
+        inside = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
+        maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
+        limits = np.iinfo(np.int16)
+        nearest = np.clip(np.rint(np.stack([x, y], axis=-1)), limits.min, limits.max).astype(np.int16)
+        return cls(camera.pinhole, None if inside.all() else inside, (maps[0], maps[1]), nearest)
+
+    def image(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """The undistorted image, bilinear."""
+        if self.maps is None:
+            return image
+        self._check_size(image)
+        return cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        """The undistorted depth (metres, NaN = none), nearest neighbour: no depth is made up between surfaces."""
+        if self.nearest is None:
+            return depth
+        self._check_size(depth)
+        nothing = np.empty(0, np.uint16)
+        return cv2.remap(
+            depth,
+            self.nearest,
+            nothing,
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(math.nan,) * 4,
+        )
+
+    def _check_size(self, image: np.ndarray) -> None:
+        height, width = image.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise InputError(
+                f"`image` is {width} x {height} pixels; the camera's images are "
+                f"{self.camera.width} x {self.camera.height}: give images of the calibrated size"
+            )
+
+
+def check_intrinsics(values: object) -> tuple[float, float, float, float]:
+    """`values` as fx, fy, cx, cy: four finite numbers, focal lengths positive; else InputError."""
+    numbers = _finite_numbers("intrinsics", values)
+    if len(numbers) != 4:
+        raise InputError(f"`intrinsics` has {len(numbers)} numbers; expected four: fx, fy, cx, cy in pixels")
+    fx, fy, cx, cy = numbers
+    if fx <= 0 or fy <= 0:
+        raise InputError(f"`intrinsics` has focal lengths {fx:g} and {fy:g} pixels; both must be positive")
+    return fx, fy, cx, cy
+
+
+def check_distortion(values: object) -> tuple[float, ...]:
+    """`values` as 0, 4, 5 or 8 finite distortion coefficients in OpenCV's order; else InputError."""
+    numbers = _finite_numbers("distortion", values)
+    if len(numbers) not in _DISTORTION_LENGTHS:
+        raise InputError(
+            f"`distortion` has {len(numbers)} coefficients; expected 0, 4 (k1, k2, p1, p2), 5 (and k3) "
+            "or 8 (and k4, k5, k6), in OpenCV's order"
+        )
+    return numbers
+
+
+def _finite_numbers(name: str, values: object) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(value) for value in values)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        raise InputError(f"`{name}` is {values!r}; it must be a sequence of numbers") from None
+    if not all(math.isfinite(number) for number in numbers):
+        raise InputError(f"`{name}` is {numbers}; every number must be finite")
+    return numbers

@@ -1,0 +1,70 @@
+"""`vggtgeo evaluate`: an estimated trajectory against the truth."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from vggtgeo.datasets import open_sequence
+from vggtgeo.errors import InputError
+from vggtgeo.evaluation import MAX_TIME_DIFFERENCE, ErrorStatistics, TrajectoryReport, evaluate_trajectory
+from vggtgeo.trajectory import Trajectory
+
+
+def evaluate(
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM format), or a run's output folder.")],
+    truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM format), or a dataset folder.")],
+    max_dt: Annotated[float, typer.Option(help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
+    delta: Annotated[int, typer.Option(help="Poses between the two of a pair, for RPE.")] = 1,
+    all_pairs: Annotated[bool, typer.Option(help="Overlapping pairs for RPE, not consecutive ones.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT."""
+    report = evaluate_trajectory(load_estimate(estimate), load_truth(truth), max_dt, delta, all_pairs)
+    if as_json:
+        typer.echo(json.dumps(report.as_dict(), indent=2))
+    else:
+        print_report(report)
+
+
+def load_estimate(path: Path) -> Trajectory:
+    """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`."""
+    return Trajectory.load_tum(path / "trajectory.txt" if path.is_dir() else path)
+
+
+def load_truth(path: Path) -> Trajectory:
+    """The trajectory in the file `path`, or the truth of the dataset in the folder `path`."""
+    if not path.is_dir():
+        return Trajectory.load_tum(path)
+    truth = open_sequence(path).ground_truth()
+    if truth is None:
+        raise InputError(f"`{path}` has no truth; give a trajectory in the TUM format")
+    return truth
+
+
+def print_report(report: TrajectoryReport) -> None:
+    """Prints the table that people read; `TrajectoryReport.as_dict` is what programs read."""
+    console = Console()
+    step = f"{report.relative.delta} pose{'s' if report.relative.delta > 1 else ''}"
+    console.print(
+        f"{report.matched} poses matched, of {report.estimated} estimated and {report.true} true; scale of the Sim(3) "
+        f"alignment {report.sim3.alignment.scale:.4f}; RPE over {step}",
+        soft_wrap=True,
+    )
+    table = Table("", "RMSE", "mean", "median", "max")
+    angles = ErrorStatistics.of(np.degrees(report.relative.rotation))
+    _add_row(table, "ATE, SE(3)", report.se3.statistics, 100, "cm")
+    _add_row(table, "ATE, Sim(3)", report.sim3.statistics, 100, "cm")
+    _add_row(table, "RPE translation", report.relative.translation_statistics, 100, "cm")
+    _add_row(table, "RPE translation, Sim(3)", report.relative_sim3.translation_statistics, 100, "cm")
+    _add_row(table, "RPE rotation", angles, 1, "deg")
+    console.print(table)
+
+
+def _add_row(table: Table, name: str, errors: ErrorStatistics, factor: float, unit: str) -> None:
+    values = (errors.rmse, errors.mean, errors.median, errors.maximum)
+    table.add_row(name, *(f"{factor * value:.3f} {unit}" if value == value else "-" for value in values))

@@ -1,0 +1,30 @@
+"""JAX's global settings for the program; a library call never touches them."""
+
+import os
+from pathlib import Path
+
+SHORTEST_CACHED_COMPILATION = 0.5
+"""Seconds: what compiles faster is not kept."""
+
+
+def set_jax_flags() -> None:
+    """64-bit numbers, and compiled code kept between runs; a setting of the user's environment wins.
+
+    Settings go through environment variables, which JAX reads when it is imported: most of `--help` never does.
+    """
+    os.environ.setdefault("JAX_ENABLE_X64", "1")
+    folder = cache_folder()
+    if folder is not None:
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(SHORTEST_CACHED_COMPILATION))
+
+
+def cache_folder() -> Path | None:
+    """`$XDG_CACHE_HOME/vggtgeo/jax` (`~/.cache/...` without that variable), or None where it cannot be written."""
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(base) / "vggtgeo" / "jax"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):
+        return None
+    return folder if os.access(folder, os.W_OK) else None

@@ -1,0 +1,138 @@
+"""The program `vggtgeo`: its commands, each loaded when it is called, and what it says when something is wrong."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import warnings
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple, NoReturn, TextIO
+
+import typer
+from typer.core import TyperGroup
+
+from vggtgeo.cli.jax_flags import set_jax_flags
+from vggtgeo.errors import InputError, InputWarning
+
+EXIT_INPUT = 2
+EXIT_INTERNAL = 1
+EXIT_INTERRUPTED = 130
+
+
+class CommandEntry(NamedTuple):
+    """A command before it is loaded: the function `name` (`-` as `_`) of `module` is its implementation."""
+
+    name: str
+    module: str
+    summary: str
+    """First line of the function's docstring, repeated here so that `--help` need not load it."""
+
+
+COMMANDS = (
+    CommandEntry("run", "vggtgeo.cli.run", "Estimate trajectory and map of the sequence at PATH."),
+    CommandEntry("demo", "vggtgeo.cli.demo", "Run on a synthetic room with exact truth, rendered on the spot."),
+    CommandEntry(
+        "evaluate", "vggtgeo.cli.evaluate", "Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT."
+    ),
+    CommandEntry("solve", "vggtgeo.cli.solve", "Solve the bundle-adjustment problem in PROBLEM."),
+    CommandEntry(
+        "simulate",
+        "vggtgeo.cli.simulate",
+        "Render a hand-held walk through SCENE as a TUM RGB-D folder with exact truth.",
+    ),
+)
+
+
+class _LazyGroup(TyperGroup):
+    """Lists stand-ins of its commands, and loads the one that is called."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        name, stand_in, rest = super().resolve_command(ctx, args)
+        entry = next((entry for entry in COMMANDS if entry.name == name), None)
+        return name, load_command(entry) if entry else stand_in, rest
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (typer.Exit, typer.Abort, BrokenPipeError):
+            raise
+        except (Exception, KeyboardInterrupt) as error:
+            if ctx.params.get("debug") or _is_usage_error(error):
+                raise
+            _leave(error)
+
+
+def load_command(entry: CommandEntry) -> Any:
+    """The command itself, made of the annotated function that implements it."""
+    function = getattr(importlib.import_module(entry.module), entry.name.replace("-", "_"))
+    single = typer.Typer(add_completion=False)
+    single.command(entry.name)(function)
+    return typer.main.get_command(single)
+
+
+def _is_usage_error(error: BaseException) -> bool:
+    """Whether typer itself prints this error (a wrong option, say), with the command's usage."""
+    return callable(getattr(error, "show", None)) and hasattr(error, "exit_code")
+
+
+def _leave(error: BaseException) -> NoReturn:
+    """End the program with one line on stderr."""
+    if isinstance(error, KeyboardInterrupt):
+        message, code = "interrupted", EXIT_INTERRUPTED
+    elif isinstance(error, InputError | OSError):
+        message, code = f"error: {error}", EXIT_INPUT
+    else:
+        message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`)"
+        code = EXIT_INTERNAL
+    typer.echo(" ".join(message.split()), err=True)
+    raise typer.Exit(code) from None
+
+
+def _stand_in() -> None:
+    """Never called: `_LazyGroup` puts the real command in its place."""
+
+
+def make_app() -> typer.Typer:
+    """The program with all its commands, none of them loaded."""
+    app = typer.Typer(
+        cls=_LazyGroup,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+    @app.callback()
+    def options(
+        debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    ) -> None:
+        """Dense indoor SLAM with a functional, differentiable bundle adjustment."""
+
+    for entry in COMMANDS:
+        app.command(entry.name, help=entry.summary)(_stand_in)
+    return app
+
+
+def main() -> None:
+    """Entry point of the program."""
+    set_jax_flags()
+    warnings.showwarning = _one_line_warnings(warnings.showwarning)
+    make_app()(prog_name="vggtgeo")
+
+
+def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
+    """A way to show warnings: those about the user's input in one line, all others as before."""
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if issubclass(category, InputWarning):
+            print(f"warning: {message}", file=file or sys.stderr)
+        else:
+            show_others(message, category, filename, lineno, file, line)
+
+    return show

@@ -1,0 +1,96 @@
+"""Solving a problem file with a clock beside it: the work of `vggtgeo solve`."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from vggtgeo.energy import energy
+from vggtgeo.errors import InputError
+from vggtgeo.problem import Problem, State
+from vggtgeo.problem_file import load_problem, save_solution
+from vggtgeo.solve import Solution, solve
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `--json` prints. Energies are `1/2 sum rho`, computed in float64 whatever the precision of the solve."""
+
+    iterations: int
+    energy_initial: float
+    energy_final: float
+    compile_s: float
+    """Seconds of tracing and compilation (little where the compiled code was in the cache)."""
+    ms_per_iteration: float | None
+    """Median over the repetitions of the whole compiled run, by its iterations; None without any."""
+    dtype: str
+    result: str
+    """Name of the termination code."""
+
+    @property
+    def sentence(self) -> str:
+        """The same for people."""
+        pace = "" if self.ms_per_iteration is None else f", {self.ms_per_iteration:.3g} ms each"
+        return (
+            f"{self.result}: energy {self.energy_initial:.6e} -> {self.energy_final:.6e} in {self.iterations} "
+            f"iterations{pace} ({self.dtype}, compiled in {self.compile_s:.1f} s)"
+        )
+
+
+def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: int) -> Report:
+    """Solve the problem in the file `problem` in precision `dtype` and write the solution to `output`.
+
+    Raises:
+        InputError: the file cannot be used, or its initial energy is not finite (then nothing is written).
+
+    """
+    exact, start, index = load_problem(problem)
+    solution, compile_s, run_s = timed_solve(_cast(exact, dtype), _cast(start, dtype), max_steps, repeat)
+    if solution.result == "nonfinite_input":
+        raise InputError(f"`{problem}`: {solution.message}")
+    state, energy_of, iterations = _widen(solution.state), jax.jit(energy), int(solution.iterations)
+    save_solution(output, state, index)
+    return Report(
+        iterations=iterations,
+        energy_initial=float(energy_of(exact, start)),
+        energy_final=float(energy_of(exact, state)),
+        compile_s=compile_s,
+        ms_per_iteration=1e3 * run_s / iterations if iterations else None,
+        dtype=dtype,
+        result=solution.result,
+    )
+
+
+def timed_solve(problem: Problem, start: State, max_steps: int, repeat: int) -> tuple[Solution, float, float]:
+    """Solution, seconds of compilation, and median seconds of `repeat` >= 1 compiled runs."""
+    solver = SchurLevenbergMarquardt(max_iterations=max_steps)
+    solve_one = jax.jit(lambda problem, start: solve(problem, start, solver=solver))
+    began = time.perf_counter()
+    compiled = solve_one.lower(problem, start).compile()
+    compile_s = time.perf_counter() - began
+    solutions, seconds = [], []
+    for _ in range(repeat):
+        began = time.perf_counter()
+        solutions.append(jax.block_until_ready(compiled(problem, start)))
+        seconds.append(time.perf_counter() - began)
+    return solutions[-1], compile_s, float(np.median(seconds))
+
+
+def _cast(tree: Any, dtype: str) -> Any:
+    return jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, tree)
+
+
+def _widen(state: State) -> State:
+    """The state in float64, its quaternions of unit length again."""
+    return State(
+        jaxlie.SE3(state.poses.wxyz_xyz.astype(jnp.float64)).normalize(),
+        state.intrinsics.astype(jnp.float64),
+        state.inverse_depth.astype(jnp.float64),
+    )

@@ -1,0 +1,159 @@
+"""What all sequences of image files share: a list of files, read one by one, with a word for bad ones."""
+
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from vggtgeo.camera import Camera
+from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.image_files import MILLIMETRES, DepthFormat, read_depth, read_image
+from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.trajectory import Trajectory
+
+_SAMPLES = 3
+_NAMED_EMPTY_DEPTHS = 3
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """Where one frame lies. Fields: index, position in the sequence; timestamp, seconds; image; depth, if any."""
+
+    index: int
+    timestamp: float
+    image: Path
+    depth: Path | None = None
+
+
+@dataclass(frozen=True)
+class FolderSequence:
+    """A sequence of image files; the layouts (7-Scenes, TUM, plain folder) list the files and know the truth.
+
+    Fields: folder; name; camera; files, in the order of time; depth_format, how the depth files code metres;
+    has_depth, False to leave the depth files alone.
+    """
+
+    folder: Path
+    name: str
+    camera: Camera
+    files: tuple[FrameFile, ...] = field(repr=False)
+    depth_format: DepthFormat = MILLIMETRES
+    has_depth: bool = False
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """See `Sequence.frames`. Images of another size than the camera's are skipped with a warning, too."""
+        check_selection(self.name, len(self), start, end, stride)
+        return self._read_all(self.files[start:end:stride])
+
+    def ground_truth(self) -> Trajectory | None:
+        """No truth, unless the layout knows one."""
+        return None
+
+    def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
+        empty = 0
+        for file in files:
+            image = self._read_image(file)
+            if image is None:
+                continue
+            depth = self._read_depth(file) if self.has_depth else None
+            if file.depth is not None and depth is not None and not np.isfinite(depth).any():
+                empty += 1
+                if empty <= _NAMED_EMPTY_DEPTHS:
+                    _warn(f"`{file.depth}` gives no valid depth; the frame is used without")
+            yield Frame(file.index, file.timestamp, image, depth, file.image.name)
+        if empty > _NAMED_EMPTY_DEPTHS:
+            _warn(f"`{self.name}`: {empty} of {len(files)} depth images gave no valid depth")
+
+    def _read_image(self, file: FrameFile) -> np.ndarray | None:
+        try:
+            image = read_image(file.image)
+        except InputError as error:
+            _warn(f"{error}; the frame is skipped")
+            return None
+        height, width = image.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            _warn(
+                f"`{file.image}` is {width} x {height} pixels; the sequence's images are "
+                f"{self.camera.width} x {self.camera.height}: the frame is skipped"
+            )
+            return None
+        return image
+
+    def _read_depth(self, file: FrameFile) -> np.ndarray:
+        nothing = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
+        if file.depth is None:
+            return nothing
+        try:
+            depth = read_depth(file.depth, self.depth_format)
+        except InputError as error:
+            _warn(f"{error}; the frame is used without depth")
+            return nothing
+        if depth.shape != nothing.shape:
+            _warn(_other_size(file.depth, depth, self.camera.width, self.camera.height) + "; used without depth")
+            return nothing
+        return depth
+
+
+def common_size(name: str, files: Sequence[FrameFile]) -> tuple[int, int]:
+    """Width and height of most of a few readable images: first, middle, last. InputError where none can be read."""
+    sizes: list[tuple[int, int]] = []
+    reason = ""
+    for file in _spread(files):
+        try:
+            height, width = read_image(file.image).shape[:2]
+        except InputError as error:
+            reason = reason or str(error)
+            continue
+        sizes.append((width, height))
+        if len(sizes) == _SAMPLES:
+            break
+    if not sizes:
+        raise InputError(f"none of the {len(files)} images of `{name}` can be read; the first: {reason}")
+    return Counter(sizes).most_common(1)[0][0]
+
+
+def depth_is_usable(name: str, files: Sequence[FrameFile], coding: DepthFormat, width: int, height: int) -> bool:
+    """Whether the sequence has depth to work with: files, of the images' size, with a valid pixel in one of
+    them.
+
+    Looks at the first, middle and last file, and at the others only while no valid pixel has been seen.
+    InputError where the depth has another size than the images; an InputWarning where no pixel of any file is
+    valid.
+    """
+    with_depth = [file for file in files if file.depth is not None]
+    for file in _spread(with_depth):
+        assert file.depth is not None
+        try:
+            depth = read_depth(file.depth, coding)
+        except InputError:
+            continue
+        if depth.shape != (height, width):
+            raise InputError(
+                _other_size(file.depth, depth, width, height) + ": register the depth to the images, or leave it out "
+                "with --rgb-only"
+            )
+        if np.isfinite(depth).any():
+            return True
+    if with_depth:
+        _warn(f"`{name}`: none of the {len(with_depth)} depth images has a valid pixel; reading the images only")
+    return False
+
+
+def _spread(files: Sequence[FrameFile]) -> list[FrameFile]:
+    first = dict.fromkeys((0, len(files) // 2, len(files) - 1))
+    order = [*first, *(row for row in range(len(files)) if row not in first)]
+    return [files[row] for row in order] if files else []
+
+
+def _other_size(path: Path, depth: np.ndarray, width: int, height: int) -> str:
+    return f"`{path}` is {depth.shape[1]} x {depth.shape[0]} pixels; the colour images are {width} x {height}"
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, InputWarning, stacklevel=4)

@@ -1,0 +1,78 @@
+"""What every reader gives: frames one after another, the camera, and the truth where there is one."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from vggtgeo.camera import Camera
+from vggtgeo.errors import InputError
+from vggtgeo.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of a sequence, as the camera took it (distortion not yet removed).
+
+    Fields:
+        index: position in the whole sequence, counted from 0, whatever was skipped.
+        timestamp: seconds.
+        image: uint8 [H, W, 3], RGB.
+        depth: float32 [H, W], z in metres, NaN where there is none; None for a sequence without depth.
+        name: the file's name, for messages.
+    """
+
+    index: int
+    timestamp: float
+    image: UInt8[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"] | None
+    name: str
+
+
+@runtime_checkable
+class Sequence(Protocol):
+    """Frames with one camera. The truth is for the report only: nothing that estimates may ask for it."""
+
+    @property
+    def name(self) -> str:
+        """For titles and messages."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all frames; `camera.known` is False where its intrinsics are a guess."""
+        ...
+
+    @property
+    def has_depth(self) -> bool:
+        """True where frames carry depth: then every frame has an array, all NaN where its file failed."""
+        ...
+
+    def __len__(self) -> int:
+        """Frames listed; unreadable ones count. A video gives its container's estimate."""
+        ...
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """The frames at positions start, start + stride, ... below end, read one by one as they are asked
+        for.
+
+        What cannot be read is skipped with an InputWarning that names it. InputError for a selection that is
+        not one, or holds no frame.
+        """
+        ...
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses, camera -> world; None where there is no truth."""
+        ...
+
+
+def check_selection(name: str, count: int, start: int, end: int | None, stride: int) -> None:
+    """Raises InputError unless `start`, `end`, `stride` select at least one of `count` frames of sequence `name`."""
+    if stride < 1:
+        raise InputError(f"`stride` is {stride}; it must be at least 1")
+    if start < 0 or (end is not None and end <= start):
+        raise InputError(f"`start` is {start} and `end` {end}; they must be 0 <= start < end")
+    if start >= count:
+        raise InputError(f"`start` is {start}; `{name}` has {count} frames: give at most {count - 1}")

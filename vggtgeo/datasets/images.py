@@ -1,0 +1,69 @@
+"""A plain folder of images, in natural order (2 before 10)."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
+from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.errors import InputError
+from vggtgeo.trajectory import Trajectory
+
+FRAMES_PER_SECOND = 30.0
+_SECONDS = re.compile(r"\d+\.\d+")
+_NANOSECONDS = re.compile(r"\d{18,19}")
+
+
+@dataclass(frozen=True)
+class ImageFolder(FolderSequence):
+    """Images of one folder, without depth. Truth: `groundtruth.txt` (TUM format), where there is one.
+
+    Time is position / 30 s, unless all names are times: seconds with a decimal point (`12.034.png`) or
+    nanoseconds (18 or 19 digits).
+    """
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has an image."""
+        return bool(_images(folder))
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Lists the images; InputError where there is none."""
+        images = _images(folder)
+        if not images:
+            raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
+        times = _times(images)
+        files = tuple(
+            FrameFile(index, time, image) for index, (time, image) in enumerate(sorted(zip(times, images, strict=True)))
+        )
+        width, height = common_size(str(folder), files)
+        camera = camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
+        return cls(folder, folder.resolve().name, camera, files)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses, if the folder has them."""
+        file = self.folder / "groundtruth.txt"
+        return Trajectory.load_tum(file) if file.is_file() else None
+
+
+def natural_key(name: str) -> list[int | str]:
+    """Sorts digits in `name` as numbers: `a2` before `a10`."""
+    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"([0-9]+)", name)]
+
+
+def _images(folder: Path) -> list[Path]:
+    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    return sorted(found, key=lambda path: (natural_key(path.name), path.name))
+
+
+def _times(images: list[Path]) -> list[float]:
+    stems = [image.stem for image in images]
+    for pattern, unit in ((_SECONDS, 1.0), (_NANOSECONDS, 1e-9)):
+        if all(pattern.fullmatch(stem) for stem in stems):
+            times = [float(stem) * unit for stem in stems]
+            if len(set(times)) == len(times):
+                return times
+    return [index / FRAMES_PER_SECOND for index in range(len(images))]

@@ -1,0 +1,110 @@
+"""Where a camera comes from: a file in the folder, published values, the user's flag, or a guess."""
+
+import math
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from vggtgeo.camera import Camera, check_distortion, check_intrinsics
+from vggtgeo.errors import InputError, InputWarning
+
+CALIBRATION = "calibration.txt"
+MATRIX = "camera-intrinsics.txt"
+
+# Colour cameras of the TUM RGB-D benchmark, 640 x 480 (fx fy cx cy, k1 k2 p1 p2 k3), from
+# https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; freiburg3 is published undistorted.
+_FREIBURG: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+_FREIBURG_NAME = re.compile(r"freiburg([123])|(?:^|[_-])fr([123])(?:[_-]|$)", re.IGNORECASE)
+
+
+def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
+    """`"fx,fy,cx,cy"` as numbers, pixels; InputError where it is not four numbers, focal lengths positive."""
+    return check_intrinsics(_numbers("`intrinsics`", text, "fx,fy,cx,cy"))
+
+
+def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
+    """The camera of `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`), else of
+    `camera-intrinsics.txt` (3 x 3) in `folder`, else None. InputError where such a file is there but wrong.
+    """
+    for name, read in ((CALIBRATION, _read_calibration), (MATRIX, _read_matrix)):
+        file = folder / name
+        if file.is_file():
+            intrinsics, distortion = read(file)
+            camera = Camera(intrinsics, width, height, distortion)
+            _warn_of_other_size(file, camera)
+            return camera
+    return None
+
+
+def freiburg_camera(name: str, width: int, height: int) -> Camera | None:
+    """The published camera, with its distortion, where `name` says freiburg1, 2 or 3 and the size is 640 x 480."""
+    match = _FREIBURG_NAME.search(name)
+    if match is None or (width, height) != (640, 480):
+        return None
+    intrinsics, distortion = _FREIBURG[match.group(1) or match.group(2)]
+    return Camera(check_intrinsics(intrinsics), width, height, distortion)
+
+
+def guess_with_warning(name: str, width: int, height: int) -> Camera:
+    """A guessed camera, `known` False, and an InputWarning that says so."""
+    camera = Camera.guess(width, height)
+    warnings.warn(
+        f"`{name}`: no intrinsics found; starting from a guess, f = {camera.intrinsics[0]:.0f} pixels: put "
+        f"`fx fy cx cy` into a file `{CALIBRATION}` beside the images, or give --intrinsics fx,fy,cx,cy",
+        InputWarning,
+        stacklevel=3,
+    )
+    return camera
+
+
+def _read_calibration(file: Path) -> tuple[tuple[float, float, float, float], tuple[float, ...]]:
+    numbers = _numbers(f"`{file}`", _without_comments(file), "fx fy cx cy [k1 k2 p1 p2]")
+    try:
+        return check_intrinsics(numbers[:4]), check_distortion(numbers[4:])
+    except InputError as error:
+        raise InputError(f"`{file}`: {error}") from None
+
+
+def _read_matrix(file: Path) -> tuple[tuple[float, float, float, float], tuple[float, ...]]:
+    numbers = _numbers(f"`{file}`", _without_comments(file), "a 3 x 3 matrix of intrinsics")
+    if len(numbers) != 9:
+        raise InputError(f"`{file}`: found {len(numbers)} numbers; expected a 3 x 3 matrix of intrinsics")
+    matrix = np.reshape(numbers, (3, 3))
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6):
+        raise InputError(f"`{file}`: found {matrix.tolist()}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    try:
+        return check_intrinsics((fx, fy, cx, cy)), ()
+    except InputError as error:
+        raise InputError(f"`{file}`: {error}") from None
+
+
+def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for word in text.replace(",", " ").split())
+    except ValueError:
+        raise InputError(f"{where}: found {text.strip()!r}; expected the numbers {expected}") from None
+
+
+def _without_comments(file: Path) -> str:
+    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    return " ".join(line.split("#", 1)[0] for line in lines)
+
+
+def _warn_of_other_size(file: Path, camera: Camera) -> None:
+    fx, fy, cx, cy = camera.intrinsics
+    centred = 0 <= cx < camera.width and 0 <= cy < camera.height
+    field_of_view = math.degrees(2 * math.atan(0.5 * max(camera.width / fx, camera.height / fy)))
+    if not centred or field_of_view < 10:
+        warnings.warn(
+            f"`{file}`: principal point ({cx:g}, {cy:g}) and field of view {field_of_view:.0f} deg are odd "
+            f"for images of {camera.width} x {camera.height}; was it calibrated at another image size?",
+            InputWarning,
+            stacklevel=3,
+        )

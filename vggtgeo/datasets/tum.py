@@ -1,0 +1,117 @@
+"""TUM RGB-D folders: `rgb.txt` and `depth.txt` (lines `timestamp file`), `groundtruth.txt`, 16-bit depth /
+5000.
+
+Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. Colour and depth
+are taken at different times: an image gets the depth nearest in time, at most 0.02 s away, each depth used
+once.
+"""
+
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
+from vggtgeo.datasets.intrinsics import camera_from_folder, freiburg_camera, guess_with_warning
+from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.trajectory import Trajectory
+
+MAX_DEPTH_DELAY = 0.02
+"""Seconds between an image and its depth."""
+
+_TRUTH = "groundtruth.txt"
+_Entry = tuple[float, Path]
+
+
+@dataclass(frozen=True)
+class TumRgbd(FolderSequence):
+    """One sequence in the layout of the TUM RGB-D benchmark. Truth: `groundtruth.txt`."""
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has an `rgb.txt`."""
+        return (folder / "rgb.txt").is_file()
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
+        images = _read_list(folder / "rgb.txt")
+        depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
+        partners = _partners(images, depths)
+        files = tuple(
+            FrameFile(index, time, image, None if partner is None else depths[partner][1])
+            for index, ((time, image), partner) in enumerate(zip(images, partners, strict=True))
+        )
+        if depths and (alone := partners.count(None)):
+            _warn(f"`{folder}`: {alone} of {len(images)} images have no depth within {MAX_DEPTH_DELAY} s")
+        width, height = common_size(str(folder), files)
+        camera = (
+            camera_from_folder(folder, width, height)
+            or freiburg_camera(folder.resolve().name, width, height)
+            or guess_with_warning(str(folder), width, height)
+        )
+        has_depth = depth_is_usable(str(folder), files, FIVE_THOUSANDTHS, width, height)
+        return cls(folder, folder.resolve().name, camera, files, FIVE_THOUSANDTHS, has_depth)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
+        file = self.folder / _TRUTH
+        return Trajectory.load_tum(file) if file.is_file() else None
+
+
+def _read_list(file: Path) -> list[_Entry]:
+    if not file.is_file():
+        raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
+    entries = []
+    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        text = line.split("#", 1)[0].strip()
+        if text:
+            entries.append(_parse_entry(file, number, text))
+    if not entries:
+        raise InputError(f"`{file}` lists nothing; expected lines `timestamp file`")
+    return _in_order(file, entries)
+
+
+def _parse_entry(file: Path, number: int, text: str) -> _Entry:
+    time, _, name = text.partition(" ")
+    try:
+        seconds = float(time)
+    except ValueError:
+        seconds = math.nan
+    if not name.strip() or not math.isfinite(seconds):
+        raise InputError(f"`{file}`, line {number}: found {text!r}; expected `timestamp file`")
+    return seconds, file.parent / name.strip()
+
+
+def _in_order(file: Path, entries: list[_Entry]) -> list[_Entry]:
+    ordered = sorted(entries, key=lambda entry: entry[0])
+    if ordered != entries:
+        _warn(f"`{file}`: timestamps are out of order; the list was sorted by time")
+    unique = [entry for row, entry in enumerate(ordered) if row == 0 or entry[0] > ordered[row - 1][0]]
+    if len(unique) < len(ordered):
+        _warn(f"`{file}`: {len(ordered) - len(unique)} lines repeat the time of another; the first was kept")
+    return unique
+
+
+def _partners(images: list[_Entry], depths: list[_Entry]) -> list[int | None]:
+    """For each image the row of its depth: pairs are made in the order of their time difference, each row once."""
+    times = np.array([time for time, _ in depths])
+    candidates = []
+    for row, (time, _) in enumerate(images):
+        low, high = np.searchsorted(times, [time - MAX_DEPTH_DELAY, time + MAX_DEPTH_DELAY], side="left")
+        candidates += [(abs(times[k] - time), row, k) for k in range(low, min(high + 1, len(times)))]
+    partners: list[int | None] = [None] * len(images)
+    taken: set[int] = set()
+    for difference, row, k in sorted(candidates):
+        if difference <= MAX_DEPTH_DELAY and partners[row] is None and k not in taken:
+            partners[row] = k
+            taken.add(k)
+    return partners
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, InputWarning, stacklevel=4)

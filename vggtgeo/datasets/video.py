@@ -1,0 +1,107 @@
+"""A video file, decoded frame by frame by OpenCV."""
+
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import cv2
+
+from vggtgeo.camera import Camera
+from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.trajectory import Trajectory
+
+_FALLBACK_RATE = 30.0
+
+
+@dataclass(frozen=True)
+class VideoFile:
+    """A video, without depth and without truth. Intrinsics come from a file in the video's folder.
+
+    Fields: path; name; camera; rate, frames/s; count, the container's number of frames (an estimate).
+    """
+
+    path: Path
+    name: str
+    camera: Camera
+    rate: float
+    count: int
+    has_depth: bool = False
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Reads the header and the first frame; InputError where OpenCV can decode no video."""
+        with _capture(path) as capture:
+            readable, image = capture.read()
+            if not readable:
+                raise InputError(f"`{path}` has no frame that can be decoded")
+            rate = capture.get(cv2.CAP_PROP_FPS)
+            count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        height, width = image.shape[:2]
+        camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height)
+        known_rate = math.isfinite(rate) and 0 < rate < 1000
+        return cls(path, path.name, camera, rate if known_rate else _FALLBACK_RATE, max(count, 1))
+
+    def __len__(self) -> int:
+        return self.count
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """See `Sequence.frames`; frames that are skipped are not converted. A stream that ends before its
+        container says so ends with an InputWarning.
+        """
+        check_selection(self.name, self.count, start, end, stride)
+        return self._decode(start, end, stride)
+
+    def ground_truth(self) -> Trajectory | None:
+        """None."""
+        return None
+
+    def _decode(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
+        time = -math.inf
+        index = 0
+        with _capture(self.path) as capture:
+            while (end is None or index < end) and capture.grab():
+                time = self._time(capture, index, time)
+                if index >= start and (index - start) % stride == 0:
+                    readable, image = capture.retrieve()
+                    if readable:
+                        yield Frame(
+                            index,
+                            time,
+                            cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image),
+                            None,
+                            f"{self.name}, frame {index}",
+                        )
+                    else:
+                        _warn(f"`{self.name}`: frame {index} cannot be decoded; it is skipped")
+                index += 1
+        wanted = self.count if end is None else min(end, self.count)
+        if index < wanted:
+            _warn(f"`{self.name}` ends after {index} frames; its header says {self.count}: is the file cut off?")
+
+    def _time(self, capture: cv2.VideoCapture, index: int, previous: float) -> float:
+        """The container's time where it increases (frames of phones come at a varying rate), else by the rate."""
+        if index == 0:
+            return 0.0
+        time = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
+        return time if math.isfinite(time) and time > previous else previous + 1.0 / self.rate
+
+
+@contextmanager
+def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+    capture = cv2.VideoCapture(str(path))
+    try:
+        if not capture.isOpened():
+            raise InputError(f"`{path}` cannot be opened as a video: it is damaged, or no video that OpenCV knows")
+        yield capture
+    finally:
+        capture.release()
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, InputWarning, stacklevel=3)

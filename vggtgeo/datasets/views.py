@@ -1,0 +1,56 @@
+"""A sequence seen otherwise: with other intrinsics, without its depth, or with its truth set apart."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from vggtgeo.camera import Camera
+from vggtgeo.datasets.folder import FolderSequence
+from vggtgeo.datasets.frame import Frame, Sequence
+from vggtgeo.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class SequenceView:
+    """`source` with another camera, and with depth and truth kept or hidden."""
+
+    source: Sequence
+    camera: Camera
+    has_depth: bool
+    has_truth: bool = True
+
+    @property
+    def name(self) -> str:
+        """The name of the source."""
+        return self.source.name
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """See `Sequence.frames`."""
+        frames = self.source.frames(start, end, stride)
+        return frames if self.has_depth else (replace(frame, depth=None) for frame in frames)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The truth of the source, unless it is hidden."""
+        return self.source.ground_truth() if self.has_truth else None
+
+
+def with_intrinsics(
+    sequence: Sequence, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
+) -> Sequence:
+    """The sequence with the given, known intrinsics (pixels) in place of whatever its folder says."""
+    camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height, distortion)
+    return SequenceView(sequence, camera, sequence.has_depth)
+
+
+def without_depth(sequence: Sequence) -> Sequence:
+    """The colour images alone; depth files are not even decoded."""
+    source = replace(sequence, has_depth=False) if isinstance(sequence, FolderSequence) else sequence
+    return SequenceView(source, sequence.camera, has_depth=False)
+
+
+def split(sequence: Sequence) -> tuple[Sequence, Trajectory | None]:
+    """What an estimator may see, and the truth for the report: the sequence given first has no truth any more."""
+    view = SequenceView(sequence, sequence.camera, sequence.has_depth, has_truth=False)
+    return view, sequence.ground_truth()

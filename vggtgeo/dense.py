@@ -1,0 +1,137 @@
+"""Dense depth of a keyframe after optimisation, and the point cloud of all keyframes.
+
+The depth prior of a pixel touches that pixel alone, so a pixel that carries no slot has its optimum at its prior: the
+dense problem is solved by the slots. What the slots learnt (`log z_optimised - log z_prior`) is then spread to their
+neighbours by a bilateral grid (Chen, Paris, Durand 2007) over image position and log depth: it follows surfaces and
+stops at depth edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from vggtgeo.point_cloud import PointCloud
+from vggtgeo.slam import rigid
+from vggtgeo.slam.keyframe import Keyframe
+
+CELL = 24.0
+"""Pixels a grid cell."""
+DEPTH_CELL = 0.08
+"""Log depth a grid cell."""
+LARGEST_CORRECTION = 0.2
+"""Of log depth: what differs more is a mismatch, not a correction."""
+
+
+def optimised_depth(keyframe: Keyframe) -> np.ndarray:
+    """Depth of every pixel that has a metric prior, corrected by the slots; float32 `[H, W]` metres, NaN = none."""
+    prior = keyframe.depth.depth
+    pixels, correction, weight = _corrections(keyframe)
+    if not len(pixels):
+        return prior.copy()
+    height, width = prior.shape
+    log_depth = np.log(prior)
+    low = float(np.nanmin(log_depth))
+    shape = (
+        int(height / CELL) + 3,
+        int(width / CELL) + 3,
+        int((float(np.nanmax(log_depth)) - low) / DEPTH_CELL) + 3,
+    )
+    columns, rows = np.rint(pixels).astype(int).T
+    at = np.stack([pixels[:, 1] / CELL, pixels[:, 0] / CELL, (log_depth[rows, columns] - low) / DEPTH_CELL])
+    cell = tuple(np.rint(at).astype(int) + 1)
+    mass, moment = np.zeros(shape), np.zeros(shape)
+    np.add.at(mass, cell, weight)
+    np.add.at(moment, cell, weight * correction)
+    mass, moment = (gaussian_filter(grid, 1.0, mode="constant") for grid in (mass, moment))
+    # A weak pull towards no correction: far from any slot the prior stands.
+    field = moment / (mass + 0.02)
+    known = np.isfinite(log_depth)
+    y, x = np.nonzero(known)
+    place = np.stack([y / CELL + 1, x / CELL + 1, (log_depth[known] - low) / DEPTH_CELL + 1])
+    result = prior.copy()
+    result[known] = prior[known] * np.exp(map_coordinates(field, place, order=1, mode="nearest"))
+    return result
+
+
+def _corrections(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels, log depth corrections and weights of the slots that have both an estimate and a prior."""
+    slots = keyframe.points
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correction = np.log(slots.prior) - np.log(slots.inverse_depth)
+    good = np.isfinite(correction) & (correction != 0) & (np.abs(correction) < LARGEST_CORRECTION)
+    return slots.pixels[good], correction[good], slots.confidence[good] * slots.prior_confidence[good]
+
+
+def map_points(
+    keyframes: Sequence[Keyframe], intrinsics: np.ndarray, *, voxel: float = 0.02, least_confidence: float = 0.5
+) -> PointCloud:
+    """One coloured cloud of all keyframes, in the world frame.
+
+    Where there is metric depth: every third pixel whose confidence is at least `least_confidence` and whose depth
+    another keyframe confirms to 4 %; else the adjusted points alone. Points of one cell of `voxel` metres are averaged.
+    """
+    metric = [bool(np.isfinite(keyframe.depth.depth).any()) for keyframe in keyframes]
+    depths = [optimised_depth(keyframe) if known else None for keyframe, known in zip(keyframes, metric, strict=True)]
+    parts = []
+    for i, keyframe in enumerate(keyframes):
+        if not metric[i]:
+            parts.append(_sparse_points(keyframe, intrinsics))
+            continue
+        neighbours = [j for j in (i - 2, i - 1, i + 1, i + 2) if 0 <= j < len(keyframes) and metric[j]]
+        parts.append(_dense_points(keyframes, depths, i, neighbours, intrinsics, least_confidence))
+    points, colours, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return _average_in_voxels(points, colours, weight, voxel)
+
+
+def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray):
+    slots = keyframe.points
+    known = np.isfinite(slots.inverse_depth) & (slots.inverse_depth > 0.02)
+    points = rigid.unproject(slots.pixels[known], slots.inverse_depth[known], keyframe.pose, intrinsics)
+    columns, rows = np.rint(slots.pixels[known]).astype(int).T
+    return points, keyframe.image[rows, columns], slots.confidence[known]
+
+
+def _dense_points(keyframes, depths, i: int, neighbours, intrinsics, least_confidence: float, step: int = 3):
+    keyframe, depth = keyframes[i], depths[i]
+    rows, columns = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step].reshape(2, -1)
+    confidence = keyframe.depth.confidence[rows, columns]
+    good = np.isfinite(depth[rows, columns]) & (confidence >= least_confidence)
+    rows, columns, confidence = rows[good], columns[good], confidence[good]
+    pixels = np.column_stack([columns, rows]).astype(np.float64)
+    points = rigid.unproject(pixels, 1.0 / depth[rows, columns].astype(np.float64), keyframe.pose, intrinsics)
+    confirmed = np.zeros(len(points), bool)
+    for j in neighbours:
+        confirmed |= _agrees(points, keyframes[j], depths[j], intrinsics)
+    if neighbours:
+        points, rows, columns, confidence = points[confirmed], rows[confirmed], columns[confirmed], confidence[confirmed]
+    # Near measurements are better: the noise of a depth sensor grows with the square of the distance.
+    z = depth[rows, columns]
+    return points, keyframe.image[rows, columns], confidence / np.maximum(z, 0.3) ** 2
+
+
+def _agrees(points: np.ndarray, keyframe: Keyframe, depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    local = points @ keyframe.pose[:3, :3].T + keyframe.pose[:3, 3]
+    with np.errstate(invalid="ignore"):
+        x, y = np.nan_to_num(rigid.project(points, keyframe.pose, intrinsics), nan=-1.0).round().astype(int).T
+    inside = (x >= 0) & (x < depth.shape[1]) & (y >= 0) & (y < depth.shape[0])
+    seen = np.where(inside, depth[np.where(inside, y, 0), np.where(inside, x, 0)], np.nan)
+    with np.errstate(invalid="ignore"):
+        return np.abs(seen - local[:, 2]) < 0.04 * local[:, 2]
+
+
+def _average_in_voxels(points: np.ndarray, colours: np.ndarray, weight: np.ndarray, voxel: float) -> PointCloud:
+    if not len(points):
+        return PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32))
+    cells = np.floor(points / voxel).astype(np.int64)
+    _, group = np.unique(cells, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    weight = np.maximum(weight.astype(np.float64), 1e-6)
+    total = np.bincount(group, weight)
+    mean = lambda values: np.column_stack([np.bincount(group, weight * column) / total for column in values.T])
+    count = np.bincount(group)
+    return PointCloud(
+        mean(points), mean(colours.astype(np.float64)).round().astype(np.uint8), (1 - 0.5**count).astype(np.float32)
+    )

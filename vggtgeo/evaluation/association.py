@@ -1,0 +1,60 @@
+"""Which pose of one trajectory belongs to which of another: the nearest in time, as in the `evo` package."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vggtgeo.errors import InputError
+from vggtgeo.trajectory import Trajectory
+
+MAX_TIME_DIFFERENCE = 0.01
+"""Seconds between two poses that may still be compared; evo's default."""
+
+
+def nearest_in_time(
+    times: Float[np.ndarray, " n"], others: Float[np.ndarray, " m"], max_dt: float
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """For each of `times` the nearest of `others` (increasing) within `max_dt` seconds; the earlier one of a
+    tie.
+
+    Returns the rows in `times` that have a partner and, beside each, the row in `others`. One row of `others`
+    may serve several of `times`.
+    """
+    if len(others) == 0 or len(times) == 0:
+        return np.zeros(0, int), np.zeros(0, int)
+    after = np.clip(np.searchsorted(others, times, side="right"), 0, len(others) - 1)
+    before = np.maximum(after - 1, 0)
+    to_after, to_before = others[after] - times, times - others[before]
+    nearest = np.where(np.abs(to_after) < np.abs(to_before), after, before)
+    rows = np.flatnonzero(np.abs(others[nearest] - times) <= max_dt)
+    return rows, nearest[rows]
+
+
+def associate(
+    estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE
+) -> tuple[Trajectory, Trajectory]:
+    """The poses of both trajectories that are at most `max_dt` seconds apart, pair by pair.
+
+    Each pose of the shorter trajectory looks for its nearest in the longer one. The times of both results are
+    those of the shorter, so that they name the pairs. InputError where `max_dt` is negative or nothing
+    matches.
+    """
+    if not max_dt >= 0:
+        raise InputError(f"`max_dt` is {max_dt}; it must be at least 0 seconds")
+    if len(truth) < len(estimate):
+        truth_rows, estimate_rows = nearest_in_time(truth.timestamps, estimate.timestamps, max_dt)
+        times = truth.timestamps[truth_rows]
+    else:
+        estimate_rows, truth_rows = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)
+        times = estimate.timestamps[estimate_rows]
+    if len(times) == 0:
+        raise InputError(f"no pose of the two trajectories matches within {max_dt:g} s: {_spans(estimate, truth)}")
+    return Trajectory(times, estimate.poses[estimate_rows]), Trajectory(times, truth.poses[truth_rows])
+
+
+def _spans(estimate: Trajectory, truth: Trajectory) -> str:
+    parts = []
+    for name, trajectory in (("`estimate`", estimate), ("`truth`", truth)):
+        times = trajectory.timestamps
+        span = f"from {times[0]:.3f} to {times[-1]:.3f} s" if len(times) else "empty"
+        parts.append(f"{name} is {span} ({len(times)} poses)")
+    return ", ".join(parts) + "; check that both use the same clock, or allow a larger `max_dt`"

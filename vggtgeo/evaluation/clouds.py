@@ -1,0 +1,64 @@
+"""How well one point cloud covers another: precision, recall, F-score, mean distances.
+
+Source of the F-score: A. Knapitsch et al., "Tanks and Temples", ACM TOG 36(4), 2017.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from vggtgeo.errors import InputError
+
+
+@dataclass(frozen=True)
+class CloudError:
+    """Fields:
+    precision: share of the estimated points with a true point within `threshold`.
+    recall: share of the true points with an estimated point within `threshold`.
+    f_score: their harmonic mean (0 where both are 0).
+    accuracy: mean distance from an estimated point to the nearest true one, metres.
+    completeness: mean distance from a true point to the nearest estimated one, metres.
+    threshold: metres.
+    """
+
+    precision: float
+    recall: float
+    f_score: float
+    accuracy: float
+    completeness: float
+    threshold: float
+
+    @property
+    def mean_distance(self) -> float:
+        """The mean of accuracy and completeness (Chamfer distance), metres."""
+        return 0.5 * (self.accuracy + self.completeness)
+
+
+def cloud_error(
+    estimate: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "m 3"], threshold: float = 0.05
+) -> CloudError:
+    """Compares two clouds in one frame, metres, by nearest neighbours (k-d trees, O((n + m) log(n + m))).
+
+    InputError for an empty cloud, NaN, other shapes, or a threshold that is not positive.
+    """
+    if not threshold > 0:
+        raise InputError(f"`threshold` is {threshold}; it must be positive metres")
+    for name, points in (("estimate", estimate), ("truth", truth)):
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+            raise InputError(f"`{name}` has shape {points.shape}; it must be [n, 3], n at least 1")
+        if not np.isfinite(points).all():
+            raise InputError(f"`{name}` has a NaN or an infinity; leave such points out")
+    to_truth, _ = KDTree(truth).query(estimate)
+    to_estimate, _ = KDTree(estimate).query(truth)
+    precision, recall = float((to_truth <= threshold).mean()), float((to_estimate <= threshold).mean())
+    total = precision + recall
+    return CloudError(
+        precision=precision,
+        recall=recall,
+        f_score=2 * precision * recall / total if total > 0 else 0.0,
+        accuracy=float(to_truth.mean()),
+        completeness=float(to_estimate.mean()),
+        threshold=threshold,
+    )

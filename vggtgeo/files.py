@@ -1,0 +1,62 @@
+"""Atomic writes: a reader of an output file sees the old content or the new, never a half.
+
+The content goes to a temporary file in the same folder (so that the final `os.replace` stays within one file
+system), is brought to the disk, and takes its name in one step. After an exception, or Ctrl-C, the temporary
+file is gone and what was there before is untouched.
+"""
+
+import json
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Gives a temporary path beside `path`, of the same suffix, that becomes `path` when the block ends well.
+
+    For writers that want a file name (OpenCV, numpy, matplotlib). Missing parent folders are made.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    try:
+        yield temporary
+        _flush_to_disk(temporary)
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_open(path: str | os.PathLike[str], mode: str = "w") -> Iterator[IO[Any]]:
+    """Opens `path` for writing (`mode` "w" or "wb"); the file appears under its name when the block ends
+    well.
+    """
+    if mode not in ("w", "wb"):
+        raise ValueError(f"`mode` is {mode!r}; an atomic write replaces the whole file: use 'w' or 'wb'")
+    encoding = "utf-8" if mode == "w" else None
+    with atomic_path(path) as temporary, open(temporary, mode, encoding=encoding) as handle:
+        yield handle
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Writes `text` as UTF-8, atomically."""
+    with atomic_open(path) as handle:
+        handle.write(text)
+
+
+def write_json(path: str | os.PathLike[str], values: Mapping[str, Any]) -> None:
+    """Writes `values` as indented JSON, atomically; NaN and infinity are refused: they are not JSON."""
+    write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+
+
+def _flush_to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,358 @@
+"""Fast energy and normal equations of bundle adjustment: hand-written columns, one pass over the edges.
+
+For a point of host i on edge (i, j), with `Y = R ray + d t` (see `residuals.py`), `X = Y_x / Y_z`, `y = Y_y / Y_z` and
+a residual whose image gradient is `(a, b)` (`(1, 0)` and `(0, 1)` for the two rows of a point, the line's normal for a
+line sample, each times the root of its weight), put
+
+    G = (a f_x / Y_z,  b f_y / Y_z,  -(G_0 X + G_1 y)),      c = R' G.
+
+The row's derivatives are: relative translation `d G`, relative rotation `Y x G`, focal lengths `a X - c_0 ray_x / f_x`
+and `b y - c_1 ray_y / f_y`, centre `a - c_0 / f_x` and `b - c_1 / f_y`, inverse depth `G . t`.
+
+Layout (chosen by measurement on CPU): one array a quantity, slots contiguous; a `scan` over edges forms 12 columns of
+`2 p + l` rows, takes their Gram matrix, and adds the cross terms into the host's rows in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vggtgeo import lie
+from vggtgeo.energy import energy_terms, marginal_energy, marginal_residual, relative_poses
+from vggtgeo.problem import Edges, LineObservations, MarginalPrior, PointObservations, Problem, State
+from vggtgeo.residuals import MIN_RELATIVE_DEPTH
+from vggtgeo.second_order import Camera, Projection, second_order, twist
+from vggtgeo.solvers.arrow import ArrowSystem, EdgeGraph
+from vggtgeo.solvers.kernels import AbstractKernel
+
+SHARED = 4
+"""Number of shared coordinates: the intrinsics."""
+
+
+class EdgeObservations(eqx.Module):
+    """Observations as one array a quantity; absent ones have weight 0 and finite entries."""
+
+    point_u: Float[Array, "e p"]
+    point_v: Float[Array, "e p"]
+    point_weight: Float[Array, "e p"]
+    line_a: Float[Array, "e l"]
+    line_b: Float[Array, "e l"]
+    line_c: Float[Array, "e l"]
+    line_weight: Float[Array, "e l"]
+
+
+def edge_observations(problem: Problem) -> EdgeObservations:
+    """Split the observations of a problem by quantity."""
+    point = jnp.where(problem.points.weight[..., None] > 0, problem.points.target, 0.0)
+    line = jnp.where(problem.lines.weight[..., None] > 0, problem.lines.coefficients, 0.0)
+    return EdgeObservations(
+        *(point[..., 0], point[..., 1], jnp.maximum(problem.points.weight, 0.0)),
+        *(line[..., 0], line[..., 1], line[..., 2], jnp.maximum(problem.lines.weight, 0.0)),
+    )
+
+
+class _Hosts(NamedTuple):
+    """Viewing rays and inverse depths of all slots, `[n, s]` each."""
+
+    ray_x: Array
+    ray_y: Array
+    depth: Array
+
+
+def fast_energy(problem: Problem, observations: EdgeObservations, state: State) -> Float[Array, ""]:
+    """The energy of `energy.energy`, by one pass over the edges."""
+    hosts = _hosts(problem, state)
+    relative = relative_poses(problem, state)
+
+    def body(total: Array, edge: Any) -> tuple[Array, None]:
+        host, rotation, translation, seen = edge
+        point, line = _project(problem, hosts, host, rotation, translation)
+        squared, _, _ = _point_residual(state.intrinsics, point, seen)
+        distance = _line_residual(state.intrinsics, line, seen)
+        rho = problem.kernel.rho
+        terms = jnp.sum(rho(seen.point_weight * squared)) + jnp.sum(rho(seen.line_weight * distance**2))
+        return total + terms, None
+
+    edges = (problem.edges.source, relative.rotation().as_matrix(), relative.translation(), observations)
+    total, _ = jax.lax.scan(body, jnp.zeros((), state.inverse_depth.dtype), edges)
+    slots_only = eqx.tree_at(lambda p: (p.edges, p.points, p.lines), problem, _no_edges(problem))
+    rest = energy_terms(slots_only, state)
+    return total / 2 + rest.depth + rest.intrinsics + rest.marginal
+
+
+def linearise(problem: Problem, observations: EdgeObservations, state: State, exact: bool = False) -> ArrowSystem:
+    """Second-order model of the energy at `state`, with its exact gradient.
+
+    The Hessian is the reweighted Gauss-Newton one, or the exact one (in the coordinates of `exp(x) T` and additive
+    intrinsics and inverse depths).
+    """
+    ranks = problem.edges.of_host.shape[1]
+    hosts = _hosts(problem, state)
+    relative = relative_poses(problem, state)
+    wide = 6 * ranks
+
+    def body(cross: Array, edge: Any) -> tuple[Array, Array]:
+        host, rank, rotation, translation, seen = edge
+        camera = (state.intrinsics, rotation, translation)
+        columns = _edge_columns(problem, hosts, host, camera, seen)
+        columns = jax.lax.optimization_barrier(columns)
+        coupled = _times_depth_column(columns, problem.num_points)
+        gram = columns @ columns.T
+        if exact:
+            added, added_coupled = _edge_second_order(problem, hosts, host, camera, seen)
+            gram = gram.at[:10, :10].add(added)
+            coupled = coupled.at[:10].add(added_coupled[:10]).at[11].add(added_coupled[10])
+        zero = jnp.zeros_like(host)
+        cross = jax.lax.dynamic_update_slice(cross, coupled[None, :6], (host, 6 * rank, zero))
+        shared = jax.lax.dynamic_slice(cross, (host, zero + wide, zero), (1, SHARED + 2, coupled.shape[1]))
+        cross = jax.lax.dynamic_update_slice(cross, shared + coupled[None, 6:], (host, zero + wide, zero))
+        return cross, gram
+
+    edges = (
+        *(problem.edges.source, problem.edges.rank),
+        *(relative.rotation().as_matrix(), relative.translation(), observations),
+    )
+    cross, gram = jax.lax.scan(body, _depth_terms(problem, state, wide, exact), edges)
+    prior_hessian, prior_gradient = _dense_priors(problem, state, exact)
+    return ArrowSystem(
+        graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
+        transport=lie.adjoint(relative),
+        gram=gram[:, :-1, :-1],
+        cross=cross,
+        twist=twist(gram[:, :6, 10]) if exact else jnp.zeros_like(gram, shape=(len(gram), 6, 6)),
+        prior_hessian=prior_hessian,
+        prior_gradient=prior_gradient,
+        free=free_coordinates(problem),
+        gauge=scale_direction(problem, state),
+    )
+
+
+def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
+    """Which of the dense coordinates move, `bool[c]`."""
+    return jnp.concatenate([jnp.repeat(~problem.fixed_pose, 6), ~problem.fixed_intrinsics])
+
+
+def scale_direction(problem: Problem, state: State) -> Float[Array, "c 1"]:
+    """Unit motion of the poses under a change of scale about the first held camera (about camera 0 without one)."""
+    rotations, translations = state.poses.rotation().as_matrix(), state.poses.translation()
+    held = jnp.argmax(problem.fixed_pose)
+    anchor = -rotations[held].T @ translations[held]
+    outward = translations + rotations @ anchor
+    direction = jnp.concatenate([outward, jnp.zeros_like(outward)], 1).reshape(-1)
+    direction = jnp.concatenate([direction, jnp.zeros(SHARED, direction.dtype)])
+    squared = jnp.sum(direction**2)
+    return (direction / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)))[:, None]
+
+
+def _no_edges(problem: Problem) -> tuple[Edges, PointObservations, LineObservations]:
+    """Edges and observations of the same problem with no edge at all, for the terms that live on slots."""
+    empty: Callable[[Array], Array] = lambda leaf: leaf[:0]
+    edges = eqx.tree_at(
+        lambda e: (e.source, e.target, e.rank),
+        problem.edges,
+        (empty(problem.edges.source), empty(problem.edges.target), empty(problem.edges.rank)),
+    )
+    return edges, jax.tree.map(empty, problem.points), jax.tree.map(empty, problem.lines)
+
+
+def _hosts(problem: Problem, state: State) -> _Hosts:
+    fx, fy, cx, cy = state.intrinsics
+    pixels = problem.pixels
+    return _Hosts((pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy, state.inverse_depth)
+
+
+def _project(
+    problem: Problem, hosts: _Hosts, host: Array, rotation: Array, translation: Array
+) -> tuple[Projection, Projection]:
+    """Project the point slots and the line slots of one host into one target camera."""
+    ray_x, ray_y, depth = (jax.lax.dynamic_index_in_dim(field, host, keepdims=False) for field in hosts)
+    split = problem.num_points
+    whole = _project_slots(ray_x, ray_y, depth, rotation, translation)
+    return jax.tree.map(lambda a: a[:split], whole), jax.tree.map(lambda a: a[split:], whole)
+
+
+def _project_slots(ray_x: Array, ray_y: Array, depth: Array, rotation: Array, translation: Array) -> Projection:
+    rows = tuple(
+        rotation[i, 0] * ray_x + rotation[i, 1] * ray_y + rotation[i, 2] + depth * translation[i] for i in range(3)
+    )
+    z = jnp.maximum(rows[2], MIN_RELATIVE_DEPTH)
+    inverse_z = 1 / z
+    in_front = jnp.where(rows[2] > MIN_RELATIVE_DEPTH, 1.0, 0.0).astype(z.dtype)
+    point = (rows[0], rows[1], rows[2])
+    return Projection(ray_x, ray_y, depth, point, inverse_z, rows[0] * inverse_z, rows[1] * inverse_z, in_front)
+
+
+def _point_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservations) -> tuple[Array, Array, Array]:
+    """Squared norm, and both entries."""
+    fx, fy, cx, cy = intrinsics
+    horizontal = fx * seen_from.x + cx - seen.point_u
+    vertical = fy * seen_from.y + cy - seen.point_v
+    return horizontal * horizontal + vertical * vertical, horizontal, vertical
+
+
+def _line_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservations) -> Array:
+    fx, fy, cx, cy = intrinsics
+    return seen.line_a * (fx * seen_from.x + cx) + seen.line_b * (fy * seen_from.y + cy) + seen.line_c
+
+
+def _root_weight(kernel: AbstractKernel, weight: Array, squared: Array) -> Array:
+    return jnp.sqrt(weight * kernel.weight(weight * squared))
+
+
+def _edge_columns(
+    problem: Problem, hosts: _Hosts, host: Array, camera: Camera, seen: EdgeObservations
+) -> Float[Array, "12 rows"]:
+    """Weighted derivatives of one edge: 6 relative pose, 4 intrinsics, residual, inverse depth; rows u, v, lines."""
+    intrinsics, rotation, translation = camera
+    point, line = _project(problem, hosts, host, rotation, translation)
+    squared, horizontal, vertical = _point_residual(intrinsics, point, seen)
+    root = _root_weight(problem.kernel, seen.point_weight, squared)
+    distance = _line_residual(intrinsics, line, seen)
+    line_root = _root_weight(problem.kernel, seen.line_weight, distance * distance)
+    parts = [
+        _row(camera, point, root, None, root * horizontal),
+        _row(camera, point, None, root, root * vertical),
+        _row(camera, line, line_root * seen.line_a, line_root * seen.line_b, line_root * distance),
+    ]
+    return jnp.concatenate([jnp.stack(part) for part in parts], 1)
+
+
+def _edge_second_order(
+    problem: Problem, hosts: _Hosts, host: Array, camera: Camera, seen: EdgeObservations
+) -> tuple[Float[Array, "10 10"], Float[Array, "11 s"]]:
+    """What the exact Hessian adds for one edge: Gram matrix `[10, 10]`, cross terms `[11, s]`."""
+    intrinsics, rotation, translation = camera
+    point, line = _project(problem, hosts, host, rotation, translation)
+    squared, horizontal, vertical = _point_residual(intrinsics, point, seen)
+    distance = _line_residual(intrinsics, line, seen)
+    point_pull, point_bend = _pull_and_bend(problem.kernel, seen.point_weight, squared)
+    line_pull, line_bend = _pull_and_bend(problem.kernel, seen.line_weight, distance * distance)
+    forces = (
+        (point, (point_pull * horizontal, point_pull * vertical), point_bend),
+        (line, (line_pull * distance * seen.line_a, line_pull * distance * seen.line_b), line_bend),
+    )
+    parts = []
+    for at, force, bend in forces:
+        derivative = _row(camera, at, *force, jnp.zeros_like(at.inverse_z))
+        geometry = [_row_of_point(camera, at, axis) for axis in range(3)]
+        whole, first, second, third = (jnp.stack([*row[:10], row[-1]]) for row in (derivative, *geometry))
+        rows = (whole, third * at.inverse_z * at.in_front, first, second)
+        parts.append(second_order(rows, bend, camera, at, force))
+    (point_gram, point_cross), (line_gram, line_cross) = parts
+    return point_gram + line_gram, jnp.concatenate([point_cross, line_cross], 1)
+
+
+def _pull_and_bend(kernel: AbstractKernel, weight: Array, squared: Array) -> tuple[Array, Array]:
+    """`w rho'` and `2 rho'' / rho'^2` of each observation; zero where absent."""
+    first, second = kernel.weight(weight * squared), kernel.curvature(weight * squared)
+    pulled = first > 0
+    bend = jnp.where(pulled & (weight > 0), 2 * second / jnp.where(pulled, first, 1.0) ** 2, 0.0)
+    return weight * first, bend
+
+
+def _row_of_point(camera: Camera, at: Projection, axis: int) -> list[Array]:
+    """The derivatives of one entry of the scaled point `Y`, in the order of `_row`."""
+    (fx, fy, _, _), rotation, translation = camera
+    y, zero, ones = at.point, jnp.zeros_like(at.depth), jnp.ones_like(at.depth)
+    translations = [at.depth if i == axis else zero for i in range(3)]
+    turns = ([zero, y[2], -y[1]], [-y[2], zero, y[0]], [y[1], -y[0], zero])[axis]
+    c0, c1 = rotation[axis, 0], rotation[axis, 1]
+    intrinsics = [-c0 * at.ray_x / fx, -c1 * at.ray_y / fy, -c0 / fx * ones, -c1 / fy * ones]
+    return [*translations, *turns, *intrinsics, zero, translation[axis] * ones]
+
+
+def _row(camera: Camera, at: Projection, a: Array | None, b: Array | None, residual: Array) -> list[Array]:
+    """The twelve columns of one residual row with image gradient `(a, b)`; None is zero."""
+    (fx, fy, _, _), rotation, translation = camera
+    zero = jnp.zeros_like(residual)
+    g0 = None if a is None else a * fx * at.inverse_z
+    g1 = None if b is None else b * fy * at.inverse_z
+    g2 = -_add(_times(g0, at.x), _times(g1, at.y)) * at.in_front
+    y0, y1, y2 = at.point
+    c0 = _add(_times(g0, rotation[0, 0]), _times(g1, rotation[1, 0]), g2 * rotation[2, 0])
+    c1 = _add(_times(g0, rotation[0, 1]), _times(g1, rotation[1, 1]), g2 * rotation[2, 1])
+    columns = [
+        *(_times(g0, at.depth), _times(g1, at.depth), g2 * at.depth),
+        _add(y1 * g2, _times(g1, -y2)),
+        _add(_times(g0, y2), -y0 * g2),
+        _add(_times(g1, y0), _times(g0, -y1)),
+        _add(_times(a, at.x), -c0 * at.ray_x / fx),
+        _add(_times(b, at.y), -c1 * at.ray_y / fy),
+        *(_add(a, -c0 / fx), _add(b, -c1 / fy)),
+        residual,
+        _add(_times(g0, translation[0]), _times(g1, translation[1]), g2 * translation[2]),
+    ]
+    return [zero if column is None else column for column in columns]
+
+
+def _times(value: Array | None, factor: Array) -> Any:
+    return None if value is None else value * factor
+
+
+def _add(*terms: Array | None) -> Any:
+    present = [term for term in terms if term is not None]
+    return sum(present[1:], present[0]) if present else None
+
+
+def _times_depth_column(columns: Float[Array, "12 rows"], points: int) -> Float[Array, "12 s"]:
+    """Each column times the inverse-depth column, the two rows of a point added; gradient and curvature come last."""
+    depth = columns[11]
+    horizontal = columns[:, :points] * depth[:points]
+    vertical = columns[:, points : 2 * points] * depth[points : 2 * points]
+    return jnp.concatenate([horizontal + vertical, columns[:, 2 * points :] * depth[2 * points :]], 1)
+
+
+def _depth_terms(problem: Problem, state: State, wide: int, exact: bool) -> Float[Array, "n r s"]:
+    """Cross terms before any edge: the depth priors' gradient and curvature in the last two rows."""
+    prior = problem.depth
+    known = prior.weight > 0
+    scale = jnp.where(known, prior.sigma, 1.0)
+    residual = (state.inverse_depth - jnp.where(known, prior.mean, 0.0)) / scale
+    weight = jnp.where(known, prior.alpha * prior.weight, 0.0)
+    squared = weight * residual**2
+    curvature = weight * problem.kernel.weight(squared)
+    gradient = curvature * residual
+    if exact:
+        curvature = curvature + 2 * weight * squared * problem.kernel.curvature(squared)
+    keyframes, slots = state.inverse_depth.shape
+    cross = jnp.zeros((keyframes, wide + SHARED + 2, slots), state.inverse_depth.dtype)
+    return cross.at[:, -2].set(gradient / scale).at[:, -1].set(curvature / scale**2)
+
+
+def _dense_priors(problem: Problem, state: State, exact: bool) -> tuple[Float[Array, "c c"], Float[Array, " c"]]:
+    """Hessian and gradient of the priors on intrinsics and of the marginalisation prior."""
+    prior = problem.intrinsics_prior
+    shared = slice(-SHARED, None)
+    size, dtype = problem.num_camera, state.inverse_depth.dtype
+    hessian = jnp.zeros((size, size), dtype).at[shared, shared].set(jnp.diag(prior.information))
+    gradient = jnp.zeros(size, dtype).at[shared].set(prior.information * (state.intrinsics - prior.mean))
+    if problem.marginal is None:
+        return hessian, gradient
+    jacobian = marginal_jacobian(problem.marginal, state)
+    gradient = gradient + jacobian.T @ marginal_residual(problem.marginal, state)
+    if exact:
+        return hessian + _marginal_hessian(problem.marginal, state), gradient
+    return hessian + jacobian.T @ jacobian, gradient
+
+
+def _marginal_hessian(prior: MarginalPrior, state: State) -> Float[Array, "c c"]:
+    def energy(step: Array) -> Array:
+        poses = lie.move(state.poses, step[:-SHARED].reshape(-1, 6))
+        return marginal_energy(prior, State(poses, state.intrinsics + step[-SHARED:], state.inverse_depth))
+
+    return jax.hessian(energy)(jnp.zeros_like(prior.offset))
+
+
+def marginal_jacobian(prior: MarginalPrior, state: State) -> Float[Array, "c c"]:
+    """Derivative of the marginalisation residual by left tangents and intrinsics at `state`."""
+    left_inverse = lie.boxminus_jacobian(lie.boxminus(state.poses, prior.poses))
+    size = prior.root.shape[0]
+    poses = prior.root[:, :-SHARED].reshape(size, -1, 6)
+    moved = jnp.einsum("cnb,nbd->cnd", poses, left_inverse).reshape(size, -1)
+    return jnp.concatenate([moved, prior.root[:, -SHARED:]], 1)

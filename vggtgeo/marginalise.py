@@ -1,0 +1,133 @@
+"""Marginalisation: what a keyframe that leaves the window has said about the others, as a Gaussian prior.
+
+The factors that go with a keyframe are the observations and depth priors of the landmarks it hosts, and the prior that
+earlier keyframes left behind. At fixed linearisation points they form the quadratic
+
+    1/2 x' H x + g' x,     x = (states) boxminus (linearisation points),
+
+from which the landmarks and then the leaving pose are eliminated by Schur complements. The square root of what is left
+is the new prior `1/2 |R x + r0|^2`. States that already are under a prior keep their linearisation point (first
+estimates): two linearisations of one state would add information along the gauge, which no measurement contains.
+Cost: one linearisation, one symmetric eigenvalue problem of size `6 n + 4`.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from vggtgeo.linearise import SHARED, edge_observations, linearise
+from vggtgeo.problem import MarginalPrior, Problem, State
+from vggtgeo.solvers.arrow import reduce
+
+
+def no_prior(keyframes: int, dtype: np.dtype | type = np.float64) -> MarginalPrior:
+    """A prior that says nothing, of the shape of one for `keyframes` keyframes."""
+    size = 6 * keyframes + SHARED
+    identity = np.tile(np.array([1.0, 0, 0, 0, 0, 0, 0], dtype), (keyframes, 1))
+    return MarginalPrior(
+        root=jnp.zeros((size, size), dtype),
+        offset=jnp.zeros(size, dtype),
+        poses=jaxlie.SE3(jnp.asarray(identity)),
+        intrinsics=jnp.zeros(SHARED, dtype),
+    )
+
+
+def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> MarginalPrior:
+    """The prior over poses and intrinsics that remains when keyframe `leaving` is taken out of the window.
+
+    `problem.marginal` must be set (`no_prior` to begin with). The result has the same shape; it says nothing about
+    the keyframe that left. Pure; `leaving` may be traced.
+    """
+    prior = problem.marginal
+    if prior is None:
+        raise ValueError("`problem.marginal` is None; set it to `no_prior(n)` before the first marginalisation")
+    point = _linearisation_point(prior, state)
+    quadratic, gradient = _quadratic(problem, point, leaving)
+    leaving_rows = jnp.arange(len(gradient)) // 6 == leaving
+    leaving_rows = leaving_rows.at[-SHARED:].set(False)
+    held = jnp.concatenate([jnp.repeat(problem.fixed_pose, 6), problem.fixed_intrinsics])
+    quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
+    root, offset = _square_root(quadratic, gradient)
+    return MarginalPrior(root=root, offset=offset, poses=point.poses, intrinsics=point.intrinsics)
+
+
+def reorder(prior: MarginalPrior, order: np.ndarray) -> MarginalPrior:
+    """The prior with keyframe `order[i]` in place i; -1 puts a keyframe there that it says nothing about."""
+    order = np.asarray(order)
+    known = order >= 0
+    columns = (6 * np.maximum(order, 0)[:, None] + np.arange(6)).reshape(-1)
+    shared = prior.root.shape[1] - SHARED + np.arange(SHARED)
+    mask = np.concatenate([np.repeat(known, 6), np.ones(SHARED, bool)])
+    root = np.where(mask, np.asarray(prior.root)[:, np.concatenate([columns, shared])], 0.0)
+    identity = np.array([1.0, 0, 0, 0, 0, 0, 0])
+    poses = np.where(known[:, None], np.asarray(prior.poses.wxyz_xyz)[np.maximum(order, 0)], identity)
+    dtype = prior.root.dtype
+    return MarginalPrior(
+        jnp.asarray(root, dtype), prior.offset, jaxlie.SE3(jnp.asarray(poses, dtype)), prior.intrinsics
+    )
+
+
+def _linearisation_point(prior: MarginalPrior, state: State) -> State:
+    """The prior's own points where it says something, the current estimate elsewhere."""
+    weight = jnp.sum(prior.root**2, 0)
+    pose_known = jnp.sum(weight[:-SHARED].reshape(-1, 6), 1) > 0
+    intrinsics_known = weight[-SHARED:] > 0
+    return State(
+        jaxlie.SE3(jnp.where(pose_known[:, None], prior.poses.wxyz_xyz, state.poses.wxyz_xyz)),
+        jnp.where(intrinsics_known, prior.intrinsics, state.intrinsics),
+        state.inverse_depth,
+    )
+
+
+def _quadratic(problem: Problem, point: State, leaving):
+    """Hessian and gradient of the leaving factors over the dense coordinates, landmarks eliminated."""
+    hosted = problem.edges.source == leaving
+    own = jnp.arange(problem.num_keyframes) == leaving
+    factors = eqx.tree_at(
+        lambda p: (p.points.weight, p.lines.weight, p.depth.weight, p.intrinsics_prior.information),
+        problem,
+        (
+            jnp.where(hosted[:, None], problem.points.weight, 0.0),
+            jnp.where(hosted[:, None], problem.lines.weight, 0.0),
+            jnp.where(own[:, None], problem.depth.weight, 0.0),
+            jnp.zeros_like(problem.intrinsics_prior.information),
+        ),
+    )
+    reduced = reduce(linearise(factors, edge_observations(factors), point))
+    return reduced.hessian - reduced.schur, reduced.gradient - reduced.schur_gradient
+
+
+def _eliminate(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows, held):
+    """Condition on held coordinates, then take the leaving rows out by a Schur complement (pseudo-inverse)."""
+    free = ~held
+    quadratic = jnp.where(free[:, None] & free[None, :], quadratic, 0.0)
+    gradient = jnp.where(free, gradient, 0.0)
+    inner = jnp.where(rows[:, None] & rows[None, :], quadratic, 0.0)
+    inverse = jnp.linalg.pinv(inner, hermitian=True)
+    coupling = jnp.where(~rows[:, None] & rows[None, :], quadratic, 0.0)
+    remaining = jnp.where(~rows[:, None] & ~rows[None, :], quadratic, 0.0)
+    remaining = remaining - coupling @ inverse @ coupling.T
+    gradient = jnp.where(rows, 0.0, gradient - coupling @ inverse @ gradient)
+    return (remaining + remaining.T) / 2, gradient
+
+
+def _square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]):
+    """`R, r0` with `R' R = H` and `R' r0 = g` on the part of the space where `H` is positive."""
+    # Metres, radians and pixels differ by orders of magnitude: balance before cutting off what is rounding error.
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(quadratic), 0.0))
+    safe = jnp.where(scale > 0, scale, 1.0)
+    values, vectors = jnp.linalg.eigh(quadratic / safe[:, None] / safe[None, :])
+    floor = len(values) * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), initial=0.0)
+    kept = values > 100 * floor
+    roots = jnp.sqrt(jnp.where(kept, values, 1.0))
+    root = jnp.where(kept[:, None], roots[:, None] * vectors.T * safe[None, :], 0.0)
+    offset = jnp.where(kept, (vectors.T @ (gradient / safe)) / roots, 0.0)
+    return root, offset
+
+
+marginalise_jit = jax.jit(marginalise)

@@ -1,0 +1,292 @@
+"""From flat lists of observations (numpy, unequal lengths) to a padded `Problem`, and back.
+
+Padding is this file's business alone: slots and edges that hold nothing get weight 0, a finite pixel and a positive
+inverse depth, and no other file asks which entries are real.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array
+
+from vggtgeo.errors import InputError
+from vggtgeo.problem import (
+    DepthPrior,
+    Edges,
+    IntrinsicsPrior,
+    LineObservations,
+    PointObservations,
+    Problem,
+    State,
+)
+from vggtgeo.solvers.kernels import AbstractKernel, Huber
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What bundle adjustment sees, as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples."""
+
+    edges: np.ndarray
+    """int `[E, 2]`: (host keyframe, target keyframe)."""
+    host: np.ndarray
+    """int `[D]`: keyframe that hosts each landmark (one inverse depth each)."""
+    pixel: np.ndarray
+    """`[D, 2]`: its pixel in the host."""
+    point_edge: np.ndarray
+    """int `[A]`."""
+    point_landmark: np.ndarray
+    """int `[A]`."""
+    point_target: np.ndarray
+    """`[A, 2]` pixels."""
+    point_weight: np.ndarray
+    """`[A]`."""
+    line_edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    line_landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    line_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """`[B, 3]`: a, b, c with a^2 + b^2 = 1."""
+    line_weight: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    depth_mean: np.ndarray | None = None
+    """`[D]`: prior inverse depth, 1/m; None = no depth prior at all."""
+    depth_sigma: np.ndarray | None = None
+    """`[D]`: its standard deviation, 1/m."""
+    depth_weight: np.ndarray | None = None
+    """`[D]`: its confidence; 0 = none."""
+    alpha: float = 2.0
+
+
+@dataclass(frozen=True)
+class PaddedSize:
+    """Static shape of a problem: every problem packed to one size shares one compiled solver."""
+
+    keyframes: int
+    points: int
+    lines: int
+    ranks: int
+    """Largest number of edges of one host."""
+    edges: int | None = None
+    """Number of edges stored; None = `keyframes * ranks`, every host padded to `ranks` edges."""
+
+
+@dataclass(frozen=True)
+class SlotIndex:
+    """Where each landmark went: `inverse_depth[host[i], slot[i]]`."""
+
+    host: np.ndarray
+    slot: np.ndarray
+
+    def gather(self, per_slot: np.ndarray | Array) -> np.ndarray:
+        """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`."""
+        return np.asarray(per_slot)[self.host, self.slot]
+
+
+def pack(
+    observations: Observations,
+    poses: np.ndarray,
+    intrinsics: np.ndarray,
+    inverse_depth: np.ndarray,
+    *,
+    size: PaddedSize | None = None,
+    intrinsics_sigma: np.ndarray | float | None = None,
+    fixed_pose: np.ndarray | None = None,
+    fixed_intrinsics: np.ndarray | bool = False,
+    kernel: AbstractKernel | None = None,
+    dtype: DTypeLike = np.float64,
+) -> tuple[Problem, State, SlotIndex]:
+    """Pack flat observations and an initial guess into arrays.
+
+    Args:
+        observations: what was measured.
+        poses: `[n, 7]` world -> camera, `(qw, qx, qy, qz, tx, ty, tz)`.
+        intrinsics: `[4]` fx, fy, cx, cy in pixels; also the mean of their prior.
+        inverse_depth: `[D]`, 1/m, positive.
+        size: padded shape; None takes the smallest that fits.
+        intrinsics_sigma: standard deviation of the intrinsics' prior in pixels; None = no prior.
+        fixed_pose: bool `[n]`; None holds the first pose.
+        fixed_intrinsics: bool or bool `[4]`: intrinsics that are held.
+        kernel: robust kernel; None = Huber with delta 1.5 px.
+        dtype: float type of all arrays.
+
+    Raises:
+        InputError: an index out of range, a landmark with both points and lines, a non-positive inverse depth, an
+            observation between keyframes that its landmark is not hosted in, or a size that is too small.
+
+    """
+    count = len(observations.host)
+    _check_indices(observations, len(poses))
+    _check_positive("inverse_depth", inverse_depth, count)
+    index, needed_points, needed_lines = _assign_slots(observations, len(poses))
+    edges, order, ranks = _sort_edges(observations.edges, len(poses))
+    size = size or PaddedSize(len(poses), needed_points, needed_lines, ranks, len(edges))
+    _check_size(size, PaddedSize(len(poses), needed_points, needed_lines, ranks, len(edges)))
+    lines = index.slot >= needed_points
+    index = SlotIndex(index.host, np.where(lines, index.slot - needed_points + size.points, index.slot))
+    graph, position = _pad_edges(edges, size)
+    row = position[order]
+    slots = size.points + size.lines
+
+    def per_slot(values: np.ndarray, empty: float) -> Array:
+        array = np.full((size.keyframes, slots, *np.shape(values)[1:]), empty, dtype)
+        array[index.host, index.slot] = values
+        return jnp.asarray(array)
+
+    point_at = (row[observations.point_edge], index.slot[observations.point_landmark])
+    line_at = (row[observations.line_edge], index.slot[observations.line_landmark] - size.points)
+    num_edges = len(graph.source)
+    points = PointObservations(
+        _scatter(point_at, observations.point_target, (num_edges, size.points, 2), dtype),
+        _scatter(point_at, observations.point_weight, (num_edges, size.points), dtype),
+    )
+    line_observations = LineObservations(
+        _scatter(line_at, observations.line_coefficients, (num_edges, size.lines, 3), dtype),
+        _scatter(line_at, observations.line_weight, (num_edges, size.lines), dtype),
+    )
+    sigma = np.inf if intrinsics_sigma is None else np.asarray(intrinsics_sigma, dtype)
+    padding = size.keyframes - len(poses)
+    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else np.asarray(fixed_pose, bool)
+    problem = Problem(
+        pixels=per_slot(observations.pixel, 0.0),
+        edges=graph,
+        points=points,
+        lines=line_observations,
+        depth=_depth_prior(observations, per_slot, count, dtype),
+        intrinsics_prior=IntrinsicsPrior(
+            jnp.asarray(intrinsics, dtype), jnp.asarray(np.broadcast_to(1 / np.square(sigma), 4), dtype)
+        ),
+        fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
+        fixed_intrinsics=jnp.asarray(np.broadcast_to(fixed_intrinsics, 4)),
+        kernel=kernel or Huber(jnp.asarray(1.5, dtype)),
+    )
+    identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
+    state = State(
+        jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype)),
+        jnp.asarray(intrinsics, dtype),
+        per_slot(inverse_depth, 1.0),
+    )
+    return problem, state, index
+
+
+def _depth_prior(
+    observations: Observations, per_slot: Callable[[np.ndarray, float], Array], count: int, dtype: DTypeLike
+) -> DepthPrior:
+    if observations.depth_mean is None:
+        zero, one = np.zeros(count), np.ones(count)
+        return DepthPrior(
+            per_slot(one, 1.0), per_slot(one, 1.0), per_slot(zero, 0.0), jnp.asarray(observations.alpha, dtype)
+        )
+    sigma = np.ones(count) if observations.depth_sigma is None else observations.depth_sigma
+    weight = np.ones(count) if observations.depth_weight is None else observations.depth_weight
+    _check_positive("depth_sigma", sigma, count)
+    return DepthPrior(
+        per_slot(observations.depth_mean, 1.0),
+        per_slot(sigma, 1.0),
+        per_slot(weight, 0.0),
+        jnp.asarray(observations.alpha, dtype),
+    )
+
+
+def _scatter(at: tuple[np.ndarray, np.ndarray], values: np.ndarray, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
+    array = np.zeros(shape, dtype)
+    array[at] = values
+    return jnp.asarray(array)
+
+
+def _assign_slots(observations: Observations, keyframes: int) -> tuple[SlotIndex, int, int]:
+    """Number the landmarks of each host: those with points first; also the largest counts of both kinds."""
+    is_line = np.zeros(len(observations.host), bool)
+    is_line[observations.line_landmark] = True
+    both = np.intersect1d(observations.point_landmark, np.nonzero(is_line)[0])
+    if len(both):
+        raise InputError(
+            f"`point_landmark` and `line_landmark` both name landmark {both[0]} (and {len(both) - 1} others): a "
+            "landmark is a point or a line sample; give the sample a landmark of its own"
+        )
+    point_counts = np.bincount(observations.host[~is_line], minlength=keyframes)
+    line_counts = np.bincount(observations.host[is_line], minlength=keyframes)
+    points, lines = int(point_counts.max(initial=0)), int(line_counts.max(initial=0))
+    slot = np.zeros(len(observations.host), int)
+    for kind, offset in ((~is_line, 0), (is_line, points)):
+        hosts = observations.host[kind]
+        order = np.argsort(hosts, kind="stable")
+        starts = np.searchsorted(hosts[order], np.arange(keyframes))
+        within = np.empty(len(hosts), int)
+        within[order] = np.arange(len(hosts)) - starts[hosts[order]]
+        slot[kind] = within + offset
+    return SlotIndex(np.asarray(observations.host), slot), points, lines
+
+
+def _sort_edges(edges: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Edges sorted by host, the new position of each given edge, and the largest out-degree."""
+    order = np.argsort(edges[:, 0], kind="stable")
+    position = np.empty(len(edges), int)
+    position[order] = np.arange(len(edges))
+    degrees = np.bincount(edges[:, 0], minlength=keyframes)
+    return edges[order], position, int(degrees.max(initial=0))
+
+
+def _pad_edges(edges: np.ndarray, size: PaddedSize) -> tuple[Edges, np.ndarray]:
+    """The graph as arrays, and the stored position of each sorted edge."""
+    hosts, first = edges[:, 0], np.searchsorted(edges[:, 0], np.arange(size.keyframes))
+    rank = np.arange(len(edges)) - first[hosts]
+    if size.edges == len(edges):
+        position, source, target, ranks = np.arange(len(edges)), hosts, edges[:, 1], rank
+    else:
+        position = hosts * size.ranks + rank
+        source, ranks = (
+            np.repeat(np.arange(size.keyframes), size.ranks),
+            np.tile(np.arange(size.ranks), size.keyframes),
+        )
+        target = source.copy()
+        target[position] = edges[:, 1]
+    of_host = np.full((size.keyframes, size.ranks), len(source))
+    of_host[source, ranks] = np.arange(len(source))
+    arrays = (jnp.asarray(array, jnp.int32) for array in (source, target, ranks, of_host))
+    return Edges(*arrays), position
+
+
+def _check_indices(observations: Observations, keyframes: int) -> None:
+    edges, landmarks = len(observations.edges), len(observations.host)
+    limits = [
+        ("edges", observations.edges, keyframes, "keyframes"),
+        ("host", observations.host, keyframes, "keyframes"),
+        ("point_edge", observations.point_edge, edges, "edges"),
+        ("line_edge", observations.line_edge, edges, "edges"),
+        ("point_landmark", observations.point_landmark, landmarks, "landmarks"),
+        ("line_landmark", observations.line_landmark, landmarks, "landmarks"),
+    ]
+    for name, given, limit, what in limits:
+        values = np.asarray(given)
+        if values.size and (values.min() < 0 or values.max() >= limit):
+            raise InputError(
+                f"`{name}` goes from {values.min()} to {values.max()}; there are {limit} {what}: use 0 to {limit - 1}"
+            )
+    for kind in ("point", "line"):
+        edge, landmark = getattr(observations, f"{kind}_edge"), getattr(observations, f"{kind}_landmark")
+        wrong = observations.edges[edge, 0] != observations.host[landmark]
+        if np.any(wrong):
+            first = int(np.nonzero(wrong)[0][0])
+            raise InputError(
+                f"`{kind}_edge[{first}]` starts at keyframe {observations.edges[edge[first], 0]}, but its landmark is "
+                f"hosted in keyframe {observations.host[landmark[first]]}: an edge observes landmarks of its own host"
+            )
+
+
+def _check_positive(name: str, values: np.ndarray, count: int) -> None:
+    if np.shape(values) != (count,):
+        raise InputError(f"`{name}` has shape {np.shape(values)}; expected ({count},), one a landmark")
+    bad = ~(np.isfinite(values) & (np.asarray(values) > 0))
+    if np.any(bad):
+        first = int(np.nonzero(bad)[0][0])
+        raise InputError(f"`{name}[{first}]` is {values[first]}; it must be positive and finite")
+
+
+def _check_size(size: PaddedSize, needed: PaddedSize) -> None:
+    for name in ("keyframes", "points", "lines", "ranks", "edges"):
+        have, need = getattr(size, name), getattr(needed, name)
+        if have is not None and (have < need or (name == "edges" and have != need)):
+            raise InputError(f"`size.{name}` is {have}; this problem needs {need}")

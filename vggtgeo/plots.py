@@ -1,0 +1,153 @@
+"""The picture of a trajectory: seen from above and from the side, the truth beside it where it is known.
+
+The frame of a reconstruction is arbitrary, so the views are found from the cameras themselves: people hold them
+without roll, so up is the direction that is most nearly at right angles to all image rows (and, while these all
+look one way, nearest to the mean up of the images). The longest horizontal extent lies along the x axis.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from vggtgeo.errors import InputError
+from vggtgeo.evaluation import AbsoluteError, absolute_error, associate
+from vggtgeo.files import atomic_path
+from vggtgeo.trajectory import Trajectory
+
+_ESTIMATE, _TRUTH, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
+_WIDTH = 11.0
+"""Inches."""
+_WEIGHT_OF_MEAN_UP = 0.02
+_LEAST_EXTENT = 0.1
+"""Metres: how much the picture of a still camera shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """What is drawn: the estimate carried to the truth's frame, the truth, and the error that is left."""
+
+    estimate: Trajectory
+    keyframes: Float[np.ndarray, "k 3"]
+    truth: Trajectory | None
+    error: AbsoluteError | None
+
+
+def plot_trajectory(
+    path: str | os.PathLike[str],
+    estimate: Trajectory,
+    truth: Trajectory | None = None,
+    keyframes: Trajectory | None = None,
+    with_scale: bool = False,
+    title: str = "",
+) -> None:
+    """Writes a PNG with the top and side view of `estimate`, metres, equal axes; atomically.
+
+    With `truth`, the estimate is first aligned to it, SE(3), or Sim(3) `with_scale`, and the title tells the ATE
+    over the poses that match in time; where too few match, the truth is left out. `keyframes` are marked. The
+    result of a reconstruction without scale and without truth has no unit. InputError for an empty estimate.
+    """
+    if len(estimate) == 0:
+        raise InputError("`estimate` has no pose; there is nothing to draw")
+    drawn = _align(estimate, truth, keyframes, with_scale)
+    axes_of_view = _view_axes(drawn.truth or drawn.estimate)
+    figure = _draw(drawn, axes_of_view, unit="m" if drawn.error or not with_scale else "no unit")
+    figure.suptitle(_title(drawn, title, with_scale), x=0.01, ha="left", fontsize=12, color=_INK)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=130, format="png", facecolor="white")
+
+
+def _align(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory | None, with_scale: bool) -> _Drawn:
+    places = np.zeros((0, 3)) if keyframes is None else keyframes.positions
+    if truth is None:
+        return _Drawn(estimate, places, None, None)
+    try:
+        error = absolute_error(*associate(estimate, truth), with_scale)
+    except InputError:
+        return _Drawn(estimate, places, None, None)
+    alignment = error.alignment
+    inside = (truth.timestamps >= estimate.timestamps[0]) & (truth.timestamps <= estimate.timestamps[-1])
+    return _Drawn(alignment.trajectory(estimate), alignment.points(places), truth.select(inside), error)
+
+
+def _view_axes(trajectory: Trajectory) -> Float[np.ndarray, "3 3"]:
+    """Rows: the longest horizontal direction, the other horizontal one, up; a right-handed frame."""
+    up = _up(trajectory)
+    centred = trajectory.positions - trajectory.positions.mean(axis=0)
+    horizontal = centred - np.outer(centred @ up, up)
+    along = np.linalg.svd(horizontal, full_matrices=True)[2][0] if len(trajectory) > 1 else np.zeros(3)
+    along = along - (along @ up) * up
+    if np.linalg.norm(along) < 0.1:  # no motion but up and down: any horizontal direction will do
+        along = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    along /= np.linalg.norm(along)
+    if (trajectory.positions[-1] - trajectory.positions[0]) @ along < 0:
+        along = -along
+    return np.stack([along, np.cross(up, along), up])
+
+
+def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
+    rows, mean_up = trajectory.rotations[:, :, 0], -trajectory.rotations[:, :, 1].mean(axis=0)
+    doubt = np.eye(3) * (mean_up @ mean_up) - np.outer(mean_up, mean_up)
+    up = np.linalg.eigh(rows.T @ rows / len(rows) + _WEIGHT_OF_MEAN_UP * doubt)[1][:, 0]
+    return up if up @ mean_up >= 0 else -up
+
+
+def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str) -> Figure:
+    origin = (drawn.truth or drawn.estimate).positions[0]
+    everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
+    points = (np.concatenate(everything) - origin) @ axes_of_view.T
+    low, high = points.min(axis=0), points.max(axis=0)
+    span = max(float((high - low).max()), _LEAST_EXTENT)
+    extent = np.maximum(high - low, 0.15 * span)
+    low, high = 0.5 * (low + high) - 0.56 * extent, 0.5 * (low + high) + 0.56 * extent
+    heights = high - low
+    panel = min(0.85 * _WIDTH * (heights[1] + heights[2]) / heights[0], 9.0)
+    figure = Figure(figsize=(_WIDTH, panel + 2.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    top, side = figure.subplots(2, 1, height_ratios=[heights[1], heights[2]], sharex=True)
+    for axes, vertical, name in ((top, 1, "seen from above"), (side, 2, "seen from the side")):
+        _draw_view(axes, drawn, origin, axes_of_view[[0, vertical]])
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[vertical], high[vertical])
+        axes.set_ylabel(f"{'across' if vertical == 1 else 'up'} [{unit}]")
+        axes.set_title(name, loc="left", fontsize=10, color=_INK)
+    side.set_xlabel(f"along the longest extent [{unit}]")
+    handles, labels = top.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=len(labels), frameon=False, fontsize=9)
+    return figure
+
+
+def _draw_view(axes: Any, drawn: _Drawn, origin: np.ndarray, rows: np.ndarray) -> None:
+    def flat(points: np.ndarray) -> np.ndarray:
+        return rows @ (points - origin).T
+
+    path = flat(drawn.estimate.positions)
+    if drawn.truth is not None:
+        axes.plot(*flat(drawn.truth.positions), color=_TRUTH, lw=2.2, alpha=0.9, label="truth", zorder=2)
+    axes.plot(*path, color=_ESTIMATE, lw=1.3, label="estimate", zorder=3)
+    if len(drawn.keyframes):
+        axes.plot(*flat(drawn.keyframes), ".", color=_ESTIMATE, ms=5, label="keyframes", zorder=4)
+    axes.plot(*path[:, 0], "o", color="white", mec=_INK, mew=1.5, ms=9, label="start", zorder=5)
+    axes.plot(*path[:, -1], "s", color=_INK, mec="white", mew=1.0, ms=9, label="end", zorder=5)
+    axes.set_aspect("equal", adjustable="box")
+    axes.grid(color=_GRID, lw=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=_INK, labelsize=9)
+    for spine in axes.spines.values():
+        spine.set_color("#bbbbbb")
+
+
+def _title(drawn: _Drawn, title: str, with_scale: bool) -> str:
+    if drawn.error is None:
+        facts = f"{len(drawn.estimate)} pose{'s' if len(drawn.estimate) > 1 else ''}, no truth"
+        if not with_scale:
+            facts += f", path {drawn.estimate.length:.2f} m"
+    else:
+        alignment = "Sim(3)" if with_scale else "SE(3)"
+        statistics = drawn.error.statistics
+        facts = f"ATE {100 * statistics.rmse:.2f} cm after {alignment} ({statistics.count} poses)"
+    return f"{title}:  {facts}" if title else facts

@@ -1,0 +1,64 @@
+"""Coloured point clouds as binary PLY files."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
+
+from vggtgeo.errors import InputError
+from vggtgeo.files import atomic_open
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Fields: points float [n, 3], world, metres; colours uint8 [n, 3], RGB; confidence float32 [n] in [0,
+    1], or None. InputError for other shapes or a NaN among the points.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    colours: UInt8[np.ndarray, "n 3"]
+    confidence: Float[np.ndarray, " n"] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.points)
+        if self.points.shape != (count, 3) or self.colours.shape != (count, 3) or self.colours.dtype != np.uint8:
+            raise InputError(
+                f"`points` has shape {self.points.shape}, `colours` {self.colours.dtype} "
+                f"{self.colours.shape}; they must be [n, 3] and uint8 [n, 3]"
+            )
+        if self.confidence is not None and self.confidence.shape != (count,):
+            raise InputError(f"`confidence` has shape {self.confidence.shape}; it must be [{count}]")
+        if not np.isfinite(self.points).all():
+            raise InputError("`points` has a NaN or an infinity; leave such points out")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def save_ply(self, path: str | os.PathLike[str]) -> None:
+        """Writes binary little-endian PLY, atomically: float32 x y z, uint8 RGB, float32 confidence."""
+        fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+        columns = [*self.points.T, *self.colours.T]
+        if self.confidence is not None:
+            fields.append(("confidence", "<f4"))
+            columns.append(self.confidence)
+        vertices = np.empty(len(self), dtype=fields)
+        for (name, _), column in zip(fields, columns, strict=True):
+            vertices[name] = column
+        with atomic_open(path, "wb") as handle:
+            PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(handle)
+
+    @classmethod
+    def load_ply(cls, path: str | os.PathLike[str]) -> "PointCloud":
+        """Reads the points, colours (black where there are none) and confidence of a PLY file."""
+        try:
+            vertices = PlyData.read(os.fspath(path))["vertex"].data
+        except (OSError, KeyError, PlyHeaderParseError, PlyParseError) as error:
+            raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY point cloud: {error}") from None
+        names = vertices.dtype.names or ()
+        points = np.column_stack([vertices[name] for name in "xyz"])
+        colours = np.zeros((len(points), 3), np.uint8)
+        if {"red", "green", "blue"} <= set(names):
+            colours = np.column_stack([vertices[name] for name in ("red", "green", "blue")]).astype(np.uint8)
+        return cls(points, colours, np.array(vertices["confidence"]) if "confidence" in names else None)

@@ -1,0 +1,122 @@
+"""The bundle-adjustment problem as arrays: state, observations, priors. All shapes are static, absence is weight 0.
+
+Sizes: `n` keyframes, `p` point slots and `l` line slots a keyframe (`s = p + l` inverse depths: points first), `e`
+directed edges `(i, j)`: slots of keyframe i observed in keyframe j.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from vggtgeo.solvers.kernels import AbstractKernel, Huber
+
+
+class State(eqx.Module):
+    """What bundle adjustment estimates."""
+
+    poses: jaxlie.SE3
+    """World -> camera of each keyframe, batch `[n]`."""
+    intrinsics: Float[Array, "4"]
+    """`fx, fy, cx, cy` in pixels, shared by all keyframes."""
+    inverse_depth: Float[Array, "n s"]
+    """1/m, along the optical axis of the host keyframe, one a slot."""
+
+
+class Edges(eqx.Module):
+    """The covisibility graph: directed edges sorted by host keyframe."""
+
+    source: Int[Array, " e"]
+    """Host keyframe i, ascending."""
+    target: Int[Array, " e"]
+    """Keyframe j in which the slots of i are observed."""
+    rank: Int[Array, " e"]
+    """Position of the edge among the edges of its host, from 0."""
+    of_host: Int[Array, "n k"]
+    """Index of the edge of each rank of each host, or `e` where a host has fewer than `k`: the inverse of `rank`."""
+
+
+class PointObservations(eqx.Module):
+    """Matches of point slots along edges."""
+
+    target: Float[Array, "e p 2"]
+    """Matched pixel in keyframe j."""
+    weight: Float[Array, "e p"]
+    """Confidence weight, >= 0; 0 means no match."""
+
+
+class LineObservations(eqx.Module):
+    """Lines matched to line samples along edges."""
+
+    coefficients: Float[Array, "e l 3"]
+    """`(a, b, c)` with `a^2 + b^2 = 1`, of the line in keyframe j."""
+    weight: Float[Array, "e l"]
+    """Confidence weight, >= 0; 0 means no match."""
+
+
+class DepthPrior(eqx.Module):
+    """A metric inverse depth for each slot: residual `(d - mean) / sigma`, weight `alpha * weight`."""
+
+    mean: Float[Array, "n s"]
+    """1/m; any finite number where `weight` is 0."""
+    sigma: Float[Array, "n s"]
+    """Standard deviation, 1/m, > 0 (1 where `weight` is 0)."""
+    weight: Float[Array, "n s"]
+    """Confidence, >= 0; 0 means no prior."""
+    alpha: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=2.0)
+    """Weight of all depth terms against the pixels' (the paper's alpha)."""
+
+
+class IntrinsicsPrior(eqx.Module):
+    """Gaussian prior on the shared intrinsics, without a robust kernel."""
+
+    mean: Float[Array, "4"]
+    information: Float[Array, "4"]
+    """`1 / sigma^2`, pixels^-2; 0 = no prior."""
+
+
+class MarginalPrior(eqx.Module):
+    """What marginalisation left behind: `r = root (x boxminus linearisation) + offset` over poses and intrinsics.
+
+    Coordinates: six a keyframe (left tangent `log(T T_lin^-1)`, translation first), then the four intrinsics.
+    """
+
+    root: Float[Array, "c c"]
+    offset: Float[Array, " c"]
+    poses: jaxlie.SE3
+    """Linearisation points, batch `[n]`; kept as long as the prior lives (first estimates)."""
+    intrinsics: Float[Array, "4"]
+
+
+class Problem(eqx.Module):
+    """A bundle-adjustment problem; every float leaf may be differentiated."""
+
+    pixels: Float[Array, "n s 2"]
+    """Where slot s of keyframe i looks: point slots first, then line samples."""
+    edges: Edges
+    points: PointObservations
+    lines: LineObservations
+    depth: DepthPrior
+    intrinsics_prior: IntrinsicsPrior
+    fixed_pose: Bool[Array, " n"]
+    """Keyframes whose pose is held (the gauge)."""
+    fixed_intrinsics: Bool[Array, "4"]
+    """Intrinsics that are held."""
+    kernel: AbstractKernel = Huber()
+    marginal: MarginalPrior | None = None
+
+    @property
+    def num_keyframes(self) -> int:
+        return self.pixels.shape[0]
+
+    @property
+    def num_points(self) -> int:
+        """Point slots a keyframe."""
+        return self.points.weight.shape[1]
+
+    @property
+    def num_camera(self) -> int:
+        """Size of the dense part of the state: six a keyframe and four intrinsics."""
+        return 6 * self.num_keyframes + 4

@@ -1,0 +1,85 @@
+"""Problems and solutions as `.npz` files."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+
+from vggtgeo.errors import InputError
+from vggtgeo.files import atomic_open
+from vggtgeo.packing import Observations, SlotIndex, pack
+from vggtgeo.problem import Problem, State
+from vggtgeo.solvers.kernels import Huber
+
+REQUIRED = (
+    *("edges", "T_init", "k_init", "k_prior_sigma"),
+    *("var_kf", "var_uv", "d_init", "d_prior", "d_sigma", "d_weight"),
+    *("pt_edge", "pt_var", "pt_target", "pt_weight"),
+    *("ln_edge", "ln_var", "ln_abc", "ln_weight"),
+    *("alpha", "huber"),
+)
+
+
+def load_problem(path: Path, dtype: DTypeLike = np.float64) -> tuple[Problem, State, SlotIndex]:
+    """Read a problem: poses world -> camera `(qw, qx, qy, qz, tx, ty, tz)`, pixels, inverse depths in 1/m.
+
+    Raises:
+        InputError: the file is missing, is no `.npz`, lacks an array or holds one that does not fit.
+
+    """
+    arrays = _read(Path(path))
+    observations = Observations(
+        edges=arrays["edges"].astype(int),
+        host=arrays["var_kf"].astype(int),
+        pixel=arrays["var_uv"],
+        point_edge=arrays["pt_edge"].astype(int),
+        point_landmark=arrays["pt_var"].astype(int),
+        point_target=arrays["pt_target"],
+        point_weight=arrays["pt_weight"],
+        line_edge=arrays["ln_edge"].astype(int),
+        line_landmark=arrays["ln_var"].astype(int),
+        line_coefficients=arrays["ln_abc"],
+        line_weight=arrays["ln_weight"],
+        depth_mean=arrays["d_prior"],
+        depth_sigma=arrays["d_sigma"],
+        depth_weight=arrays["d_weight"],
+        alpha=float(arrays["alpha"]),
+    )
+    return pack(
+        observations,
+        arrays["T_init"],
+        arrays["k_init"],
+        arrays["d_init"],
+        intrinsics_sigma=arrays["k_prior_sigma"],
+        kernel=Huber(jnp.asarray(float(arrays["huber"]), dtype)),
+        dtype=dtype,
+    )
+
+
+def save_solution(path: Path, state: State, index: SlotIndex) -> None:
+    """Write a solution as `.npz`, atomically: `T [N, 7]`, `k [4]`, `d [D]` in the conventions of the problem's file."""
+    with atomic_open(path, "wb") as file:
+        np.savez(
+            file,
+            T=np.asarray(state.poses.wxyz_xyz),
+            k=np.asarray(state.intrinsics),
+            d=index.gather(state.inverse_depth),
+        )
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise InputError(f"`{path}` is no file; give the .npz of a bundle-adjustment problem")
+    try:
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(f"`{path}` cannot be read as .npz: {error}") from error
+    missing = [name for name in REQUIRED if name not in arrays]
+    if missing:
+        raise InputError(f"`{path}` lacks the arrays {', '.join(missing)}; the layout is in docs/problem-file.md")
+    return arrays

@@ -1,0 +1,15 @@
+"""Synthetic indoor worlds: rendered RGB and depth along hand-held walks, with exact truth for everything.
+
+A number measured here is a simulated number and is always called so.
+"""
+
+from vggtgeo.simulation.oracle import SimulatedOracle as SimulatedOracle
+from vggtgeo.simulation.render import Picture as Picture
+from vggtgeo.simulation.render import render as render
+from vggtgeo.simulation.scene import Scene as Scene
+from vggtgeo.simulation.sensor import IDEAL as IDEAL
+from vggtgeo.simulation.sensor import Sensor as Sensor
+from vggtgeo.simulation.sequence import SyntheticSequence as SyntheticSequence
+from vggtgeo.simulation.sequence import simulate as simulate
+from vggtgeo.simulation.tum_folder import write_tum_folder as write_tum_folder
+from vggtgeo.simulation.worlds import WORLDS as WORLDS

@@ -1,0 +1,178 @@
+"""Soft light on every surface, computed once a scene: lamps with shadows, and darkening in corners.
+
+The light that arrives does not depend on the camera, so the same point has the same colour in every frame (up to
+exposure and noise): what a photometric test needs. Irradiance is sampled on a grid of a few texels a surface and
+looked up bilinearly.
+
+    direct   = sum over lamps, over points of each lamp: power cos(theta) cos(theta_lamp) / (r^2 + 0.5) * unshadowed
+    ambient  = base * (1 - 0.55 * share of a cosine-weighted hemisphere that solid boxes block within 0.8 m)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from vggtgeo.simulation.atlas import look_up
+from vggtgeo.simulation.shapes import Blockers, Surfaces
+
+_WIDTH = 2048
+_AMBIENT_REACH = 0.8
+_BATCH = 60000  # segments times boxes tested at once: small enough for the cache
+_LAMP_CELLS = 3  # a lamp is sampled once in each of 3 x 3 cells
+
+
+@dataclass(frozen=True)
+class Lightmap:
+    """image: float32 [H, W], irradiance. corner: float32 [P, 2], texel of (s, t) = 0. density: [P, 2], texels a m."""
+
+    image: np.ndarray
+    corner: np.ndarray
+    density: np.ndarray
+
+    def sample(self, which: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Irradiance float32 [n] of surfaces `which` [n] at (s, t) [n], metres."""
+        x = self.corner[:, 0][which] + s * self.density[:, 0][which]
+        y = self.corner[:, 1][which] + t * self.density[:, 1][which]
+        return look_up(self.image, x, y)
+
+
+def bake(
+    surfaces: Surfaces, blockers: Blockers, lights: list[tuple], ambient: float, texel: float, seed: int
+) -> Lightmap:
+    """The lightmap of a scene with about one sample each `texel` metres."""
+    rng = np.random.default_rng([seed, 11])
+    counts = np.clip(np.ceil(surfaces.extent / texel).astype(int) + 1, 2, _WIDTH)
+    corner, height = _pack(counts)
+    image = np.zeros((height, _WIDTH), np.float32)
+    which, s, t, sizes = _texels(surfaces, counts)
+    points, normals = surfaces.points(which, s, t)
+    points += 0.012 * normals
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    light = _ambient(points, normals, blockers, starts, ambient, rng)
+    for lamp in lights:
+        light += _direct(points, normals, blockers, starts, lamp, rng)
+    for row, (width, rows) in enumerate(counts):
+        grid = light[starts[row] : starts[row + 1]].reshape(rows, width)
+        smooth = cv2.GaussianBlur(grid, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE)
+        x, y = corner[row]
+        image[y : y + rows, x : x + width] = smooth
+    density = (counts - 1) / surfaces.extent
+    return Lightmap(image, corner.astype(np.float32), density.astype(np.float32))
+
+
+def _pack(counts: np.ndarray) -> tuple[np.ndarray, int]:
+    """Shelf packing of [P, 2] (width, height) rectangles: corners [P, 2] and the height used."""
+    corner = np.zeros((len(counts), 2), int)
+    x = y = shelf = 0
+    for row in np.argsort(-counts[:, 1], kind="stable"):
+        width, height = counts[row]
+        if x + width > _WIDTH:
+            x, y, shelf = 0, y + shelf, 0
+        corner[row] = x, y
+        x, shelf = x + width, max(shelf, height)
+    return corner, int(y + shelf)
+
+
+def _texels(surfaces: Surfaces, counts: np.ndarray) -> tuple[np.ndarray, ...]:
+    """(surface, s, t) of every texel, and how many each surface has; outer texels lie 1 cm inside the border."""
+    which, s, t = [], [], []
+    for row, (width, height) in enumerate(counts):
+        margin = np.minimum(0.01, 0.1 * surfaces.extent[row])
+        across = np.clip(np.linspace(0, surfaces.extent[row, 0], width), margin[0], surfaces.extent[row, 0] - margin[0])
+        upward = np.clip(
+            np.linspace(0, surfaces.extent[row, 1], height), margin[1], surfaces.extent[row, 1] - margin[1]
+        )
+        grid_t, grid_s = np.meshgrid(upward, across, indexing="ij")
+        which.append(np.full(grid_s.size, row))
+        s.append(grid_s.ravel())
+        t.append(grid_t.ravel())
+    return np.concatenate(which), np.concatenate(s), np.concatenate(t), counts.prod(axis=1)
+
+
+def _ambient(
+    points: np.ndarray,
+    normals: np.ndarray,
+    blockers: Blockers,
+    starts: np.ndarray,
+    base: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    rays = 12
+    direction = rng.standard_normal((len(points), rays, 3), dtype=np.float32)
+    direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-6)
+    direction += normals[:, None]  # a uniform sphere on the tip of the normal: cosine-weighted directions
+    direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-6)
+    blocked = _shadowed(points, _AMBIENT_REACH * direction, blockers, starts)
+    return base * (1.0 - 0.55 * blocked.mean(axis=1))
+
+
+def _direct(
+    points: np.ndarray,
+    normals: np.ndarray,
+    blockers: Blockers,
+    starts: np.ndarray,
+    lamp: tuple,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    centre, size, power, reach = lamp
+    light = np.zeros(len(points))
+    towards = centre - points
+    near = np.nonzero((np.sum(towards**2, axis=1) < reach**2) & (np.einsum("nk,nk->n", towards, normals) > -0.5))[0]
+    to_lamp = np.repeat(towards[near][:, None], _LAMP_CELLS**2, axis=1)
+    cells = np.stack(np.divmod(np.arange(_LAMP_CELLS**2), _LAMP_CELLS), axis=1)
+    to_lamp[..., :2] += ((cells + rng.uniform(0, 1, (len(near), len(cells), 2))) / _LAMP_CELLS - 0.5) * size
+    square = np.sum(to_lamp**2, axis=2)
+    distance = np.sqrt(square)
+    cosine = np.maximum(np.einsum("nk,nsk->ns", normals[near], to_lamp), 0) / distance
+    downward = np.clip(to_lamp[..., 2] / distance, 0, 1)
+    gain = power * cosine * downward * np.clip(1 - (distance / reach) ** 4, 0, 1) / (square + 0.5)
+    lit = np.nonzero(gain.max(axis=1, initial=0.0) > 1e-4)[0]
+    spans = np.searchsorted(near[lit], starts)
+    shadow = _shadowed(points[near[lit]], 0.97 * to_lamp[lit], blockers, spans)
+    light[near[lit]] = (gain[lit] * ~shadow).mean(axis=1)
+    return light
+
+
+def _shadowed(points: np.ndarray, rays: np.ndarray, blockers: Blockers, starts: np.ndarray) -> np.ndarray:
+    """Whether the segments points [n, 3] -> points + rays [n, S, 3] meet a box: bool [n, S].
+
+    `starts` groups points that lie together, so that far boxes are left out at once.
+    """
+    points, rays = points.astype(np.float32), rays.astype(np.float32)
+    blocked = np.zeros(rays.shape[:2], bool)
+    reach = np.hypot(blockers.half[:, 0], blockers.half[:, 1])
+    reach = np.stack([reach, reach, blockers.half[:, 2]], axis=1)
+    low, high = blockers.centre - reach, blockers.centre + reach
+    for first, last in pairwise(starts.tolist()):
+        if first == last:
+            continue
+        at = points[first:last, None]
+        end = at + rays[first:last]
+        bottom = np.minimum(at.min(axis=(0, 1)), end.min(axis=(0, 1)))
+        top = np.maximum(at.max(axis=(0, 1)), end.max(axis=(0, 1)))
+        boxes = np.nonzero(np.all((low <= top) & (high >= bottom), axis=1))[0]
+        batch = max(1, _BATCH // (end.shape[0] * end.shape[1]))
+        for some in np.split(boxes, np.arange(batch, len(boxes), batch)):
+            blocked[first:last] |= _meets(at, rays[first:last], blockers, some)
+    return blocked
+
+
+def _meets(points: np.ndarray, rays: np.ndarray, blockers: Blockers, some: np.ndarray) -> np.ndarray:
+    """Slab test of segments points [n, 1, 3], rays [n, S, 3] against the boxes `some` [B]: bool [n, S]."""
+    yaw = blockers.yaw[some]
+    cos, sin = np.cos(yaw).astype(np.float32), np.sin(yaw).astype(np.float32)
+    half = blockers.half[some].astype(np.float32)
+    local = points[..., None, :] - blockers.centre[some].astype(np.float32)
+    turned = (cos * local[..., 0] + sin * local[..., 1], cos * local[..., 1] - sin * local[..., 0], local[..., 2])
+    x, y, z = (rays[..., k, None] for k in range(3))
+    enter, leave = np.float32(1e-4), np.float32(1.0)
+    for position, way, side in zip(turned, (cos * x + sin * y, cos * y - sin * x, z), half.T, strict=True):
+        inverse = np.float32(1.0) / np.where(np.abs(way) < 1e-9, np.float32(1e-9), way)
+        middle, reach = -position * inverse, side * np.abs(inverse)
+        enter = np.maximum(enter, middle - reach)
+        leave = np.minimum(leave, middle + reach)
+    return np.any(enter < leave, axis=-1)

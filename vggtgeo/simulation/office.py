@@ -1,0 +1,129 @@
+"""The `office`: an open-plan floor of 16 x 11 x 2.8 m with islands of desks, shelves and boards. Well textured."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from vggtgeo.simulation.furniture import (
+    DARK,
+    Place,
+    cabinet,
+    chair,
+    desk,
+    hang,
+    lamp_panel,
+    plant,
+    shelf,
+    sofa,
+    table,
+    wall,
+)
+from vggtgeo.simulation.room import BRICK, PLASTER, floor_and_ceiling
+from vggtgeo.simulation.scene import Scene, finish
+from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
+from vggtgeo.simulation.trajectories import Walk
+
+_SIZE = (16.0, 11.0)
+_HEIGHT = 2.8
+_ON_THE_WALL = {"poster": 0.3, "painting": 0.2, "board": 0.15, "whiteboard": 0.1, "window": 0.15, "door": 0.1}
+
+OFFICE_WALK = Walk(
+    way=np.array(
+        [
+            [8.0, 5.6, 1.60],
+            [14.6, 5.6, 1.55],
+            [14.6, 9.7, 1.60],
+            [8.0, 9.8, 1.55],
+            [1.4, 9.7, 1.60],
+            [1.4, 5.5, 1.60],
+            [1.4, 1.3, 1.55],
+            [8.0, 1.2, 1.60],
+            [14.6, 1.3, 1.60],
+            [14.6, 4.9, 1.55],
+            [9.0, 5.3, 1.60],
+            [8.0, 3.4, 1.60],
+            [7.0, 5.3, 1.55],
+        ]
+    ),
+    speed=0.7,
+    corner=0.40,
+    turn=0.45,
+    glance=0.45,
+    pitch=-0.14,
+)
+
+
+def build_office(seed: int) -> Scene:
+    """Four islands of four desks, lined by shelves, boards, doors and windows."""
+    b = SceneBuilder(seed)
+    floor_and_ceiling(b, (0, 0), _SIZE, _HEIGHT, Look("carpet", 1.3), Look("ceiling", 1.2, detail=0.05))
+    sx, sy = _SIZE
+    corners = [(0.0, 0.0), (0.0, sy), (sx, sy), (sx, 0.0), (0.0, 0.0)]
+    looks = (BRICK, PLASTER, PLASTER.tinted(0.86, 0.93, 1.0), PLASTER.tinted(1.0, 0.95, 0.85))
+    for side, (start, end) in enumerate(pairwise(corners)):
+        wall(b, start, end, _HEIGHT, looks[side])
+        length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
+        hang(b, start, end, 0.5 * length, 0.0, (length, 0.10), DARK, 0.015)
+        _dress(b, start, end, length, side)
+    variant = 0
+    for x in (4.5, 11.5):
+        for y in (3.4, 7.7):
+            _island(b, (x, y), variant)
+            variant += 4
+    _pillars_and_corners(b)
+    for x in (2.7, 6.2, 9.8, 13.3):
+        for y in (1.9, 5.5, 9.1):
+            lamp_panel(b, x, y, _HEIGHT, power=6.0, reach=7.0)
+    return finish(b, "office", ambient=0.34, exposure=0.70, texel=0.14)
+
+
+def _island(b: SceneBuilder, at: Vector, variant: int) -> None:
+    """Four desks back to back with screens of cloth between them."""
+    place = Place(at, 0.0)
+    for column, x in enumerate((-0.78, 0.78)):
+        for row, yaw in enumerate((0.0, np.pi)):
+            y = -0.40 if row == 0 else 0.40
+            number = variant + 2 * column + row
+            desk(b, place(x, y), yaw, number % 7)
+            turn = float(b.rng.uniform(-0.6, 0.6))
+            away = 2.4 * y + float(b.rng.uniform(-0.05, 0.10)) * np.sign(y)
+            chair(b, place(x + 0.1, away), yaw + np.pi + turn, (0.08, 0.12 + 0.05 * (number % 3), 0.30))
+    panel = Look("fabric", 0.6, tint=((0.25, 0.42, 0.50), (0.55, 0.30, 0.22), (0.35, 0.45, 0.22))[variant // 4 % 3])
+    b.box(place(0, 0, 0.55), (3.1, 0.03, 0.62), panel)
+    b.box(place(0, 0, 0.75), (0.03, 1.2, 0.35), panel)
+
+
+def _dress(b: SceneBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
+    """Things on one wall, about one in 2 m, in an order drawn from the seed."""
+    along, number = 1.1, 10 * side
+    while along < length - 1.0:
+        kind = str(b.rng.choice(list(_ON_THE_WALL), p=list(_ON_THE_WALL.values())))
+        look = Look(f"{kind}:{number}", None, emission=0.7 if kind == "window" else 0.0)
+        if kind == "door":
+            hang(b, start, end, along, 0.0, (0.95, 2.05), look, 0.05)
+        else:
+            width, height = b.rng.uniform([0.6, 0.6], [1.4, 1.1]) * (0.75 if kind == "poster" else 1.0)
+            hang(b, start, end, along, 1.05 + float(b.rng.uniform(0, 0.35)), (width, height), look, 0.03)
+        along += float(b.rng.uniform(1.5, 2.3))
+        number += 1
+
+
+def _pillars_and_corners(b: SceneBuilder) -> None:
+    """Low shelves along the walls, two pillars, and corners with plants and a sofa."""
+    for index, x in enumerate((3.6, 6.0, 10.4, 12.6)):
+        shelf(b, (x, 0.20), np.pi, 1.3, 0.85, 3 * index % 9)
+    for index, x in enumerate((4.4, 9.6, 12.2)):
+        shelf(b, (x, 10.80), 0.0, 1.3, (0.85, 1.9, 1.25)[index], 3 * index % 9)
+    cabinet(b, (15.72, 7.5), -0.5 * np.pi)
+    cabinet(b, (15.72, 3.1), -0.5 * np.pi, (1.2, 0.45, 0.8), "books:8")
+    sofa(b, (0.5, 7.4), 0.5 * np.pi, (0.24, 0.30, 0.12), 1.8)
+    cabinet(b, (0.28, 3.4), 0.5 * np.pi, (1.2, 0.45, 0.8), "books:7")
+    b.box((8.0, 7.7, 0), (0.5, 0.5, _HEIGHT), Look("concrete", 1.4))
+    b.box((8.0, 7.44, 1.2), (0.40, 0.02, 0.56), DARK, front=Look("poster:61", None))
+    b.box((8.0, 7.96, 1.2), (0.40, 0.02, 0.56), DARK, np.pi, front=Look("poster:62", None))
+    table(b, (8.0, 6.75), 0.0)
+    table(b, (8.0, 8.5), 0.0)
+    for at in ((0.5, 0.5), (15.5, 0.5), (15.5, 10.5), (0.5, 10.5), (8.0, 2.2), (6.6, 10.6)):
+        plant(b, at, 1.2 + 0.3 * float(b.rng.uniform()))

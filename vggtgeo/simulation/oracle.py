@@ -1,0 +1,137 @@
+"""The truth about a synthetic sequence, asked by image: what the stubs of the five roles stand on.
+
+A role is given images, not frame numbers. The oracle therefore hands the sequence's frames out itself (it is a
+`Sequence`) and remembers the fingerprint of each image it gave.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vggtgeo.camera import Camera
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.errors import InputError
+from vggtgeo.simulation.raster import View, view_from
+from vggtgeo.simulation.render import Picture
+from vggtgeo.simulation.sequence import SyntheticSequence
+from vggtgeo.simulation.truth import (
+    VisibleEdges,
+    farthest_depth,
+    is_visible,
+    locate,
+    project,
+    texture_strength,
+    visible_edges,
+)
+from vggtgeo.trajectory import Trajectory
+
+_KEPT_FRAMES = 14  # about 10 MB each at 640 x 480
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    picture: Picture
+    view: View
+    texture: np.ndarray
+    farthest: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedOracle:
+    """A `Sequence` that knows the truth about each image it has given."""
+
+    sequence: SyntheticSequence
+    _given: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
+    _cache: OrderedDict[int, _Known] = field(default_factory=OrderedDict, repr=False)
+
+    @property
+    def name(self) -> str:
+        return self.sequence.name
+
+    @property
+    def camera(self) -> Camera:
+        return self.sequence.camera
+
+    @property
+    def has_depth(self) -> bool:
+        return self.sequence.has_depth
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """fx, fy, cx, cy, float64 [4], pixels."""
+        return np.array(self.camera.intrinsics)
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """The sequence's frames; each is known to `index_of` from then on."""
+        for frame in self.sequence.frames(start, end, stride):
+            self._given[_fingerprint(frame.image)] = frame.index
+            yield frame
+
+    def ground_truth(self) -> Trajectory:
+        return self.sequence.ground_truth()
+
+    def index_of(self, image: np.ndarray) -> int:
+        """The frame whose image this is; InputError for an image that `frames` has not given."""
+        index = self._given.get(_fingerprint(image))
+        if index is None:
+            raise InputError(
+                "`image` is no image that this simulated sequence has given; stubs know the frames of the oracle's "
+                "own `frames()` only: feed the pipeline from the oracle, unchanged"
+            )
+        return index
+
+    def timestamp(self, index: int) -> float:
+        """Seconds."""
+        return self.sequence.timestamp(index)
+
+    def pose(self, index: int) -> np.ndarray:
+        """True pose, world -> camera, float64 [4, 4]."""
+        return self.sequence.pose(index)
+
+    def depth(self, index: int) -> np.ndarray:
+        """True depth float64 [H, W], metres, NaN = none."""
+        return self._known(index).picture.depth
+
+    def glass(self, index: int) -> np.ndarray:
+        """Pixels seen through glass, bool [H, W]."""
+        return self._known(index).picture.glass
+
+    def texture(self, index: int) -> np.ndarray:
+        """Strength of texture, float32 [H, W] in [0, 1)."""
+        return self._known(index).texture
+
+    def edges(self, index: int) -> VisibleEdges:
+        """Visible parts of the scene's straight edges."""
+        return visible_edges(self.sequence.scene, self.pose(index), self.camera, self._known(index).picture)
+
+    def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where `pixels` [n, 2] of frame i are in frame j, float64 [n, 2], and whether they are seen there, bool."""
+        known = self._known(index_i)
+        points, there = locate(known.view, self.pose(index_i), self.camera, known.picture, pixels)
+        target, depth = project(points, self.pose(index_j), self.camera)
+        return target, there & is_visible(target, depth, self._known(index_j).farthest)
+
+    def _known(self, index: int) -> _Known:
+        known = self._cache.pop(index, None) or self._learn(index)
+        self._cache[index] = known
+        if len(self._cache) > _KEPT_FRAMES:
+            self._cache.popitem(last=False)
+        return known
+
+    def _learn(self, index: int) -> _Known:
+        picture = self.sequence.picture(index)
+        view = view_from(self.sequence.scene.surfaces, self.pose(index))
+        return _Known(picture, view, texture_strength(picture), farthest_depth(picture))
+
+
+def _fingerprint(image: np.ndarray) -> tuple[int, int]:
+    data = np.ascontiguousarray(image).tobytes()
+    return zlib.crc32(data), zlib.adler32(data)

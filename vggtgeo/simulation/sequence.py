@@ -1,0 +1,144 @@
+"""A walk through a synthetic scene, as a sequence of frames that are rendered when they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vggtgeo.camera import Camera
+from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.errors import InputError
+from vggtgeo.simulation.render import Picture, render
+from vggtgeo.simulation.scene import Scene
+from vggtgeo.simulation.sensor import Sensor
+from vggtgeo.simulation.trajectories import HandheldMotion
+from vggtgeo.simulation.worlds import WORLDS
+from vggtgeo.trajectory import Trajectory
+
+_BAND = 16  # rows that share one pose under rolling exposure
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticSequence:
+    """Frames of a synthetic scene (a `Sequence`), and exact truth about each of them.
+
+    scene: what is seen. motion: pose as a function of time. camera: ideal pinhole. sensor: its errors. count: number
+    of frames. rate: frames a second. seed: of the noise. Everything follows from these alone.
+    """
+
+    scene: Scene
+    motion: HandheldMotion
+    camera: Camera
+    sensor: Sensor
+    count: int
+    rate: float
+    seed: int
+    has_depth: bool = field(default=True)
+
+    @property
+    def name(self) -> str:
+        return f"synthetic {self.scene.name}, seed {self.seed}"
+
+    def __len__(self) -> int:
+        return self.count
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """Renders the frames at start, start + stride, ... below end; InputError if that selects none."""
+        check_selection(self.name, self.count, start, end, stride)
+        for index in range(start, min(self.count, end or self.count), stride):
+            yield self.frame(index)
+
+    def ground_truth(self) -> Trajectory:
+        """The exact poses, camera -> world."""
+        times = np.array([self.timestamp(k) for k in range(self.count)])
+        return Trajectory(times, np.array([self.motion.camera_to_world(time) for time in times]))
+
+    def timestamp(self, index: int) -> float:
+        """Seconds; the middle of the exposure."""
+        return index / self.rate
+
+    def pose(self, index: int) -> np.ndarray:
+        """True pose of a frame, world -> camera, float64 [4, 4]."""
+        return self._pose_at(self.timestamp(index))
+
+    def frame(self, index: int) -> Frame:
+        """One frame as the sensor sees it."""
+        rng = np.random.default_rng([self.seed, 19, index])
+        picture = self.picture(index)
+        light = self._exposed(index, picture) * np.float32(self.sensor.gain(self.timestamp(index)))
+        image = self.sensor.image(light, rng)
+        depth = self.sensor.depth(picture.depth, rng) if self.has_depth else None
+        return Frame(index, self.timestamp(index), image, depth, f"{self.scene.name}-{index:05d}")
+
+    def picture(self, index: int) -> Picture:
+        """What an ideal camera sees at the frame's instant: light, exact depth, surfaces, glass."""
+        return self._render(self.pose(index), 0, self.camera.height)
+
+    def true_depth(self, index: int) -> np.ndarray:
+        """Exact depth, float64 [H, W], metres; NaN where no surface is."""
+        return self.picture(index).depth
+
+    def _pose_at(self, time: float) -> np.ndarray:
+        return np.linalg.inv(self.motion.camera_to_world(time))
+
+    def _render(self, pose: np.ndarray, top: int, bottom: int) -> Picture:
+        fx, fy, cx, cy = self.camera.intrinsics
+        return render(self.scene, pose, (fx, fy, cx, cy - top), (self.camera.width, bottom - top))
+
+    def _exposed(self, index: int, picture: Picture) -> np.ndarray:
+        """Light [H, W, 3] gathered over the open shutter, row by row where the exposure rolls."""
+        sensor, middle, height = self.sensor, self.timestamp(index), self.camera.height
+        if not sensor.exposure_time and not sensor.readout_time:
+            return picture.light
+        count = sensor.blur_samples if sensor.exposure_time else 1
+        instants = middle + sensor.exposure_time * ((np.arange(count) + 0.5) / count - 0.5)
+        band = _BAND if sensor.readout_time else height
+        light = np.zeros_like(picture.light)
+        for top in range(0, height, band):
+            bottom = min(top + band, height)
+            late = sensor.readout_time * (0.5 * (top + bottom) / height - 0.5)
+            for time in instants:
+                light[top:bottom] += self._render(self._pose_at(time + late), top, bottom).light / np.float32(count)
+        return light
+
+
+def simulate(
+    scene: str = "room",
+    frames: int = 60,
+    seed: int = 0,
+    size: tuple[int, int] = (640, 480),
+    *,
+    rate: float = 30.0,
+    speed: float | None = None,
+    sensor: Sensor | None = None,
+) -> SyntheticSequence:
+    """A hand-held walk of `frames` frames through the built-in `scene`.
+
+    scene: a key of `WORLDS`. size: (width, height), pixels. rate: frames a second. speed: metres a second, None for
+    the scene's own. sensor: error model, None for `Sensor()`. The horizontal field of view is 62 degrees.
+    Raises InputError for an unknown scene or a number that is not positive.
+    """
+    if scene not in WORLDS:
+        raise InputError(f"`scene` is {scene!r}; it must be one of {', '.join(WORLDS)}")
+    for name, value in (
+        ("frames", frames),
+        ("size", min(size)),
+        ("rate", rate),
+        ("speed", 1.0 if speed is None else speed),
+    ):
+        if value <= 0:
+            raise InputError(f"`{name}` is {value}; it must be positive")
+    build, walk = WORLDS[scene]
+    motion = HandheldMotion.along(walk, seed)
+    if speed is not None:
+        motion = motion.at_speed(speed)
+    return SyntheticSequence(build(seed), motion, camera_of(size), sensor or Sensor(), frames, rate, seed)
+
+
+def camera_of(size: tuple[int, int]) -> Camera:
+    """The simulated camera for images of `size` = (width, height): ideal, 62 degrees wide."""
+    width, height = size
+    focal = 0.832 * width
+    return Camera((focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), width, height)

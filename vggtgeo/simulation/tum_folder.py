@@ -1,0 +1,56 @@
+"""Writes a synthetic sequence as a TUM RGB-D folder, so that any SLAM system can run it.
+
+`rgb/`, `depth/` (16-bit PNG, metres x 5000, 0 = none), `rgb.txt`, `depth.txt`, `groundtruth.txt`, and
+`calibration.txt` (fx fy cx cy). The lists are written last: a folder without them was interrupted.
+"""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.errors import InputError
+from vggtgeo.files import write_text
+from vggtgeo.simulation.sequence import SyntheticSequence
+
+_DEPTH_UNITS = 5000.0
+_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+
+
+def write_tum_folder(sequence: SyntheticSequence, folder: str | os.PathLike[str]) -> Iterator[Frame]:
+    """Renders `sequence` into `folder`, giving each frame once it is written (for a progress bar).
+
+    Raises InputError if `folder` is there and not empty, or cannot be written.
+    """
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"`{target}` is there and not an empty folder; give the name of a new one")
+    for part in ("rgb", "depth"):
+        (target / part).mkdir(parents=True, exist_ok=True)
+    names = []
+    for frame in sequence.frames():
+        name = f"{frame.timestamp:.6f}.png"
+        _write(target / "rgb" / name, np.ascontiguousarray(frame.image[..., ::-1]))
+        if frame.depth is not None:
+            _write(target / "depth" / name, _depth_code(frame.depth))
+        names.append((frame.timestamp, name))
+        yield frame
+    fx, fy, cx, cy = sequence.camera.intrinsics
+    write_text(target / "calibration.txt", f"{fx:.9g} {fy:.9g} {cx:.9g} {cy:.9g}\n")
+    sequence.ground_truth().save_tum(target / "groundtruth.txt")
+    for part in ("rgb", "depth") if sequence.has_depth else ("rgb",):
+        lines = "".join(f"{time:.6f} {part}/{name}\n" for time, name in names)
+        write_text(target / f"{part}.txt", f"# {sequence.name} (simulated)\n# timestamp filename\n{lines}")
+
+
+def _depth_code(depth: np.ndarray) -> np.ndarray:
+    code = np.nan_to_num(depth * _DEPTH_UNITS, nan=0.0, posinf=0.0)
+    return np.where(code < 65535, np.rint(code), 0).astype(np.uint16)
+
+
+def _write(path: Path, image: np.ndarray) -> None:
+    if not cv2.imwrite(str(path), image, _FAST):
+        raise InputError(f"`{path}` could not be written; check that the disk has space and the folder allows it")

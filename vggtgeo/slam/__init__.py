@@ -1,0 +1,1 @@
+"""The SLAM pipeline: a fold over frames."""

@@ -1,0 +1,241 @@
+"""From keyframes and their matches to a bundle-adjustment problem, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vggtgeo.models.classical import line_coefficients
+from vggtgeo.packing import Observations, PaddedSize, SlotIndex, pack
+from vggtgeo.problem import MarginalPrior, Problem, State
+from vggtgeo.slam import rigid
+from vggtgeo.slam.covisibility import Directed
+from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.settings import SlamSettings
+
+LEAST_INVERSE_DEPTH = 1e-3
+"""1/m; a landmark starts no farther than a kilometre away."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """A packed problem and the way back: local host and slot number of each landmark (points, then line samples)."""
+
+    problem: Problem
+    initial: State
+    index: SlotIndex
+    host: np.ndarray
+    slot: np.ndarray
+    is_line: np.ndarray
+    informed: np.ndarray
+    """Whether measurements determine the landmark's depth well enough to be used elsewhere, `[D]`."""
+
+
+def build(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    intrinsics: np.ndarray,
+    settings: SlamSettings,
+    *,
+    size: PaddedSize | None,
+    intrinsics_sigma: np.ndarray | None,
+    fixed_pose: np.ndarray,
+    marginal: MarginalPrior | None = None,
+) -> Adjustment:
+    """Pack `keyframes` (at most `size.keyframes`) and the directed edges between them.
+
+    Of each host at most `point_slots` key points (those with the most observations) and `line_slots` line samples
+    (of the segments with the most) take part.
+    """
+    local = {keyframe.number: i for i, keyframe in enumerate(keyframes)}
+    points = _Selection.points(keyframes, edges, local, settings)
+    lines = _Selection.lines(keyframes, edges, local, settings)
+    depths, informed = _initial_depths(keyframes, edges, local, points, intrinsics)
+    host = np.concatenate([points.host, lines.host])
+    slots = [(keyframes[h].points, s) for h, s in zip(points.host, points.slot, strict=True)]
+    slots += [(keyframes[h].samples, s) for h, s in zip(lines.host, lines.slot, strict=True)]
+    read = lambda name: np.array([getattr(group, name)[s] for group, s in slots]).reshape(len(slots), -1)
+    prior, sigma = read("prior")[:, 0], read("sigma")[:, 0]
+    has_prior = np.isfinite(prior) & np.isfinite(sigma)
+    depths = np.concatenate([depths, np.where(np.isfinite(prior[len(points.host) :]), prior[len(points.host) :], 0.5)])
+    weight = np.where(has_prior, read("prior_confidence")[:, 0] if settings.use_confidence else 1.0, 0.0)
+    point_rows = _point_rows(keyframes, edges, local, points, settings)
+    line_rows = _line_rows(keyframes, edges, local, lines, settings, len(points.host))
+    observations = Observations(
+        edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),
+        host=host,
+        pixel=read("pixels").reshape(-1, 2),
+        **point_rows,
+        **line_rows,
+        depth_mean=np.where(has_prior, prior, 1.0),
+        depth_sigma=np.where(has_prior, sigma, 1.0),
+        depth_weight=weight if settings.depth_weight > 0 else np.zeros_like(weight),
+        alpha=settings.depth_weight,
+    )
+    problem, initial, index = pack(
+        observations,
+        rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
+        intrinsics,
+        np.maximum(depths, LEAST_INVERSE_DEPTH),
+        size=size,
+        intrinsics_sigma=intrinsics_sigma,
+        fixed_pose=fixed_pose,
+        fixed_intrinsics=intrinsics_sigma is None,
+        kernel=settings.kernel,
+    )
+    problem = replace(problem, marginal=marginal)
+    return Adjustment(
+        problem=problem,
+        initial=initial,
+        index=index,
+        host=host,
+        slot=np.concatenate([points.slot, lines.slot]),
+        is_line=np.arange(len(host)) >= len(points.host),
+        informed=np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior,
+    )
+
+
+def write_back(
+    keyframes: Sequence[Keyframe], adjustment: Adjustment, state: State
+) -> tuple[tuple[Keyframe, ...], np.ndarray]:
+    """The keyframes with adjusted poses and inverse depths, and the adjusted intrinsics."""
+    poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
+    depths = adjustment.index.gather(state.inverse_depth)
+    updated = []
+    for i, keyframe in enumerate(keyframes):
+        here = (adjustment.host == i) & adjustment.informed
+        points = _updated(keyframe.points, adjustment, depths, here & ~adjustment.is_line)
+        samples = _updated(keyframe.samples, adjustment, depths, here & adjustment.is_line)
+        updated.append(replace(keyframe, pose=poses[i], points=points, samples=samples))
+    return tuple(updated), np.asarray(state.intrinsics, np.float64)
+
+
+def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.ndarray) -> Slots:
+    inverse = slots.inverse_depth.copy()
+    inverse[adjustment.slot[here]] = depths[here]
+    return replace(slots, inverse_depth=inverse)
+
+
+@dataclass(frozen=True, eq=False)
+class _Selection:
+    """Chosen slots, sorted by host, and a table from (host, slot) to landmark, -1 = not chosen."""
+
+    host: np.ndarray
+    slot: np.ndarray
+    table: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, chosen: list[np.ndarray], sizes: list[int]) -> _Selection:
+        host = np.repeat(np.arange(len(chosen)), [len(c) for c in chosen])
+        starts = np.cumsum([0, *(len(c) for c in chosen)])
+        tables = []
+        for size, slots, start in zip(sizes, chosen, starts[:-1], strict=True):
+            table = np.full(size, -1)
+            table[slots] = start + np.arange(len(slots))
+            tables.append(table)
+        return cls(host, np.concatenate([*chosen, np.zeros(0, int)]).astype(int), tuple(tables))
+
+    @classmethod
+    def points(cls, keyframes, edges, local, settings: SlamSettings) -> _Selection:
+        counts = [np.zeros(len(keyframe.features)) for keyframe in keyframes]
+        for edge in edges:
+            counts[local[edge.host]][edge.slots] += 1 + 0.1 * edge.confidence
+        chosen = []
+        for count in counts:
+            order = np.argsort(-count, kind="stable")[: settings.point_slots]
+            chosen.append(np.sort(order[count[order] > 0]))
+        return cls.of(chosen, [len(c) for c in counts])
+
+    @classmethod
+    def lines(cls, keyframes, edges, local, settings: SlamSettings) -> _Selection:
+        counts = [np.zeros(len(keyframe.lines)) for keyframe in keyframes]
+        for edge in edges:
+            counts[local[edge.host]][edge.line_slots] += 1 + 0.1 * edge.line_confidence
+        chosen = []
+        for keyframe, count in zip(keyframes, counts, strict=True):
+            known = np.isfinite(keyframe.samples.prior)
+            length = np.bincount(keyframe.sample_segment, minlength=len(count))
+            order = np.argsort(-count, kind="stable")
+            order = order[count[order] > 0]
+            order = order[np.cumsum(length[order]) <= settings.line_slots]
+            chosen.append(np.nonzero(np.isin(keyframe.sample_segment, order) & known)[0])
+        return cls.of(chosen, [len(keyframe.sample_segment) for keyframe in keyframes])
+
+
+def _point_rows(keyframes, edges, local, points: _Selection, settings: SlamSettings) -> dict[str, np.ndarray]:
+    edge_ids, landmarks, targets, weights = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros(0)]
+    for number, edge in enumerate(edges):
+        host = local[edge.host]
+        landmark = points.table[host][edge.slots]
+        chosen = landmark >= 0
+        # A slot is matched once on an edge; a matcher that gives two targets keeps the last.
+        edge_ids.append(np.full(np.count_nonzero(chosen), number))
+        landmarks.append(landmark[chosen])
+        targets.append(edge.pixels[chosen])
+        omega = keyframes[host].points.confidence[edge.slots[chosen]]
+        weights.append(_weight(edge.confidence[chosen] * omega, settings))
+    return dict(
+        point_edge=np.concatenate(edge_ids),
+        point_landmark=np.concatenate(landmarks),
+        point_target=np.concatenate(targets),
+        point_weight=np.concatenate(weights),
+    )
+
+
+def _line_rows(keyframes, edges, local, lines: _Selection, settings: SlamSettings, offset: int):
+    edge_ids, landmarks, coefficients, weights = (
+        [np.zeros(0, int)],
+        [np.zeros(0, int)],
+        [np.zeros((0, 3))],
+        [np.zeros(0)],
+    )
+    for number, edge in enumerate(edges):
+        host, target = local[edge.host], keyframes[local[edge.target]]
+        matched = np.full(len(keyframes[host].lines), -1)
+        matched[edge.line_slots] = np.arange(len(edge.line_slots))
+        of_sample = matched[keyframes[host].sample_segment]
+        chosen = (of_sample >= 0) & (lines.table[host] >= 0)
+        if not np.any(chosen):
+            continue
+        of_line = line_coefficients(target.lines.segments.endpoints)
+        edge_ids.append(np.full(np.count_nonzero(chosen), number))
+        landmarks.append(offset + lines.table[host][chosen])
+        coefficients.append(of_line[edge.line_targets[of_sample[chosen]]])
+        omega = keyframes[host].samples.confidence[chosen]
+        weights.append(_weight(edge.line_confidence[of_sample[chosen]] * omega, settings) * settings.line_weight)
+    return dict(
+        line_edge=np.concatenate(edge_ids),
+        line_landmark=np.concatenate(landmarks),
+        line_coefficients=np.concatenate(coefficients),
+        line_weight=np.concatenate(weights),
+    )
+
+
+def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:
+    if not settings.use_confidence:
+        return np.ones_like(confidence)
+    return settings.confidence_gain * confidence + settings.confidence_floor
+
+
+def _initial_depths(keyframes, edges, local, points: _Selection, intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth of each point landmark: its estimate, else triangulated; and whether views determine it."""
+    current = np.array([keyframes[h].points.inverse_depth[s] for h, s in zip(points.host, points.slot, strict=True)])
+    weighted, information = np.zeros(len(current)), np.zeros(len(current))
+    for edge in edges:
+        host, target = keyframes[local[edge.host]], keyframes[local[edge.target]]
+        landmark = points.table[local[edge.host]][edge.slots]
+        chosen = landmark >= 0
+        relative = target.pose @ rigid.invert(host.pose)
+        value, weight = rigid.triangulate(
+            host.features.pixels[edge.slots[chosen]], edge.pixels[chosen], relative, intrinsics
+        )
+        np.add.at(weighted, landmark[chosen], weight * value)
+        np.add.at(information, landmark[chosen], weight)
+    triangulated = weighted / np.maximum(information, 1e-12)
+    good = (information > 0) & (triangulated > LEAST_INVERSE_DEPTH) & (triangulated * np.sqrt(information) > 5.0)
+    known = np.isfinite(current)
+    typical = np.median(current[known]) if np.any(known) else (np.median(triangulated[good]) if np.any(good) else 1.0)
+    depths = np.where(known, current, np.where(good, triangulated, typical))
+    return depths.astype(np.float64), good

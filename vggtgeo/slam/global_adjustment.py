@@ -1,0 +1,101 @@
+"""The last look at the whole map: edges between keyframes that saw the same place at different times, and one
+adjustment of all keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
+from vggtgeo.packing import PaddedSize
+from vggtgeo.slam import rigid
+from vggtgeo.slam.adjustment import build, write_back
+from vggtgeo.slam.covisibility import Directed, Pair, directions, overlap, some_points
+from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.window import solve_jit
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+
+
+def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
+    """Match keyframes that should see the same place by the current estimate but have not been matched yet."""
+    known = {pair.key for pair in slam.pairs}
+    found = []
+    for first, second in _candidates(slam, settings, known):
+        pair = _verified(slam.keyframes[first], slam.keyframes[second], roles, settings, slam.intrinsics)
+        if pair is not None:
+            found.append(pair)
+    return replace(slam, pairs=(*slam.pairs, *found))
+
+
+def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
+    """Bundle-adjust every keyframe."""
+    if len(slam.keyframes) < 3 or not slam.pairs:
+        return slam
+    by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
+    edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
+    edges = _thin(edges, len(slam.keyframes), settings)
+    ranks = max(np.bincount([edge.host for edge in edges]))
+    size = PaddedSize(
+        len(slam.keyframes), settings.point_slots, settings.line_slots, int(ranks), len(edges)
+    )
+    fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
+    adjustment = build(
+        slam.keyframes,
+        edges,
+        slam.intrinsics,
+        settings,
+        size=size,
+        intrinsics_sigma=slam.intrinsics_sigma,
+        fixed_pose=fixed,
+    )
+    solver = SchurLevenbergMarquardt(max_iterations=settings.global_iterations, rtol=1e-5)
+    solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
+    if not np.isfinite(float(solution.energy)):
+        return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
+    keyframes, intrinsics = write_back(slam.keyframes, adjustment, solution.state)
+    return replace(slam, keyframes=keyframes, intrinsics=intrinsics, solved=None)
+
+
+def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:
+    """At most `global_neighbours` edges a host: those with the most matches."""
+    kept = []
+    for host in range(keyframes):
+        own = sorted((edge for edge in edges if edge.host == host), key=lambda edge: -len(edge.slots))
+        kept += own[: settings.global_neighbours]
+    return kept
+
+
+def _candidates(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Unmatched pairs by how much of one should be visible in the other, the best few of each keyframe."""
+    chosen = []
+    samples = [some_points(keyframe, slam.intrinsics) for keyframe in slam.keyframes]
+    for second in slam.keyframes:
+        scored = []
+        for first in slam.keyframes[: max(second.number - settings.window, 0)]:
+            if (first.number, second.number) in known:
+                continue
+            share = overlap(samples[first.number], second, slam.intrinsics)
+            turned = rigid.angle_between(first.pose, second.pose)
+            if share > 0.4 and turned < np.deg2rad(40):
+                scored.append((share - turned, first.number))
+        chosen += [(number, second.number) for _, number in sorted(scored, reverse=True)[: settings.loop_candidates]]
+    return chosen
+
+
+def _verified(
+    first: Keyframe, second: Keyframe, roles: Roles, settings: SlamSettings, intrinsics: np.ndarray
+) -> Pair | None:
+    """Matches that agree on one pose of the second keyframe in the first one's points, whatever the drift."""
+    matches = roles.points.match(first.features, second.features)
+    inverse = first.points.inverse_depth[matches.index_i]
+    known = np.isfinite(inverse)
+    matches, inverse = matches.select(known), inverse[known]
+    points = rigid.unproject(matches.pixels_i, inverse, first.pose, intrinsics)
+    guess = roles.geometry.locate(PoseQuery(second.image, intrinsics, points, matches.pixels_j, matches.confidence))
+    if guess.result is not GeometryResult.SUCCESS or guess.inlier_count <= settings.least_covisible:
+        return None
+    empty = np.zeros(0, int)
+    return Pair(first.number, second.number, matches.select(guess.inliers), LineMatches(empty, empty, np.zeros(0)))

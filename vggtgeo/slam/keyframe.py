@@ -1,0 +1,126 @@
+"""A keyframe: an image with everything that was measured in it, and the estimates that hang on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.models.classical import sample_segments, segment_depths
+from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures
+from vggtgeo.slam.settings import Roles, SlamSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Slots:
+    """Pixels of one keyframe that carry an inverse depth: key points, or samples of its segments.
+
+    pixels: float [m, 2]. inverse_depth: float [m], 1/m, NaN = not known yet. prior, sigma: float [m], metric inverse
+    depth and its standard deviation, 1/m, NaN = none. prior_confidence: float [m] in [0, 1].
+    confidence: float [m] in [0, 1], how far the image can be trusted there.
+    """
+
+    pixels: np.ndarray
+    inverse_depth: np.ndarray
+    prior: np.ndarray
+    sigma: np.ndarray
+    prior_confidence: np.ndarray
+    confidence: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; what the
+    roles measured; and the slots of its points and line samples (`sample_segment` int [m]: segment of each sample).
+    """
+
+    number: int
+    frame: int
+    timestamp: float
+    pose: np.ndarray
+    image: np.ndarray
+    features: Features
+    lines: LineFeatures
+    line_depths: np.ndarray
+    depth: DepthEstimate
+    confidence: np.ndarray
+    points: Slots
+    samples: Slots
+    sample_segment: np.ndarray
+
+
+def make_keyframe(
+    number: int,
+    frame: Frame,
+    pose: np.ndarray,
+    features: Features,
+    roles: Roles,
+    settings: SlamSettings,
+    intrinsics: np.ndarray,
+) -> Keyframe:
+    """Run the roles that only keyframes need, and read depth and confidence at key points and line samples."""
+    depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
+    confidence = roles.confidence.confidence(frame.image)
+    lines = _detect_lines(frame, roles, settings)
+    ends = lines.segments.endpoints
+    line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
+    segment, pixels, fraction = sample_segments(ends, settings.line_spacing)
+    points = _slots_at(features.pixels, depth, confidence)
+    samples = _slots_at(pixels, depth, confidence)
+    on_line = _along_segments(line_depths, segment, fraction)
+    return Keyframe(
+        number=number,
+        frame=frame.index,
+        timestamp=frame.timestamp,
+        pose=pose,
+        image=frame.image,
+        features=features,
+        lines=lines,
+        line_depths=line_depths,
+        depth=depth,
+        confidence=confidence.astype(np.float16),
+        points=points,
+        samples=_with_line_depth(samples, on_line),
+        sample_segment=segment,
+    )
+
+
+def _detect_lines(frame: Frame, roles: Roles, settings: SlamSettings) -> LineFeatures:
+    segments = roles.lines.detect(frame.image)
+    if not settings.use_lines:
+        segments = type(segments)(segments.endpoints[:0], segments.scores[:0])
+    return roles.line_matches.describe(frame.image, segments)
+
+
+def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) -> Slots:
+    z, sigma_rel, trust = (_read(image, pixels) for image in (depth.depth, depth.sigma_rel, depth.confidence))
+    inverse = 1.0 / z
+    return Slots(pixels, inverse, inverse, sigma_rel * inverse, np.nan_to_num(trust), _read(confidence, pixels))
+
+
+def _read(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """The nearest pixel's value, float64 [m]."""
+    height, width = image.shape
+    columns, rows = np.rint(pixels).astype(int).T
+    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
+
+
+def _along_segments(line_depths: np.ndarray, segment: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Inverse depth of each sample from its segment's ends: affine along the image of a straight line."""
+    inverse = 1.0 / line_depths[segment]
+    return inverse[:, 0] + fraction * (inverse[:, 1] - inverse[:, 0])
+
+
+def _with_line_depth(samples: Slots, on_line: np.ndarray) -> Slots:
+    """An edge of an object lies on a jump of depth, where a single pixel's depth is a coin toss: trust the line fit."""
+    known = np.isfinite(on_line)
+    floor = 0.02 * on_line
+    return Slots(
+        pixels=samples.pixels,
+        inverse_depth=np.where(known, on_line, np.nan),
+        prior=np.where(known, on_line, np.nan),
+        sigma=np.where(known, np.fmax(np.nan_to_num(samples.sigma), floor), np.nan),
+        prior_confidence=np.where(known, np.maximum(samples.prior_confidence, 0.3), 0.0),
+        confidence=samples.confidence,
+    )

@@ -1,0 +1,112 @@
+"""Everything a run leaves behind, each file written atomically."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vggtgeo.dense import map_points, optimised_depth
+from vggtgeo.errors import InputError
+from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
+from vggtgeo.files import atomic_path, write_json
+from vggtgeo.plots import plot_trajectory
+from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
+from vggtgeo.slam.state import Slam
+from vggtgeo.trajectory import Trajectory
+
+DEPTH_UNIT = 5000.0
+"""Counts a metre in the 16-bit depth images, as in the TUM RGB-D format."""
+
+
+def write_trajectories(folder: Path, slam: Slam) -> None:
+    """`trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world."""
+    frame_trajectory(slam).save_tum(folder / "trajectory.txt")
+    keyframe_trajectory(slam).save_tum(folder / "keyframes.txt")
+
+
+def write_map(folder: Path, slam: Slam) -> int:
+    """`map.ply`; returns the number of points."""
+    cloud = map_points(slam.keyframes, slam.intrinsics)
+    cloud.save_ply(folder / "map.ply")
+    return len(cloud)
+
+
+def write_depth(folder: Path, slam: Slam) -> None:
+    """`depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none) and `depth/NNNNNN.confidence.png` (8 bit) a keyframe."""
+    for keyframe in slam.keyframes:
+        depth = optimised_depth(keyframe)
+        counts = np.clip(np.nan_to_num(depth) * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
+        confidence = (255 * keyframe.depth.confidence).round().astype(np.uint8)
+        for name, image in (("depth", counts), ("confidence", confidence)):
+            with atomic_path(folder / "depth" / f"{keyframe.frame:06d}.{name}.png") as temporary:
+                cv2.imwrite(os.fspath(temporary), image)
+
+
+def write_plot(folder: Path, slam: Slam, truth: Trajectory | None, title: str) -> None:
+    """`trajectory.png`: top and side view, the truth beside it where it is known."""
+    plot_trajectory(
+        folder / "trajectory.png",
+        frame_trajectory(slam),
+        truth,
+        keyframe_trajectory(slam),
+        with_scale=not slam.metric,
+        title=title,
+    )
+
+
+def compare(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:
+    """Errors against the truth; None where there is none, or too few poses match it in time."""
+    if truth is None:
+        return None
+    try:
+        return evaluate_trajectory(frame_trajectory(slam), truth)
+    except InputError:
+        return None
+
+
+def write_summary(
+    folder: Path,
+    slam: Slam,
+    settings: Mapping[str, Any],
+    seconds: Mapping[str, float],
+    report: TrajectoryReport | None,
+    **counts: Any,
+) -> None:
+    """`summary.json`: settings, versions, counts, time by stage, final intrinsics, and the ATE where truth is known."""
+    tracked = sum(record.tracked for record in slam.frames)
+    values = {
+        "settings": dict(settings),
+        "versions": versions(),
+        "frames": len(slam.frames),
+        "frames_tracked": tracked,
+        "keyframes": len(slam.keyframes),
+        "pairs": len(slam.pairs),
+        "origins": len(slam.origins),
+        "scale": "metric" if slam.metric else "free (no metric depth): lengths have no unit",
+        "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
+        "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
+        "notes": list(slam.notes),
+        **counts,
+    }
+    if report is not None:
+        values["truth"] = report.as_dict()
+    write_json(folder / "summary.json", values)
+
+
+def versions() -> dict[str, str]:
+    """The versions that a result depends on."""
+    names = ("vggtgeo", "jax", "optimistix", "lineax", "equinox", "jaxlie", "numpy", "opencv-python-headless")
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed (source tree)"
+    return found

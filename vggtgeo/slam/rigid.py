@@ -1,0 +1,76 @@
+"""Small numpy helpers for world -> camera poses as 4 x 4 matrices and pinhole pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def invert(pose: np.ndarray) -> np.ndarray:
+    """Inverse of rigid motions, float64 [..., 4, 4]."""
+    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
+    result = np.zeros_like(pose)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, pose[..., :3, 3])
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def centre(pose: np.ndarray) -> np.ndarray:
+    """Camera centre in the world, metres."""
+    return -pose[:3, :3].T @ pose[:3, 3]
+
+
+def angle_between(first: np.ndarray, second: np.ndarray) -> float:
+    """Angle of the relative rotation, radians."""
+    cosine = (np.trace(first[:3, :3].T @ second[:3, :3]) - 1) / 2
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def rays(pixels: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Viewing rays with z = 1, float64 [m, 3]."""
+    return np.column_stack([(pixels - intrinsics[2:]) / intrinsics[:2], np.ones(len(pixels))])
+
+
+def unproject(pixels: np.ndarray, inverse_depth: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """World points float64 [m, 3] of pixels with inverse depths; NaN where the depth is."""
+    local = rays(pixels, intrinsics) / inverse_depth[:, None]
+    return (local - pose[:3, 3]) @ pose[:3, :3]
+
+
+def project(points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Pixels float64 [m, 2] of world points; NaN behind the camera."""
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    ahead = local[:, 2] > 1e-3
+    z = np.where(ahead, local[:, 2], np.nan)
+    return local[:, :2] / z[:, None] * intrinsics[:2] + intrinsics[2:]
+
+
+def to_quaternion(poses: np.ndarray) -> np.ndarray:
+    """`(qw, qx, qy, qz, tx, ty, tz)` of world -> camera matrices, float64 [n, 7]."""
+    xyzw = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    return np.concatenate([xyzw[:, 3:], xyzw[:, :3], poses[:, :3, 3]], 1)
+
+
+def to_matrix(quaternions: np.ndarray) -> np.ndarray:
+    """The inverse of `to_quaternion`."""
+    poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
+    poses[:, :3, 3] = quaternions[:, 4:]
+    return poses
+
+
+def triangulate(
+    pixels: np.ndarray, targets: np.ndarray, relative: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth of pixels of camera i matched to `targets` in camera j, and its information.
+
+    `d (t x r') = -(R r) x r'` in the least-squares sense; `relative` maps camera i to camera j. The information is
+    `f^2 |t x r'|^2`, so several views combine by a weighted mean. Returns two float64 [m].
+    """
+    turned = rays(pixels, intrinsics) @ relative[:3, :3].T
+    seen = rays(targets, intrinsics)
+    lever = np.cross(relative[:3, 3], seen)
+    information = (lever**2).sum(1)
+    value = -(lever * np.cross(turned, seen)).sum(1) / np.maximum(information, 1e-18)
+    return value, information * float(intrinsics[0]) ** 2

@@ -1,0 +1,117 @@
+"""Running the fold over a sequence: reading and describing frames in one thread, tracking and mapping in another."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+
+from vggtgeo.camera import Camera
+from vggtgeo.datasets.frame import Frame, Sequence
+from vggtgeo.errors import InputError
+from vggtgeo.models.roles import Features
+from vggtgeo.slam import rigid
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.global_adjustment import adjust_all, close_loops
+from vggtgeo.slam.pipeline import begin, step
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.trajectory import Trajectory
+
+AHEAD = 3
+"""Frames that are prepared before they are needed."""
+
+
+def run(
+    sequence: Sequence,
+    roles: Roles | None = None,
+    settings: SlamSettings | None = None,
+    *,
+    start: int = 0,
+    end: int | None = None,
+    stride: int = 1,
+    clock: Clock | None = None,
+) -> Iterator[Slam]:
+    """Track and map a sequence; yields the state after every frame, so that a caller can draw, stop or save.
+
+    `finish` turns the last state into the result. Frames are undistorted first.
+    """
+    frames = sequence.frames(start, end, stride)
+    yield from run_frames(frames, sequence.camera, roles or Roles(), settings or SlamSettings(), clock or Clock())
+
+
+def run_frames(
+    frames: Iterable[Frame], camera: Camera, roles: Roles, settings: SlamSettings, clock: Clock
+) -> Iterator[Slam]:
+    """The same over any iterable of frames of one camera."""
+    slam = begin(camera, roles, settings)
+    for frame, features in _described(frames, camera, roles, clock):
+        slam = step(slam, frame, features, roles, settings, clock)
+        yield slam
+
+
+def finish(slam: Slam, roles: Roles, settings: SlamSettings, clock: Clock | None = None) -> Slam:
+    """Join what was seen twice, and adjust the whole map once more."""
+    if not settings.global_adjustment or len(slam.keyframes) < 3:
+        return slam
+    clock = clock or Clock()
+    with clock.measure("loops"):
+        slam = close_loops(slam, roles, settings)
+    with clock.measure("global adjustment"):
+        return adjust_all(slam, settings)
+
+
+def frame_trajectory(slam: Slam) -> Trajectory:
+    """Camera -> world of every frame."""
+    poses = rigid.invert(np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4))
+    return Trajectory(np.array([record.timestamp for record in slam.frames]), poses)
+
+
+def keyframe_trajectory(slam: Slam) -> Trajectory:
+    """Camera -> world of the keyframes."""
+    poses = rigid.invert(np.array([keyframe.pose for keyframe in slam.keyframes]).reshape(-1, 4, 4))
+    return Trajectory(np.array([keyframe.timestamp for keyframe in slam.keyframes]), poses)
+
+
+def _described(
+    frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock
+) -> Iterator[tuple[Frame, Features]]:
+    """Undistorted frames with their key points, prepared in a thread of their own while earlier ones are tracked."""
+    undistorter = camera.undistorter()
+
+    def prepare(frame: Frame) -> tuple[Frame, Features]:
+        _check_size(frame, camera)
+        with clock.measure("describe (own thread)"):
+            image = undistorter.image(frame.image)
+            depth = None if frame.depth is None else undistorter.depth(frame.depth)
+            frame = Frame(frame.index, frame.timestamp, image, depth, frame.name)
+            return frame, roles.points.describe(image)
+
+    def read_and_prepare() -> tuple[Frame, Features] | None:
+        with clock.measure("read (own thread)"):
+            frame = next(source, None)
+        return None if frame is None else prepare(frame)
+
+    source = iter(frames)
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames") as pool:
+        queue: deque[Future[tuple[Frame, Features] | None]] = deque(
+            pool.submit(read_and_prepare) for _ in range(AHEAD)
+        )
+        try:
+            while (ready := queue.popleft().result()) is not None:
+                queue.append(pool.submit(read_and_prepare))
+                yield ready
+        finally:
+            for waiting in queue:
+                waiting.cancel()
+
+
+def _check_size(frame: Frame, camera: Camera) -> None:
+    height, width = frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise InputError(
+            f"`{frame.name}` is {width} x {height} pixels; the camera's images are {camera.width} x {camera.height}: "
+            "all frames of a run must have one size"
+        )

@@ -1,0 +1,91 @@
+"""Settings of the SLAM pipeline, checked when they are made, and the role objects it is built from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from vggtgeo.errors import InputError
+from vggtgeo.models.classical import (
+    BandLineMatcher,
+    LsdDetector,
+    NoDepth,
+    PnpGeometry,
+    SensorDepth,
+    SiftMatcher,
+    StructureTensor,
+)
+from vggtgeo.solvers.kernels import AbstractKernel, Cauchy, Huber, GemanMcClure
+from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector, LineMatcher, MetricDepth, PointMatcher
+
+
+@dataclass(frozen=True)
+class Roles:
+    """The perception objects of one run."""
+
+    points: PointMatcher = field(default_factory=SiftMatcher)
+    lines: LineDetector = field(default_factory=LsdDetector)
+    line_matches: LineMatcher = field(default_factory=BandLineMatcher)
+    depth: MetricDepth = field(default_factory=SensorDepth)
+    confidence: DenseConfidence = field(default_factory=StructureTensor)
+    geometry: InitialGeometry = field(default_factory=PnpGeometry)
+
+    @property
+    def metric(self) -> bool:
+        """Whether a metric depth fixes the scale of the world."""
+        return not isinstance(self.depth, NoDepth)
+
+
+@dataclass(frozen=True)
+class SlamSettings:
+    """Numbers of the pipeline; lengths in metres, angles in radians, pixels where named so."""
+
+    window: int = 10
+    """Keyframes adjusted together."""
+    keyframe_distance: float = 0.15
+    keyframe_angle: float = math.radians(5.0)
+    least_inliers: int = 50
+    """A frame with fewer tracked inliers becomes a keyframe."""
+    least_covisible: int = 50
+    """Keyframes with more matches than this are joined by an edge."""
+    match_gate: float = 8.0
+    """Largest reprojection error of a match between keyframes by the tracked poses, pixels."""
+    epipolar_gate: float = 4.0
+    """The same for the epipolar distance, where depth is not known, pixels."""
+    least_overlap: float = 0.25
+    """Share of a keyframe's points that must fall into another's image before the two are matched at all."""
+    kernel: AbstractKernel = field(default_factory=lambda: Cauchy(2.0))
+    point_slots: int = 320
+    line_slots: int = 192
+    line_spacing: float = 10.0
+    """Pixels between the samples of a segment."""
+    use_lines: bool = True
+    line_weight: float = 0.25
+    """Weight of one line sample against one point: neighbouring samples share their segment's error."""
+    use_confidence: bool = True
+    confidence_gain: float = 1.0
+    confidence_floor: float = 0.1
+    """Weight of a match: `gain * confidence + floor`."""
+    depth_weight: float = 2.0
+    """The paper's alpha; 0 switches the depth prior off."""
+    known_intrinsics_sigma: float = 0.003
+    """Standard deviation of the prior on known intrinsics, relative to the focal length."""
+    guessed_intrinsics_sigma: float = 0.3
+    """The same for guessed ones."""
+    window_iterations: int = 12
+    global_iterations: int = 40
+    global_neighbours: int = 16
+    """Most edges of one keyframe in the global adjustment."""
+    loop_candidates: int = 3
+    """Pairs that each keyframe may propose in the search for places seen before."""
+    global_adjustment: bool = True
+    """Adjust all keyframes together at the end, with edges between those that saw the same place."""
+
+    def __post_init__(self) -> None:
+        for name in ("keyframe_distance", "keyframe_angle", "line_spacing", "known_intrinsics_sigma"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
+        if self.window < 3:
+            raise InputError(f"`window` is {self.window}; it must hold at least 3 keyframes")
+        if self.depth_weight < 0 or self.confidence_floor < 0:
+            raise InputError("`depth_weight` and `confidence_floor` must not be negative")

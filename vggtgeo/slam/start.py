@@ -1,0 +1,68 @@
+"""The start of a sequence without depth: two views with parallax give the first map, of nominal scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.models.roles import Features, GeometryResult, PoseQuery
+from vggtgeo.slam import rigid
+from vggtgeo.slam.keyframe import Keyframe, make_keyframe
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import FramePose, Slam, Waiting
+from vggtgeo.slam.window import adjust, enter, scale_anchor
+
+NOMINAL_DEPTH = 2.5
+"""Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
+MOST_WAITING = 90
+
+
+def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
+    """Try to start a map from the first keyframe and this frame; until that works, the frame waits."""
+    first = slam.keyframes[slam.window[-1]]
+    matches = roles.points.match(first.features, features)
+    guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics)
+    if guess.result is not GeometryResult.SUCCESS:
+        return _wait(slam, frame, features)
+    scale = NOMINAL_DEPTH / float(np.median(guess.points[guess.inliers, 2]))
+    relative = guess.pose.copy()
+    relative[:3, 3] *= scale
+    inverse = np.full(len(first.features), np.nan)
+    inverse[matches.index_i[guess.inliers]] = 1.0 / (scale * guess.points[guess.inliers, 2])
+    first = replace(first, points=replace(first.points, inverse_depth=inverse))
+    keyframes = (*slam.keyframes[:-1], first)
+    slam = replace(slam, keyframes=keyframes)
+    number = len(keyframes)
+    second = make_keyframe(number, frame, relative @ first.pose, features, roles, settings, slam.intrinsics)
+    slam = enter(slam, second, roles, settings)
+    slam = adjust(replace(slam, prior=scale_anchor(slam, settings)), settings)
+    slam = _place_waiting(slam, slam.keyframes[first.number], roles)
+    inliers = int(np.count_nonzero(guess.inliers))
+    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, inliers)
+    return replace(slam, frames=(*slam.frames, record), waiting=())
+
+
+def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
+    waiting = (*slam.waiting, Waiting(frame.index, frame.timestamp, frame.image, features))
+    record = FramePose(frame.index, frame.timestamp, slam.window[-1], np.eye(4), False, 0)
+    return replace(slam, waiting=waiting[-MOST_WAITING:], frames=(*slam.frames, record))
+
+
+def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
+    """Give the frames that waited their poses by the new map."""
+    placed = {}
+    for frame in slam.waiting:
+        matches = roles.points.match(first.features, frame.features)
+        inverse = first.points.inverse_depth[matches.index_i]
+        matches, inverse = matches.select(np.isfinite(inverse)), inverse[np.isfinite(inverse)]
+        points = rigid.unproject(matches.pixels_i, inverse, first.pose, slam.intrinsics)
+        query = PoseQuery(frame.image, slam.intrinsics, points, matches.pixels_j, matches.confidence)
+        guess = roles.geometry.locate(query)
+        if guess.result is GeometryResult.SUCCESS:
+            relative = guess.pose @ rigid.invert(first.pose)
+            placed[frame.frame] = FramePose(
+                frame.frame, frame.timestamp, first.number, relative, True, guess.inlier_count
+            )
+    return replace(slam, frames=tuple(placed.get(record.frame, record) for record in slam.frames))

@@ -1,0 +1,74 @@
+"""The one value that the pipeline folds over frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vggtgeo.models.roles import Features
+from vggtgeo.problem import MarginalPrior, State
+from vggtgeo.slam.adjustment import Adjustment
+from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.keyframe import Keyframe
+
+
+@dataclass(frozen=True, eq=False)
+class FramePose:
+    """Pose of one frame relative to a keyframe, so that it follows when the keyframe is adjusted.
+
+    relative: float64 [4, 4], reference camera -> this camera. tracked: False where the pose is only predicted.
+    """
+
+    frame: int
+    timestamp: float
+    reference: int
+    relative: np.ndarray
+    tracked: bool
+    inliers: int
+
+
+@dataclass(frozen=True, eq=False)
+class Waiting:
+    """A frame seen before the first two views of an RGB sequence gave a map; it is placed as soon as there is one."""
+
+    frame: int
+    timestamp: float
+    image: np.ndarray
+    features: Features
+
+
+@dataclass(frozen=True, eq=False)
+class Slam:
+    """Everything known after some frames.
+
+    intrinsics: current fx, fy, cx, cy. keyframes: all, by number. pairs: all matches between them. window: numbers of
+    the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
+    solved: the last window problem and its solution. frames: every frame's pose. velocity: last motion from frame to
+    frame, camera -> camera. waiting: frames before the start of an RGB sequence. lost: frames since tracking was lost.
+    metric: whether lengths are metres. notes: what the user should know.
+    """
+
+    intrinsics: np.ndarray
+    intrinsics_sigma: np.ndarray
+    metric: bool
+    keyframes: tuple[Keyframe, ...] = ()
+    pairs: tuple[Pair, ...] = ()
+    window: tuple[int, ...] = ()
+    prior: MarginalPrior | None = None
+    solved: tuple[Adjustment, State] | None = None
+    frames: tuple[FramePose, ...] = ()
+    velocity: np.ndarray = field(default_factory=lambda: np.eye(4))
+    waiting: tuple[Waiting, ...] = ()
+    lost: int = 0
+    origins: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def pose(self, record: FramePose) -> np.ndarray:
+        """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
+        return record.relative @ self.keyframes[record.reference].pose
+
+    @property
+    def last_pose(self) -> np.ndarray:
+        """World -> camera of the last frame."""
+        return self.pose(self.frames[-1]) if self.frames else np.eye(4)

@@ -1,0 +1,114 @@
+"""The sliding window: adjust its keyframes together, and keep what those that leave have said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from vggtgeo.marginalise import marginalise_jit, no_prior, reorder
+from vggtgeo.packing import PaddedSize
+from vggtgeo.problem import MarginalPrior
+from vggtgeo.slam.adjustment import Adjustment, build, write_back
+from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
+from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.solve import solve
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+
+solve_jit = eqx.filter_jit(solve)
+
+
+def window_size(settings: SlamSettings) -> PaddedSize:
+    """The one padded shape that all windows of a run share."""
+    return PaddedSize(settings.window, settings.point_slots, settings.line_slots, settings.window - 1)
+
+
+def make_room(slam: Slam, settings: SlamSettings) -> Slam:
+    """Marginalise the oldest keyframe of a full window."""
+    if len(slam.window) < settings.window:
+        return slam
+    if slam.solved is None:
+        return replace(slam, window=slam.window[1:])
+    adjustment, state = slam.solved
+    prior = marginalise_jit(adjustment.problem, state, jnp.asarray(0))
+    order = np.append(np.arange(1, settings.window), -1)
+    return replace(slam, window=slam.window[1:], prior=reorder(prior, order))
+
+
+def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings) -> Slam:
+    """Add a keyframe to the window and match it to the others."""
+    slam = make_room(slam, settings)
+    matched = [
+        match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics) for number in slam.window
+    ]
+    pairs = tuple(pair for pair in matched if pair is not None)
+    return replace(
+        slam,
+        keyframes=(*slam.keyframes, keyframe),
+        window=(*slam.window, keyframe.number),
+        pairs=(*slam.pairs, *pairs),
+    )
+
+
+def adjust(slam: Slam, settings: SlamSettings) -> Slam:
+    """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
+    members = [slam.keyframes[number] for number in slam.window]
+    adjustment = window_problem(slam, members, settings)
+    solver = SchurLevenbergMarquardt(max_iterations=settings.window_iterations, rtol=1e-5)
+    solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
+    if not np.isfinite(float(solution.energy)):
+        return replace(slam, notes=(*slam.notes, f"window at keyframe {members[-1].number}: {solution.message}"))
+    updated, intrinsics = write_back(members, adjustment, solution.state)
+    keyframes = list(slam.keyframes)
+    for keyframe in updated:
+        keyframes[keyframe.number] = keyframe
+    return replace(slam, keyframes=tuple(keyframes), intrinsics=intrinsics, solved=(adjustment, solution.state))
+
+
+def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> Adjustment:
+    """The problem of the current window."""
+    fixed = np.isin([keyframe.number for keyframe in members], slam.origins)
+    sigma = None if not np.any(slam.intrinsics_sigma) else slam.intrinsics_sigma
+    return build(
+        members,
+        window_edges(slam),
+        slam.intrinsics,
+        settings,
+        size=window_size(settings),
+        intrinsics_sigma=sigma,
+        fixed_pose=fixed,
+        marginal=slam.prior if slam.prior is not None else no_prior(settings.window),
+    )
+
+
+def window_edges(slam: Slam) -> list[Directed]:
+    """Both directions of every pair inside the window."""
+    inside = set(slam.window)
+    pairs = [pair for pair in slam.pairs if pair.first in inside and pair.second in inside]
+    by_number = {number: slam.keyframes[number] for number in inside}
+    return [edge for pair in pairs for edge in directions(pair, by_number)]
+
+
+def scale_anchor(slam: Slam, settings: SlamSettings) -> MarginalPrior:
+    """A prior that holds the distance between the first two keyframes: the unit of a map without metric depth."""
+    prior = no_prior(settings.window)
+    pose = slam.keyframes[slam.window[1]].pose
+    length = np.linalg.norm(pose[:3, 3])
+    row = np.zeros(prior.root.shape[1])
+    row[6:9] = pose[:3, 3] / (1e-3 * length**2)
+    members = np.array([slam.keyframes[number].pose for number in slam.window])
+    return _with_row(prior, row, members)
+
+
+def _with_row(prior: MarginalPrior, row: np.ndarray, poses: np.ndarray) -> MarginalPrior:
+    from vggtgeo.slam import rigid
+
+    points = np.asarray(prior.poses.wxyz_xyz).copy()
+    points[: len(poses)] = rigid.to_quaternion(poses)
+    return eqx.tree_at(
+        lambda p: (p.root, p.poses.wxyz_xyz), prior, (prior.root.at[0].set(jnp.asarray(row)), jnp.asarray(points))
+    )

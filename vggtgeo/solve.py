@@ -1,0 +1,97 @@
+"""`solve`: bundle adjustment as a pure function."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from vggtgeo.bundle_adjustment import BundleAdjustment
+from vggtgeo.problem import Problem, State
+from vggtgeo.solvers.adjoint import ArrowAdjoint
+from vggtgeo.solvers.levenberg_marquardt import (
+    CONVERGED,
+    SchurLevenbergMarquardt,
+    Termination,
+    termination_message,
+    termination_name,
+)
+
+
+class Solution(eqx.Module):
+    """The outcome of `solve`; a pytree, so it passes through `jit` and `vmap`."""
+
+    state: State
+    energy: Float[Array, ""]
+    """`1/2 sum rho` at `state`."""
+    history: Float[Array, " h"]
+    """Energy after each iteration, from the initial one; NaN beyond the last."""
+    iterations: Int[Array, ""]
+    """Tried steps, accepted or not."""
+    linearisations: Int[Array, ""]
+    gradient_norm: Float[Array, ""]
+    """Largest gradient entry of the last linearisation, scaled by its curvature (unit of the root of the energy)."""
+    termination: Termination
+
+    @property
+    def converged(self) -> Bool[Array, ""]:
+        """Whether the iteration ended by itself; a traced boolean under `jit`."""
+        met = self.termination == CONVERGED[0]
+        for code in CONVERGED[1:]:
+            met = met | (self.termination == code)
+        return met
+
+    @property
+    def result(self) -> str:
+        """Name of the termination code (outside `jit`, for one solution)."""
+        return termination_name(self.termination)
+
+    @property
+    def message(self) -> str:
+        """Why the iteration ended and what to do (outside `jit`, for one solution)."""
+        return termination_message(self.termination)
+
+
+def solve(
+    problem: Problem,
+    initial: State,
+    *,
+    solver: SchurLevenbergMarquardt | None = None,
+    adjoint: optx.AbstractAdjoint | None = None,
+) -> Solution:
+    """Minimise the energy of `problem` from `initial`.
+
+    Pure: works under `jax.jit`, `jax.vmap`, `jax.grad` and `jax.jvp`. Derivatives of `Solution.state` with respect to
+    every float leaf of `problem`, and to the held coordinates of `initial`, are those of the optimum (implicit function
+    theorem, exact Hessian); energy, history and counts carry none. Nothing throws: see `Solution.termination`.
+
+    Args:
+        problem: observations and priors, `vggtgeo.pack` makes one from flat lists.
+        initial: starting state, world -> camera poses, pixels, 1/m.
+        solver: iteration and linear algebra; default `SchurLevenbergMarquardt()`.
+        adjoint: how to differentiate; default `ArrowAdjoint()`. `optimistix.RecursiveCheckpointAdjoint()` with
+            `SchurLevenbergMarquardt(differentiable_loop=True)` differentiates through the iterates instead.
+    """
+    solver = SchurLevenbergMarquardt() if solver is None else solver
+    adjoint = ArrowAdjoint() if adjoint is None else adjoint
+    found: optx.Solution = optx.least_squares(
+        lambda point, ba: ba.energy(point),
+        solver,
+        initial,
+        args=BundleAdjustment(problem),
+        max_steps=solver.max_iterations,
+        adjoint=adjoint,
+        throw=False,
+    )
+    last = jax.lax.stop_gradient(eqx.filter(found.state, eqx.is_array))
+    last = eqx.combine(last, found.state)
+    return Solution(
+        state=found.value,
+        energy=last.energy,
+        history=last.history,
+        iterations=last.iterations,
+        linearisations=last.linearisations,
+        gradient_norm=last.gradient_norm,
+        termination=last.termination,
+    )

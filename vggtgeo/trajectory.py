@@ -1,0 +1,156 @@
+"""Trajectories: timed camera poses, and their files in the TUM format.
+
+A line of the file is `timestamp tx ty tz qx qy qz qw`: seconds, metres, unit quaternion, camera -> world.
+"""
+
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.files import write_text
+
+_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Camera poses at increasing times.
+
+    Fields:
+        timestamps: float64 [n], seconds, strictly increasing.
+        poses: float64 [n, 4, 4], camera -> world, metres (or the unit of a scale-free reconstruction).
+
+    Raises InputError for other shapes, NaN or infinity, times that do not increase, or what is no rotation.
+    """
+
+    timestamps: Float[np.ndarray, " n"]
+    poses: Float[np.ndarray, "n 4 4"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "timestamps", np.asarray(self.timestamps, np.float64))
+        object.__setattr__(self, "poses", np.asarray(self.poses, np.float64))
+        _check(self.timestamps, self.poses)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def positions(self) -> Float[np.ndarray, "n 3"]:
+        """Camera centres in the world, metres."""
+        return self.poses[:, :3, 3]
+
+    @property
+    def rotations(self) -> Float[np.ndarray, "n 3 3"]:
+        """Camera -> world rotations."""
+        return self.poses[:, :3, :3]
+
+    @property
+    def length(self) -> float:
+        """Length of the path through the camera centres, metres."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    def select(self, rows: np.ndarray | slice) -> Self:
+        """The poses at `rows` (indices in increasing order, a boolean mask, or a slice)."""
+        return type(self)(self.timestamps[rows], self.poses[rows])
+
+    def save_tum(self, path: str | os.PathLike[str]) -> None:
+        """Writes the TUM format, nine decimals, atomically."""
+        quaternions = Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
+        rows = np.column_stack([self.timestamps, self.positions, quaternions])
+        lines = (" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows.tolist())
+        write_text(path, _HEADER + "".join(lines))
+
+    @classmethod
+    def load_tum(cls, path: str | os.PathLike[str]) -> Self:
+        """Reads the TUM format (blanks or commas; `#` begins a comment).
+
+        Quaternions are normalised. Lines out of order are sorted, and of lines with one time the first is
+        kept, both with an InputWarning. InputError names the file and line for a missing file, a wrong number
+        of columns, what is not a finite number, or a quaternion of length zero.
+        """
+        rows = _in_order(path, _read_rows(path))
+        quaternions = rows[:, 4:]
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+        poses[:, :3, 3] = rows[:, 1:4]
+        return cls(rows[:, 0], poses)
+
+
+def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
+    count = len(timestamps)
+    if timestamps.ndim != 1 or poses.shape != (count, 4, 4):
+        raise InputError(
+            f"`timestamps` has shape {timestamps.shape}, `poses` {poses.shape}; expected [n] and [n, 4, 4]"
+        )
+    finite = np.isfinite(timestamps) & np.isfinite(poses).all(axis=(1, 2))
+    if not finite.all():
+        raise InputError(f"pose {int(np.argmin(finite))} of {count} has a NaN or an infinity; leave such poses out")
+    steps = np.diff(timestamps)
+    if (steps <= 0).any():
+        row = int(np.argmax(steps <= 0))
+        raise InputError(
+            f"`timestamps` must increase; entry {row + 1} is {timestamps[row + 1]:.6f} after "
+            f"{timestamps[row]:.6f}: sort them, and keep one pose for a time"
+        )
+    rotations = poses[:, :3, :3]
+    off = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    bad = (off > _ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0)
+    if bad.any():
+        raise InputError(f"pose {int(np.argmax(bad))} of {count} has no rotation in its upper left 3 x 3 block")
+
+
+def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(f"`{file}` is not there or is no file; give a trajectory in the TUM format")
+    rows = []
+    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        text = line.split("#", 1)[0].replace(",", " ").strip()
+        if text:
+            rows.append(_parse_row(f"`{file}`, line {number}", text))
+    if not rows:
+        raise InputError(f"`{file}` holds no pose; a line must be `timestamp tx ty tz qx qy qz qw`")
+    return np.array(rows)
+
+
+def _parse_row(where: str, text: str) -> list[float]:
+    words = text.split()
+    if len(words) != 8:
+        raise InputError(f"{where}: found {len(words)} columns; expected 8: `timestamp tx ty tz qx qy qz qw`")
+    try:
+        row = [float(word) for word in words]
+    except ValueError:
+        raise InputError(f"{where}: found {text!r}; expected 8 numbers: `timestamp tx ty tz qx qy qz qw`") from None
+    if not np.isfinite(row).all():
+        raise InputError(f"{where}: found a NaN or an infinity in {text!r}; leave such poses out of the file")
+    if np.linalg.norm(row[4:]) < 1e-6:
+        raise InputError(f"{where}: the quaternion has length zero; expected a unit quaternion `qx qy qz qw`")
+    return row
+
+
+def _in_order(path: str | os.PathLike[str], rows: np.ndarray) -> np.ndarray:
+    if (np.diff(rows[:, 0]) < 0).any():
+        row = int(np.argmax(np.diff(rows[:, 0]) < 0)) + 1
+        warnings.warn(
+            f"`{path}`: timestamps are out of order (first {rows[row, 0]:.6f}); the poses were sorted",
+            InputWarning,
+            stacklevel=3,
+        )
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    first = np.concatenate([[True], np.diff(rows[:, 0]) > 0])
+    if not first.all():
+        warnings.warn(
+            f"`{path}`: {int((~first).sum())} poses repeat the time of another (first at "
+            f"{rows[int(np.argmin(first)), 0]:.6f}); the first of each was kept",
+            InputWarning,
+            stacklevel=3,
+        )
+    return rows[first]
