@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from vggtgeo.solvers.adjoint import solve_exactly
 from vggtgeo.solvers.arrow import (
     ArrowSystem,

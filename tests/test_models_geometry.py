@@ -38,6 +38,17 @@ def test_refinement_reaches_the_exact_pose() -> None:
     np.testing.assert_allclose(found, POSE, atol=1e-8)
 
 
+def test_one_step_of_the_refinement_is_newtons() -> None:
+    # Proves that its derivatives are exact: the error after a step is of the order of the square of the one before,
+    # where a wrong column would leave one of the first order. Oracle: the exact pose.
+    query, _ = _query(100)
+    for size in (1e-2, 1e-3):
+        start = views.pose((20 * size, -10 * size, 30 * size), (size, -size, size)) @ POSE
+        found = refine_pose(start, query.points, query.pixels, np.ones(100), views.INTRINSICS, delta=1e3, steps=1)
+        left = np.abs(found - POSE).max()
+        assert left < 2 * size**2, f"{left:.2e} left of {size:.0e}"
+
+
 def test_refinement_obeys_weights_and_stays_robust() -> None:
     # Proves that a weight of zero removes a point and that Huber bounds an outlier. Oracle: the exact pose.
     query, right = _query(100, wrong=0.1)
@@ -126,9 +137,10 @@ def _matches(motion: np.ndarray, noise: float = 0.3) -> tuple[np.ndarray, np.nda
     return first, second, points, right
 
 
-def test_two_views_give_motion_and_structure() -> None:
+@pytest.mark.parametrize("travel", [(0.4, 0.1, 0.1), (-0.4, 0.1, 0.0), (0.1, -0.4, -0.1), (0.0, 0.4, 0.1)])
+def test_two_views_give_motion_and_structure(travel: tuple[float, float, float]) -> None:
     # Proves rotation, direction of travel, and points up to one scale. Oracle: the motion the matches were made with.
-    motion = views.pose((2.0, 5.0, -3.0), (0.4, 0.1, 0.1))
+    motion = views.pose((2.0, 5.0, -3.0), travel)
     first, second, points, right = _matches(motion)
     guess = PnpGeometry().start(first, second, views.INTRINSICS)
     scale = np.linalg.norm(motion[:3, 3])

@@ -155,7 +155,20 @@ def test_verification_separates_planted_outliers(intrinsics, translation) -> Non
     inliers = EpipolarVerifier(intrinsics=intrinsics).inliers(first, second)
     measured = f"kept {inliers[right].mean():.1%} of the right, {inliers[~right].mean():.1%} of the wrong"
     assert inliers[right].mean() > 0.95, measured
-    assert inliers[~right].mean() < 0.15, measured
+    assert inliers[~right].mean() < (0.15 if any(translation) else 0.02), measured
+
+
+def test_a_homography_steps_in_for_a_plane() -> None:
+    # Proves that on a plane, chance matches on epipolar lines are rejected. Oracle: which of 75 % were planted.
+    generator = np.random.default_rng(3)
+    first = generator.uniform((0, 0), views.SIZE, (400, 2))
+    second = views.move(views.plane_homography(MOTION), first) + generator.normal(0, 0.3, (400, 2))
+    right = np.arange(400) >= 300
+    second[~right] = generator.uniform((0, 0), views.SIZE, (300, 2))
+    inliers = EpipolarVerifier().inliers(first, second)
+    measured = f"kept {inliers[right].mean():.1%} of the right, {inliers[~right].mean():.1%} of the wrong"
+    assert inliers[right].mean() > 0.9, measured
+    assert inliers[~right].mean() < 0.02, measured
 
 
 @pytest.mark.parametrize(

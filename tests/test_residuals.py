@@ -27,7 +27,9 @@ def pinhole(poses: np.ndarray, intrinsics: np.ndarray, pixel: np.ndarray, depth:
 def test_point_residual_by_hand() -> None:
     # Proves that the residual is projection minus match, in pixels. Oracle: numpy, in metres and through the world.
     target = np.array([60.0, 170.0])
-    found = point_residual(RELATIVE, jnp.asarray(INTRINSICS), jnp.asarray(PIXEL), jnp.asarray(1 / DEPTH), jnp.asarray(target))
+    found = point_residual(
+        RELATIVE, jnp.asarray(INTRINSICS), jnp.asarray(PIXEL), jnp.asarray(1 / DEPTH), jnp.asarray(target)
+    )
     np.testing.assert_allclose(found, pinhole(POSES[:2], INTRINSICS, PIXEL, DEPTH) - target, atol=1e-10)
 
 
@@ -48,9 +50,7 @@ def test_depth_residual_counts_standard_deviations() -> None:
 def test_the_identity_projects_a_pixel_onto_itself() -> None:
     # Proves that without motion a pixel stays where it is, at any depth, at infinity too.
     for inverse_depth in (0.0, 1e-6, 0.4, 100.0):
-        seen = project(
-            jaxlie.SE3.identity(), jnp.asarray(INTRINSICS), jnp.asarray(PIXEL), jnp.asarray(inverse_depth)
-        )
+        seen = project(jaxlie.SE3.identity(), jnp.asarray(INTRINSICS), jnp.asarray(PIXEL), jnp.asarray(inverse_depth))
         np.testing.assert_allclose(seen, PIXEL, atol=1e-11)
 
 
@@ -58,7 +58,9 @@ def test_the_identity_projects_a_pixel_onto_itself() -> None:
 def test_behind_the_camera_is_finite_and_far(forward: float) -> None:
     # Proves that a point at or behind the target camera gives finite values and gradients, far outside the image.
     moved = jaxlie.SE3.from_translation(jnp.array([0.3, 0.0, -forward]))
-    residual = lambda pose, depth: point_residual(pose, jnp.asarray(INTRINSICS), jnp.asarray(PIXEL), depth, jnp.zeros(2))
+    residual = lambda pose, depth: point_residual(
+        pose, jnp.asarray(INTRINSICS), jnp.asarray(PIXEL), depth, jnp.zeros(2)
+    )
     value = residual(moved, jnp.asarray(1 / DEPTH))
     derivatives = jax.jacobian(residual, argnums=(0, 1))(moved, jnp.asarray(1 / DEPTH))
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves((value, derivatives)))

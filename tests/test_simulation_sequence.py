@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from synthetic_room import room
 
+from vggtgeo.cli.simulate import parse_size
+from vggtgeo.cli.simulate import simulate as simulate_command
 from vggtgeo.datasets import open_sequence
 from vggtgeo.errors import InputError
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
@@ -166,3 +168,13 @@ def test_tum_folder_reads_back(tmp_path: Path, walk: SyntheticSequence) -> None:
     assert np.abs(read.ground_truth().poses - few.ground_truth().poses).max() < 1e-8
     with pytest.raises(InputError, match="not an empty folder"):
         next(write_tum_folder(few, folder))
+
+
+def test_the_command_writes_a_folder_and_names_wrong_sizes(tmp_path: Path) -> None:
+    # `vggtgeo simulate` writes what `open_sequence` reads, of the size asked for; a wrong size is refused by name.
+    simulate_command("corridor", tmp_path / "out", frames=2, seed=0, size="64x48", rate=10.0)
+    read = open_sequence(tmp_path / "out")
+    assert (len(read), read.camera.width, read.camera.height) == (2, 64, 48)
+    for text in ("640", "axb", "8x8"):
+        with pytest.raises(InputError, match="--size"):
+            parse_size(text)

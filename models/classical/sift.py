@@ -31,7 +31,7 @@ class SiftMatcher:
     ratio: float = 0.85
     radius: float = 60.0
     verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)
-    area: int = 200_000
+    area: int = 172_800
     refinement: PatchAlignment | None = field(default_factory=PatchAlignment)
 
     def __post_init__(self) -> None:
@@ -40,7 +40,7 @@ class SiftMatcher:
         if not 0 < self.ratio <= 1:
             raise ValueError(f"`ratio` is {self.ratio}, expected a value in (0, 1]; 0.85 is usual")
         if self.area < 10_000:
-            raise ValueError(f"`area` is {self.area}, expected at least 10000 pixels; 200000 is usual")
+            raise ValueError(f"`area` is {self.area}, expected at least 10000 pixels; 172800 is usual")
 
     @cached_property
     def _sift(self) -> cv2.SIFT:
@@ -76,5 +76,5 @@ def _shrunk(gray: np.ndarray, area: int) -> tuple[np.ndarray, np.ndarray]:
     scale = np.sqrt(area / gray.size)
     if scale >= 1.0:
         return gray, np.ones(2)
-    size = tuple(max(int(round(side * scale)), 1) for side in gray.shape[::-1])
+    size = tuple(max(round(side * scale), 1) for side in gray.shape[::-1])
     return cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.array(gray.shape[::-1]) / size

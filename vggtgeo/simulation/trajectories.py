@@ -78,11 +78,10 @@ class HandheldMotion:
 
     def camera_to_world(self, time: float) -> np.ndarray:
         """Pose at `time` (seconds), camera -> world, float64 [4, 4]."""
-        rounds, place = divmod(self.speed * (time + _integral(self.waves[0], time)), self.length)
+        place = self.speed * (time + _integral(self.waves[0], time)) % self.length
         low = min(int(place / self.step), len(self.path) - 2)
         share = place / self.step - low
         x, y, z, yaw, pitch = (1 - share) * self.path[low] + share * self.path[low + 1]
-        yaw += rounds * (self.path[-1, 3] - self.path[0, 3])
         east, north, up, turn, nod, roll = (_value(wave, time) for wave in self.waves[1:])
         return _pose(np.array([x + east, y + north, z + up]), yaw + turn, pitch + nod, roll)
 

@@ -1,0 +1,147 @@
+"""Derivatives of the optimum, implicit and exact, against finite differences and against differentiation of the loop."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import optimistix as optx
+import pytest
+from scenes import make_scene
+from test_exact_hessian import prior_on
+
+from vggtgeo.problem import Problem, State
+from vggtgeo.solve import solve
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+
+SCENE = make_scene(3, 5, 1, 2, noise=0.5, outliers=0.1, depth_error=0.05, seed=4)
+SOLVER = SchurLevenbergMarquardt(rtol=1e-9, max_iterations=60)
+Both = tuple[Problem, State]
+
+# Leaf of (problem, initial state), and how far to move it for a finite difference: pixels, unit normals, 1/m, ...
+LEAVES: dict[str, tuple[Callable[[Both], Any], float]] = {
+    "pixels": (lambda both: both[0].pixels, 1e-3),
+    "point targets": (lambda both: both[0].points.target, 1e-3),
+    "point weights": (lambda both: both[0].points.weight, 1e-4),
+    "line coefficients": (lambda both: both[0].lines.coefficients, 1e-6),
+    "line weights": (lambda both: both[0].lines.weight, 1e-4),
+    "depth prior": (lambda both: both[0].depth.mean, 1e-5),
+    "depth sigma": (lambda both: both[0].depth.sigma, 1e-6),
+    "depth confidence": (lambda both: both[0].depth.weight, 1e-4),
+    "alpha": (lambda both: both[0].depth.alpha, 1e-4),
+    "intrinsics' prior": (lambda both: both[0].intrinsics_prior.mean, 1e-3),
+    "intrinsics' information": (lambda both: both[0].intrinsics_prior.information, 1e-6),
+    "kernel": (lambda both: both[0].kernel.delta, 1e-4),
+    "marginal root": (lambda both: both[0].marginal.root, 1e-4),
+    "marginal offset": (lambda both: both[0].marginal.offset, 1e-4),
+    "marginal poses": (lambda both: both[0].marginal.poses.wxyz_xyz, 1e-6),
+    "marginal intrinsics": (lambda both: both[0].marginal.intrinsics, 1e-3),
+    "held pose": (lambda both: both[1].poses.wxyz_xyz, 1e-6),
+    "held intrinsics": (lambda both: both[1].intrinsics, 1e-3),
+}
+
+
+def make_problem() -> Both:
+    """A problem with every kind of leaf; pose 0 and c_y are held."""
+    problem, state, _ = SCENE.pack(fixed_intrinsics=np.array([False, False, False, True]))
+    return eqx.tree_at(lambda p: p.marginal, problem, prior_on(state, 2.0), is_leaf=lambda leaf: leaf is None), state
+
+
+def loss_of(state: State) -> jax.Array:
+    """A number that depends on everything that is estimated."""
+    poses = jnp.sum(jnp.sin(3 * state.poses.wxyz_xyz))
+    return poses + jnp.sum(state.inverse_depth**2) + 1e-2 * jnp.sum(state.intrinsics)
+
+
+def loss(both: Both) -> jax.Array:
+    return loss_of(solve(*both, solver=SOLVER).state)
+
+
+def zeros_like(both: Both) -> Both:
+    return jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, both)
+
+
+def direction(name: str, both: Both) -> np.ndarray:
+    """A random direction for a leaf: absent entries stay absent, unit quaternions stay of unit length."""
+    leaf = np.asarray(LEAVES[name][0](both))
+    moved = np.random.default_rng(0).normal(size=leaf.shape) * (leaf != 0)
+    if leaf.shape[-1:] == (7,):
+        quaternion = leaf[..., :4]
+        moved[..., :4] -= np.sum(moved[..., :4] * quaternion, -1, keepdims=True) * quaternion
+    return moved
+
+
+@pytest.fixture(scope="module")
+def both() -> Both:
+    return make_problem()
+
+
+@pytest.fixture(scope="module")
+def forward() -> Callable[[Both, Both], tuple[jax.Array, jax.Array]]:
+    """The loss at the polished optimum and its derivative along a direction."""
+    return eqx.filter_jit(lambda both, tangent: eqx.filter_jvp(loss, (both,), (tangent,)))
+
+
+@pytest.fixture(scope="module")
+def reverse(both: Both) -> Both:
+    return eqx.filter_jit(eqx.filter_grad(loss))(both)
+
+
+@pytest.mark.parametrize("name", LEAVES)
+def test_gradient_is_the_finite_difference(name: str, both: Both, forward: Callable, reverse: Both) -> None:
+    # Proves the derivative of the optimum by each leaf, and that both modes give it. Oracle: central differences of
+    # solve-and-polish, which stands at the optimum to the last digits.
+    where, step = LEAVES[name]
+    along = jnp.asarray(direction(name, both))
+    tangent = eqx.tree_at(where, zeros_like(both), along)
+    at = lambda e: forward(eqx.tree_at(where, both, where(both) + e * along), zeros_like(both))[0]
+    difference = float((at(step) - at(-step)) / (2 * step))
+    by_forward, by_reverse = float(forward(both, tangent)[1]), float(jnp.sum(where(reverse) * along))
+    scale = abs(difference) + 1e-9
+    assert scale > 1e-7
+    assert abs(by_reverse - difference) < 1e-5 * scale, (by_reverse, difference)
+    assert abs(by_forward - by_reverse) < 1e-10 * scale, (by_forward, by_reverse)
+
+
+def test_every_leaf_is_in_the_table(both: Both, reverse: Both) -> None:
+    # Proves that no float leaf is left out above, and that the free part of the start has no influence on the optimum.
+    leaves = [leaf for leaf in jax.tree.leaves(both) if eqx.is_inexact_array(leaf)]
+    listed = [where(both) for where, _ in LEAVES.values()]
+    assert [leaf.shape for leaf in leaves if not any(leaf is other for other in listed)] == [both[1].inverse_depth.shape]
+    assert float(jnp.abs(reverse[1].inverse_depth).max()) == 0.0
+    assert float(jnp.abs(reverse[1].poses.wxyz_xyz[1:]).max()) == 0.0
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(reverse))
+
+
+@pytest.mark.slow
+def test_differentiating_the_loop_gives_the_same(both: Both, reverse: Both) -> None:
+    # Proves the implicit derivative by a second oracle: reverse mode through all iterations, run to the last digits.
+    solver = SchurLevenbergMarquardt(rtol=0.0, atol=0.0, max_iterations=60, differentiable_loop=True)
+    adjoint = optx.RecursiveCheckpointAdjoint()
+    unrolled = eqx.filter_jit(
+        eqx.filter_grad(lambda both: loss_of(solve(*both, solver=solver, adjoint=adjoint).state))
+    )(both)
+    for name in ("point targets", "depth prior", "point weights"):
+        found, oracle = (LEAVES[name][0](tree) for tree in (reverse, unrolled))
+        error = float(jnp.abs(found - oracle).max() / jnp.abs(oracle).max())
+        assert error < 1e-4, (name, error)
+
+
+def test_what_is_not_determined_has_no_derivative(reverse: Both) -> None:
+    # Proves that a problem without any weight gives zero, not NaN: nothing there moves the optimum.
+    problem, state = make_problem()
+    nothing = lambda leaf: jnp.zeros_like(leaf)
+    problem = eqx.tree_at(
+        lambda p: (p.points.weight, p.lines.weight, p.depth.weight, p.marginal.root, p.intrinsics_prior.information),
+        problem,
+        replace_fn=nothing,
+    )
+    gradient = eqx.filter_jit(eqx.filter_grad(loss))((problem, state))
+    del reverse
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(gradient))
+
+
+_ = jaxlie

@@ -1,0 +1,123 @@
+"""Marginalisation: what a keyframe leaves behind equals what it would have said in the whole problem."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import make_scene
+
+from vggtgeo.energy import energy
+from vggtgeo.linearise import edge_observations, linearise
+from vggtgeo.marginalise import marginalise, no_prior, reorder
+from vggtgeo.problem import Problem, State
+from vggtgeo.solvers.adjoint import solve_exactly
+from vggtgeo.solvers.arrow import ArrowVector, reduce
+from vggtgeo.solvers.kernels import Square
+
+
+class _Made(NamedTuple):
+    problem: Problem
+    initial: State
+    truth: State
+
+
+def _made(keyframes: int, points: int, lines: int) -> _Made:
+    scene = make_scene(keyframes, points, lines, noise=0.5, depth_error=0.02)
+    problem, initial, _ = scene.pack()
+    return _Made(problem, initial, scene.at_truth()[1])
+
+
+def _gauss_newton_step(problem: Problem, state: State) -> ArrowVector:
+    system = linearise(problem, edge_observations(problem), state)
+    gradient = ArrowVector(reduce(system).gradient, system.landmark_gradient)
+    return solve_exactly(system, jax.tree.map(jnp.negative, gradient))
+
+
+def _without(problem: Problem, dropped_edges, dropped_host: int | None) -> Problem:
+    keep = ~dropped_edges[:, None]
+    depth = problem.depth.weight
+    depth = depth if dropped_host is None else depth.at[dropped_host].set(0.0)
+    return eqx.tree_at(
+        lambda p: (p.points.weight, p.lines.weight, p.depth.weight),
+        problem,
+        (jnp.where(keep, problem.points.weight, 0.0), jnp.where(keep, problem.lines.weight, 0.0), depth),
+    )
+
+
+@pytest.mark.parametrize("leaving", [0, 1])
+def test_marginalise_then_solve_equals_solve_all(leaving: int) -> None:
+    """On the linearised problem both give one step, to 1e-9; oracle: the whole problem (0 is held, 1 is free)."""
+    made = _made(4, 10, 2)
+    whole = eqx.tree_at(lambda p: p.kernel, made.problem, Square())
+    source, target = whole.edges.source, whole.edges.target
+    # Other hosts' landmarks seen in the leaving keyframe are dropped by design: the whole problem drops them too.
+    whole = _without(whole, (target == leaving) & (source != leaving), None)
+    whole = eqx.tree_at(lambda p: p.marginal, whole, no_prior(4), is_leaf=lambda leaf: leaf is None)
+    expected = _gauss_newton_step(whole, made.initial)
+
+    prior = marginalise(whole, made.initial, jnp.asarray(leaving))
+    rest = _without(whole, source == leaving, leaving)
+    rest = eqx.tree_at(
+        lambda p: (p.marginal, p.fixed_pose), rest, (prior, whole.fixed_pose.at[leaving].set(True))
+    )
+    step = _gauss_newton_step(rest, made.initial)
+
+    remaining = np.repeat(np.arange(4) != leaving, 6)
+    remaining = np.concatenate([remaining, np.ones(4, bool)])
+    error = np.abs(np.asarray(step.dense - expected.dense))[remaining].max()
+    scale = np.abs(np.asarray(expected.dense)).max()
+    assert error < 1e-9 * scale, f"steps differ by {error:.2e} of {scale:.2e}"
+    others = np.arange(4) != leaving
+    depth_error = np.abs(np.asarray(step.landmarks - expected.landmarks))[others].max()
+    assert depth_error < 1e-9, f"inverse depths differ by {depth_error:.2e}"
+
+
+def test_prior_is_exact_at_its_linearisation_point() -> None:
+    """Energy of the prior along random directions: gradient and curvature equal the reduced quadratic's."""
+    made = _made(3, 6, 1)
+    problem = eqx.tree_at(lambda p: p.marginal, made.problem, no_prior(3), is_leaf=lambda leaf: leaf is None)
+    prior = marginalise(problem, made.initial, jnp.asarray(0))
+    hessian, gradient = prior.root.T @ prior.root, prior.root.T @ prior.offset
+    assert np.all(np.asarray(prior.root)[:, :6] == 0.0), "the prior still speaks of the keyframe that left"
+    assert np.linalg.eigvalsh(np.asarray(hessian)).min() > -1e-9 * float(jnp.max(jnp.abs(hessian)))
+    assert np.all(np.isfinite(np.asarray(gradient)))
+
+
+def test_first_estimates_are_kept() -> None:
+    """A state under a prior keeps its linearisation point when the prior is carried on; oracle: the points given."""
+    made = _made(3, 6, 1)
+    problem = eqx.tree_at(lambda p: p.marginal, made.problem, no_prior(3), is_leaf=lambda leaf: leaf is None)
+    first = marginalise(problem, made.initial, jnp.asarray(0))
+    carried = eqx.tree_at(lambda p: p.marginal, problem, first)
+    second = marginalise(carried, made.truth, jnp.asarray(1))
+    kept = np.abs(np.asarray(second.poses.wxyz_xyz[2] - made.initial.poses.wxyz_xyz[2])).max()
+    assert kept == 0.0, f"the linearisation point moved by {kept:.2e}"
+
+
+def test_reorder_moves_information_with_its_keyframe() -> None:
+    """Energy of a reordered prior at reordered states equals the original; oracle: the prior itself."""
+    made = _made(3, 6, 1)
+    problem = eqx.tree_at(lambda p: p.marginal, made.problem, no_prior(3), is_leaf=lambda leaf: leaf is None)
+    prior = marginalise(problem, made.initial, jnp.asarray(0))
+    order = np.array([1, 2, -1])
+    moved = reorder(prior, order)
+    shuffled = State(
+        jax.tree.map(lambda leaf: leaf[jnp.asarray([1, 2, 0])], made.truth.poses),
+        made.truth.intrinsics,
+        made.truth.inverse_depth[jnp.asarray([1, 2, 0])],
+    )
+    empty = _without(problem, jnp.ones(len(problem.edges.source), bool), None)
+    empty = eqx.tree_at(
+        lambda p: (p.depth.weight, p.intrinsics_prior.information),
+        empty,
+        (jnp.zeros_like(empty.depth.weight), jnp.zeros(4)),
+    )
+    before = float(energy(eqx.tree_at(lambda p: p.marginal, empty, prior), made.truth))
+    after = float(energy(eqx.tree_at(lambda p: p.marginal, empty, moved), shuffled))
+    assert after == pytest.approx(before, rel=1e-12), f"{after} against {before}"
+    assert before > 0

@@ -1,0 +1,216 @@
+"""`solve`: it finds the truth, says how it ended, and is a pure function under JAX's transformations."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scenes import Scene, make_scene
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+
+from vggtgeo.packing import PaddedSize
+from vggtgeo.problem import Problem, State
+from vggtgeo.solve import Solution, solve
+
+EXACT = make_scene()
+NOISY = make_scene(noise=0.5, outliers=0.15, depth_error=0.05, seed=2)
+OPTIONS = {"fixed_intrinsics": np.array([False, False, False, True])}
+SOLVER = SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
+Solve = Callable[[Problem, State], Solution]
+
+
+@pytest.fixture(scope="module")
+def solved() -> Solve:
+    """`solve`, compiled once for all tests of this file."""
+    return jax.jit(lambda problem, state: solve(problem, state, solver=SOLVER))
+
+
+def exact_problem(scene: Scene = EXACT) -> tuple[Problem, State, State]:
+    """A problem whose optimum is known, the guess, and the truth."""
+    problem, truth, _ = scene.at_truth(**OPTIONS)
+    _, start, _ = scene.pack(**OPTIONS)
+    held = start.intrinsics.at[3].set(truth.intrinsics[3])
+    return problem, State(start.poses, held, start.inverse_depth), truth
+
+
+def distance(found: State, truth: State) -> float:
+    """Largest difference of poses (metres, radians), relative intrinsics and relative depths."""
+    tangents = (found.poses @ truth.poses.inverse()).log()
+    relative = lambda a, b: jnp.abs(a / b - 1).max()
+    depth = relative(found.inverse_depth, truth.inverse_depth)
+    return float(max(jnp.abs(tangents).max(), relative(found.intrinsics, truth.intrinsics), depth))
+
+
+def finite(solution: Solution) -> bool:
+    return all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves((solution.state, solution.energy)))
+
+
+def test_exact_observations_give_the_truth(solved: Solve) -> None:
+    # Proves that points, lines and depths pull to one optimum. Oracle: the scene that the observations came from.
+    problem, start, truth = exact_problem()
+    solution = solved(problem, start)
+    assert distance(start, truth) > 1e-2
+    assert distance(solution.state, truth) < 1e-8
+    assert float(solution.energy) < 1e-18
+    assert bool(solution.converged), solution.message
+
+
+def test_what_the_solution_reports(solved: Solve) -> None:
+    # Proves counts, history and codes on a noisy problem. Oracle: what each of them is defined to be.
+    problem, start, _ = NOISY.pack(**OPTIONS)
+    solution = solved(problem, start)
+    steps, history = int(solution.iterations), np.asarray(solution.history)
+    assert solution.result == "energy_converged"
+    assert solution.message.startswith("Converged")
+    assert 3 < steps < 40
+    assert 0 < int(solution.linearisations) <= steps
+    assert np.all(np.isfinite(history[: steps + 1]))
+    assert np.all(np.isnan(history[steps + 1 :]))
+    assert np.all(np.diff(history[: steps + 1]) <= 0)
+    assert history[steps] == float(solution.energy)
+    assert 0 < float(solution.gradient_norm) < 1e-3
+
+
+def test_held_coordinates_stay(solved: Solve) -> None:
+    # Proves that the first pose and held intrinsics keep their bits while all others move.
+    problem, start, _ = NOISY.pack(**OPTIONS)
+    state = solved(problem, start).state
+    moved = np.abs(state.poses.wxyz_xyz - start.poses.wxyz_xyz).max(1)
+    np.testing.assert_allclose(moved[0], 0.0, atol=1e-15)
+    assert np.all(moved[1:] > 1e-6)
+    assert float(state.intrinsics[3]) == float(start.intrinsics[3])
+    assert bool(jnp.all(state.intrinsics[:3] != start.intrinsics[:3]))
+
+
+@pytest.mark.parametrize("spoil", ["pose", "pixel", "target", "weight", "depth"])
+def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
+    # Proves that NaN anywhere in use ends at once, with the code that says so and the initial state untouched.
+    problem, start, _ = NOISY.pack(**OPTIONS)
+    nan = lambda tree, where: eqx.tree_at(where, tree, replace_fn=lambda leaf: leaf.at[(0,) * leaf.ndim].set(jnp.nan))
+    seen = tuple(np.argwhere(problem.points.weight > 0)[0])
+    if spoil == "pose":
+        start = State(jaxlie.SE3(start.poses.wxyz_xyz.at[1, 4].set(jnp.nan)), start.intrinsics, start.inverse_depth)
+    elif spoil == "depth":
+        start = nan(start, lambda s: s.inverse_depth)
+    elif spoil == "pixel":
+        problem = nan(problem, lambda p: p.pixels)
+    elif spoil == "target":
+        problem = eqx.tree_at(lambda p: p.points.target, problem, replace_fn=lambda leaf: leaf.at[seen].set(jnp.nan))
+    else:
+        problem = eqx.tree_at(lambda p: p.points.weight, problem, replace_fn=lambda leaf: leaf.at[seen].set(jnp.inf))
+    solution = solved(problem, start)
+    assert solution.result == "nonfinite_input"
+    assert int(solution.iterations) == 0
+    assert not bool(solution.converged)
+    np.testing.assert_array_equal(solution.state.inverse_depth, start.inverse_depth)
+    np.testing.assert_array_equal(solution.state.poses.wxyz_xyz, start.poses.wxyz_xyz)
+
+
+def test_no_weight_at_all(solved: Solve) -> None:
+    # Proves that a problem that asks for nothing leaves the state as it is. Oracle: the start.
+    scene = NOISY.with_observations(
+        point_weight=0 * NOISY.observations.point_weight,
+        line_weight=0 * NOISY.observations.line_weight,
+        depth_weight=0 * NOISY.observations.depth_weight,
+    )
+    problem, start, _ = scene.pack(**{**OPTIONS, "intrinsics_sigma": None})
+    solution = solved(problem, start)
+    assert bool(solution.converged), solution.message
+    assert float(solution.energy) == 0.0
+    assert distance(solution.state, start) < 1e-15
+
+
+def test_a_keyframe_that_nothing_was_matched_in(solved: Solve) -> None:
+    # Proves that an unconnected keyframe does no harm: the others come out as they should, it stays finite and, having
+    # depth priors only, where it was. Oracle: the truth of the others, its start.
+    seen = EXACT.observations
+    with_last = {kind: np.any(seen.edges[getattr(seen, f"{kind}_edge")] == 2, 1) for kind in ("point", "line")}
+    scene = EXACT.with_observations(
+        point_weight=np.where(with_last["point"], 0.0, seen.point_weight),
+        line_weight=np.where(with_last["line"], 0.0, seen.line_weight),
+    )
+    problem, start, truth = exact_problem(scene)
+    solution = solved(problem, start)
+    first_two = lambda state: State(jaxlie.SE3(state.poses.wxyz_xyz[:2]), state.intrinsics, state.inverse_depth)
+    assert bool(solution.converged), solution.message
+    assert distance(first_two(solution.state), first_two(truth)) < 1e-7
+    np.testing.assert_allclose(solution.state.poses.wxyz_xyz[2], start.poses.wxyz_xyz[2], atol=1e-12)
+
+
+def test_without_depth_the_scale_is_held(solved: Solve) -> None:
+    # Proves that with no metric depth the scale stays that of the start instead of drifting, and all else is found.
+    # Oracle: the truth of all that was matched, brought to the solution's scale by its translations.
+    scene = EXACT.with_observations(depth_weight=0 * EXACT.observations.depth_weight)
+    problem, start, truth = exact_problem(scene)
+    solution = solved(problem, start)
+    scale = float(jnp.linalg.norm(solution.state.poses.translation()) / jnp.linalg.norm(truth.poses.translation()))
+    size = float(jnp.linalg.norm(start.poses.translation()) / jnp.linalg.norm(truth.poses.translation()))
+    seen = jnp.any((jnp.concatenate([problem.points.weight, problem.lines.weight], 1) > 0).reshape(3, 2, -1), 1)
+    rescaled = State(
+        jaxlie.SE3(solution.state.poses.wxyz_xyz.at[:, 4:].divide(scale)),
+        solution.state.intrinsics,
+        jnp.where(seen, solution.state.inverse_depth * scale, truth.inverse_depth),
+    )
+    assert finite(solution)
+    assert bool(solution.converged), solution.message
+    assert distance(rescaled, truth) < 1e-8
+    assert abs(scale / size - 1) < 0.05
+
+
+def test_two_keyframes_that_start_at_the_same_place(solved: Solve) -> None:
+    # Proves that a vanishing baseline, where depth has no influence, is no end: the gradient of the poses counts.
+    # Oracle: the truth.
+    problem, start, truth = exact_problem()
+    together = jaxlie.SE3(jnp.broadcast_to(start.poses.wxyz_xyz[:1], start.poses.wxyz_xyz.shape))
+    no_depth = eqx.tree_at(lambda p: p.depth.weight, problem, replace_fn=jnp.zeros_like)
+    solution = solved(no_depth, State(together, start.intrinsics, truth.inverse_depth))
+    assert int(solution.iterations) > 1, solution.message
+    assert float(solution.energy) < 1e-3 * float(solution.history[0])
+
+
+def test_without_jit_it_is_the_same(solved: Solve) -> None:
+    # Proves that compilation changes no step, and that a budget that is too small is said. Oracle: the compiled run.
+    problem, start, _ = NOISY.pack(**OPTIONS)
+    compiled = solved(problem, start)
+    two = solve(problem, start, solver=SchurLevenbergMarquardt(rtol=1e-12, max_iterations=2))
+    assert two.result == "max_iterations"
+    assert int(two.iterations) == 2
+    assert not bool(two.converged)
+    np.testing.assert_allclose(two.history, compiled.history[:3], rtol=1e-12)
+
+
+def test_vmap_solves_each(solved: Solve) -> None:
+    # Proves that a batch of problems of one shape is solved one by one, each with its own count. Oracle: two solves.
+    problems = [scene.pack(**OPTIONS)[:2] for scene in (NOISY, make_scene(noise=1.0, depth_error=0.1, seed=5))]
+    alone = [solved(*problem) for problem in problems]
+    stacked = jax.tree.map(lambda a, b: jnp.stack([a, b]), *problems)
+    batch = jax.jit(jax.vmap(lambda problem, state: solve(problem, state, solver=SOLVER)))(*stacked)
+    for i, solution in enumerate(alone):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], batch.state)
+        assert float(batch.energy[i]) == pytest.approx(float(solution.energy), rel=1e-10)
+        assert distance(one, solution.state) < 1e-7
+    assert [int(n) for n in batch.iterations] == [int(solution.iterations) for solution in alone]
+
+
+def test_padding_does_not_move_the_optimum(solved: Solve) -> None:
+    # Proves that the same problem in a larger shape has the same solution. Oracle: the tight packing.
+    problem, start, index = NOISY.pack(**OPTIONS)
+    padded, padded_start, padded_index = NOISY.pack(size=PaddedSize(4, 8, 5, 3), **OPTIONS)
+    tight, wide = solved(problem, start), solved(padded, padded_start)
+    assert float(wide.energy) == pytest.approx(float(tight.energy), rel=1e-12)
+    np.testing.assert_allclose(wide.state.poses.wxyz_xyz[:3], tight.state.poses.wxyz_xyz, atol=1e-6)
+    found, expected = padded_index.gather(wide.state.inverse_depth), index.gather(tight.state.inverse_depth)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_float32_is_close_to_float64(solved: Solve) -> None:
+    # Proves that a float32 problem stays float32 and loses precision only. Oracle: the float64 solution.
+    exact, single = (solved(*NOISY.pack(dtype=dtype, **OPTIONS)[:2]) for dtype in (np.float64, np.float32))
+    dtypes = {leaf.dtype for leaf in jax.tree.leaves(single) if jnp.issubdtype(leaf.dtype, jnp.floating)}
+    assert dtypes == {np.dtype(np.float32)}
+    assert bool(single.converged), single.message
+    assert float(single.energy) == pytest.approx(float(exact.energy), rel=1e-5)
+    assert distance(single.state, exact.state) < 2e-3
