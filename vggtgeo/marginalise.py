@@ -52,7 +52,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> Marg
     leaving_rows = leaving_rows.at[-SHARED:].set(False)
     held = jnp.concatenate([jnp.repeat(problem.fixed_pose, 6), problem.fixed_intrinsics])
     quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
-    root, offset = _square_root(quadratic, gradient)
+    root, offset = square_root(quadratic, gradient)
     return MarginalPrior(root=root, offset=offset, poses=point.poses, intrinsics=point.intrinsics)
 
 
@@ -116,7 +116,7 @@ def _eliminate(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], row
     return (remaining + remaining.T) / 2, gradient
 
 
-def _square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]):
+def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]):
     """`R, r0` with `R' R = H` and `R' r0 = g` on the part of the space where `H` is positive."""
     # Metres, radians and pixels differ by orders of magnitude: balance before cutting off what is rounding error.
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(quadratic), 0.0))

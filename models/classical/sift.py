@@ -23,7 +23,7 @@ class SiftMatcher:
     ratio: largest ratio of the best to the second-best descriptor distance. radius: how far from its predicted
     place a match may lie, pixels, where a prediction is given. area: an image of more pixels is shrunk to about so
     many for detection, which bounds the cost; the refinement works at full resolution and makes up for it (at 640 x 480
-    a third less time for the same trajectory error). refinement: sub-pixel alignment of the targets, or None.
+    almost half the time for the same trajectory error). refinement: sub-pixel alignment of the targets, or None.
     """
 
     count: int = 1500

@@ -15,13 +15,14 @@ from vggtgeo.models.roles import GeometryResult, StartGuess
 class TwoViewStart:
     """Essential matrix by MAGSAC++, the one of its four motions with points in front, triangulation.
 
-    threshold: largest epipolar error of an inlier, pixels. least: fewest points of a success.
+    threshold: largest epipolar error of an inlier, pixels. least: fewest points of a success: a start can wait for a
+    good pair, and on real clips those of about 50 points were often wrong.
     parallax: least median angle between the rays of a point, radians; below it depth is mostly noise.
     """
 
     threshold: float = 1.5
-    least: int = 40
-    parallax: float = float(np.deg2rad(1.5))
+    least: int = 60
+    parallax: float = float(np.deg2rad(2.0))
     confidence: float = 0.9999
     max_iterations: int = 5000
 

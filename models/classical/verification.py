@@ -78,7 +78,7 @@ def _adds_nothing(epipolar: np.ndarray, homography: np.ndarray) -> bool:
     A wrong match lies within 2 px of a line across a 300 pixel image with a probability of about 3 %.
     """
     extra = np.count_nonzero(epipolar & ~homography)
-    return extra < 0.15 * np.count_nonzero(~homography)
+    return bool(extra < 0.15 * np.count_nonzero(~homography))
 
 
 def _quietly(estimate: Callable[..., tuple[Any, np.ndarray | None]], *arguments: Any) -> np.ndarray | None:

@@ -5,13 +5,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
+from vggtgeo.marginalise import no_prior
 from vggtgeo.packing import PaddedSize
+from vggtgeo.problem import MarginalPrior
 from vggtgeo.slam import rigid
 from vggtgeo.slam.adjustment import build, write_back
 from vggtgeo.slam.covisibility import Directed, Pair, directions, overlap, some_points
+from vggtgeo.slam.depth_alignment import Surface, depth_prior
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
@@ -31,7 +36,7 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
 
 
 def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
-    """Bundle-adjust every keyframe."""
+    """Bundle-adjust every keyframe: features and, where there is metric depth, surfaces, in a few rounds."""
     if len(slam.keyframes) < 3 or not slam.pairs:
         return slam
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
@@ -42,21 +47,36 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         len(slam.keyframes), settings.point_slots, settings.line_slots, int(ranks), len(edges)
     )
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
-    adjustment = build(
-        slam.keyframes,
-        edges,
-        slam.intrinsics,
-        settings,
-        size=size,
-        intrinsics_sigma=slam.intrinsics_sigma,
-        fixed_pose=fixed,
-    )
+    surfaces = [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
     solver = SchurLevenbergMarquardt(max_iterations=settings.global_iterations, rtol=1e-5)
-    solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
-    if not np.isfinite(float(solution.energy)):
-        return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
-    keyframes, intrinsics = write_back(slam.keyframes, adjustment, solution.state)
-    return replace(slam, keyframes=keyframes, intrinsics=intrinsics, solved=None)
+    initial_intrinsics = slam.intrinsics
+    for _ in range(settings.global_rounds):
+        adjustment = build(
+            slam.keyframes,
+            edges,
+            slam.intrinsics,
+            settings,
+            size=size,
+            intrinsics_sigma=slam.intrinsics_sigma,
+            fixed_pose=fixed,
+            marginal=_surface_prior(slam, surfaces, settings),
+        )
+        problem = eqx.tree_at(
+            lambda p: p.intrinsics_prior.mean, adjustment.problem, jnp.asarray(initial_intrinsics)
+        )
+        solution = solve_jit(problem, adjustment.initial, solver=solver)
+        if not np.isfinite(float(solution.energy)):
+            return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
+        keyframes, intrinsics = write_back(slam.keyframes, adjustment, solution.state)
+        slam = replace(slam, keyframes=keyframes, intrinsics=intrinsics, solved=None)
+    return slam
+
+
+def _surface_prior(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> MarginalPrior:
+    if not surfaces or settings.surface_points <= 0:
+        return no_prior(len(slam.keyframes))
+    pairs = [pair.key for pair in slam.pairs]
+    return depth_prior(slam.keyframes, pairs, surfaces, slam.intrinsics, settings.surface_points)
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:

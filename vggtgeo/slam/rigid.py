@@ -74,3 +74,11 @@ def triangulate(
     information = (lever**2).sum(1)
     value = -(lever * np.cross(turned, seen)).sum(1) / np.maximum(information, 1e-18)
     return value, information * float(intrinsics[0]) ** 2
+
+
+def adjoint(pose: np.ndarray) -> np.ndarray:
+    """`Ad(T)`, float64 [6, 6], tangents translation first."""
+    x, y, z = pose[:3, 3]
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation = pose[:3, :3]
+    return np.block([[rotation, skew @ rotation], [np.zeros((3, 3)), rotation]])

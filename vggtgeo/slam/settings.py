@@ -68,12 +68,16 @@ class SlamSettings:
     """Weight of a match: `gain * confidence + floor`."""
     depth_weight: float = 2.0
     """The paper's alpha; 0 switches the depth prior off."""
-    known_intrinsics_sigma: float = 0.003
+    known_intrinsics_sigma: float = 0.002
     """Standard deviation of the prior on known intrinsics, relative to the focal length."""
     guessed_intrinsics_sigma: float = 0.3
     """The same for guessed ones."""
     window_iterations: int = 12
     global_iterations: int = 40
+    global_rounds: int = 3
+    """Adjustments at the end, each after relinearising the dense depth between keyframes."""
+    surface_points: float = 300.0
+    """How many independent points the dense depth of a pair counts for; 0 leaves it out."""
     global_neighbours: int = 16
     """Most edges of one keyframe in the global adjustment."""
     loop_candidates: int = 3

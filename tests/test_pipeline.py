@@ -1,0 +1,127 @@
+"""The pipeline on a few synthetic frames with exact truth, and on input that is bad."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from vggtgeo.camera import Camera
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.errors import InputError
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.models.classical import NoDepth, SiftMatcher
+from vggtgeo.simulation import simulate
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.run import finish, frame_trajectory, run_frames
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.window import solve_jit
+
+SIZE = (320, 240)
+# One small window shape for all tests of this file, so that the solver is compiled once.
+SETTINGS = SlamSettings(window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False)
+ROLES = Roles(points=SiftMatcher(count=500))
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[list[Frame], Camera, object]:
+    sequence = simulate("room", 30, 0, SIZE, rate=10.0)
+    return list(sequence.frames()), sequence.camera, sequence.ground_truth()
+
+
+def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES, settings: SlamSettings = SETTINGS) -> Slam:
+    slam: Slam | None = None
+    for slam in run_frames(iter(frames), camera, roles, settings, Clock()):
+        pass
+    assert slam is not None
+    return slam
+
+
+@pytest.fixture(scope="module")
+def tracked(room) -> Slam:
+    frames, camera, _ = room
+    return _run(frames, camera)
+
+
+def test_rgbd_recovers_the_truth(room, tracked: Slam) -> None:
+    """ATE below 1.5 cm on a synthetic room with sensor noise, every frame tracked; oracle: the renderer's poses."""
+    report = evaluate_trajectory(frame_trajectory(tracked), room[2])
+    error = report.se3.statistics.rmse
+    assert all(record.tracked for record in tracked.frames)
+    assert len(tracked.keyframes) > SETTINGS.window, "no keyframe ever left the window"
+    assert error < 0.015, f"ATE {error:.4f} m"
+
+
+def test_no_recompilation_after_the_first_window(room, tracked: Slam) -> None:
+    """A second pass over other frames compiles nothing; oracle: JAX's own count of compiled programs."""
+    frames, camera, _ = room
+    compiled = solve_jit._cached._cache_size() if hasattr(solve_jit, "_cached") else None
+    with jax.log_compiles(False):
+        _run(frames[5:20], camera)
+    if compiled is not None:
+        assert solve_jit._cached._cache_size() == compiled
+
+
+def test_global_adjustment_keeps_the_truth(room, tracked: Slam) -> None:
+    """The adjustment of all keyframes at the end does not worsen a good map; oracle: the renderer's poses."""
+    settings = replace(SETTINGS, global_adjustment=True, global_iterations=10)
+    finished = finish(tracked, ROLES, settings)
+    error = evaluate_trajectory(frame_trajectory(finished), room[2]).se3.statistics.rmse
+    assert error < 0.015, f"ATE {error:.4f} m"
+
+
+def test_rgb_recovers_the_shape(room) -> None:
+    """Without depth the trajectory is right up to scale, and the state says that lengths are not metres."""
+    frames, camera, truth = room
+    colour = [replace(frame, depth=None) for frame in frames]
+    slam = _run(colour, camera, replace(ROLES, depth=NoDepth()))
+    error = evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse
+    assert not slam.metric
+    assert len(slam.frames) == len(frames)
+    assert error < 0.03, f"ATE after Sim(3) {error:.4f} m"
+
+
+def _black(frame: Frame) -> Frame:
+    return replace(frame, image=np.zeros_like(frame.image), depth=np.full_like(frame.depth, np.nan))
+
+
+def _bad_sequences(frames: list[Frame]) -> Iterator[tuple[str, list[Frame]]]:
+    yield "one frame", frames[:1]
+    yield "two identical frames", [frames[0], replace(frames[0], index=1, timestamp=0.1)]
+    yield "still camera", [replace(frames[0], index=i, timestamp=i / 10) for i in range(5)]
+    yield "black frames in between", [*frames[:4], _black(frames[4]), _black(frames[5]), *frames[6:9]]
+    yield "black from the start", [_black(frame) for frame in frames[:3]]
+    yield "no valid depth", [replace(frame, depth=np.full_like(frame.depth, np.nan)) for frame in frames[:4]]
+
+
+@pytest.mark.parametrize("case", range(6))
+def test_bad_sequences_end_with_a_finite_pose_for_every_frame(room, case: int) -> None:
+    """Whatever the frames show, each gets a finite pose and nothing raises."""
+    name, frames = list(_bad_sequences(room[0]))[case]
+    slam = _run(frames, room[1])
+    poses = frame_trajectory(slam).poses
+    assert len(poses) == len(frames), name
+    assert np.all(np.isfinite(poses)), name
+
+
+def test_a_jump_is_said_and_survived(room) -> None:
+    """After a jump to a place never seen, tracking is reported lost, the map goes on from a new origin."""
+    frames, camera, _ = room
+    other = simulate("room", 2000, 0, SIZE, rate=10.0)
+    elsewhere = [replace(other.frame(60 + i), index=8 + i, timestamp=(8 + i) / 10) for i in range(14)]
+    slam = _run([*frames[:8], *elsewhere], camera)
+    assert any("tracking was lost at frame 8" in note for note in slam.notes), slam.notes
+    assert len(slam.origins) == 2
+    assert len(slam.frames) == 22
+
+
+def test_a_frame_of_another_size_is_named(room) -> None:
+    """An image whose size differs raises an error that names it, found and expected."""
+    frames, camera, _ = room
+    odd = replace(frames[1], image=frames[1].image[:-10], depth=None, name="odd.png")
+    with pytest.raises(InputError, match=r"`odd.png` is 320 x 230 pixels.*320 x 240"):
+        _run([frames[0], odd], camera)

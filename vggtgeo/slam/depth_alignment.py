@@ -1,0 +1,141 @@
+"""Dense depth between keyframes: projective point-to-plane alignment (Chen & Medioni 1991; Newcombe et al., KinectFusion,
+2011) as a quadratic on relative poses, so that surfaces without texture speak in the adjustment too.
+
+At the current poses every pair (i, j) gives residuals `n . (T_ji p - q)` in standard deviations of the sensor, where
+`q, n` is the surface of j at the pixel that `p` of i falls on. Their normal equations `H, g` over the left tangent
+`eta` of `T_ji` are carried to the two poses by `eta = x_j - Ad(T_ji) x_i`, added up over all pairs, and enter the
+adjustment as a Gaussian prior linearised at the current poses. Relinearising after each adjustment makes it
+Gauss-Newton on the sum of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from vggtgeo.marginalise import square_root
+from vggtgeo.problem import MarginalPrior
+from vggtgeo.slam import rigid
+from vggtgeo.slam.keyframe import Keyframe
+
+CELL = 4
+"""Pixels a side of the blocks whose median depth makes one surface point."""
+FARTHEST = 0.10
+"""Metres between surfaces that can be one."""
+LEAST_COSINE = 0.8
+LEAST_POINTS = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A keyframe's depth as points float64 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = none."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    intrinsics: np.ndarray
+
+    @classmethod
+    def of(cls, keyframe: Keyframe, intrinsics: np.ndarray) -> Surface:
+        """Block medians of the depth, and normals from central differences that do not cross a depth jump."""
+        depth = keyframe.depth.depth
+        height, width = depth.shape[0] // CELL, depth.shape[1] // CELL
+        blocks = depth[: height * CELL, : width * CELL].astype(np.float64).reshape(height, CELL, width, CELL)
+        ordered = np.sort(blocks.transpose(0, 2, 1, 3).reshape(height, width, -1), axis=2)
+        count = np.isfinite(ordered).sum(2)
+        middle = np.take_along_axis(ordered, np.maximum(count // 2, 0)[..., None].clip(0, CELL**2 - 1), 2)[..., 0]
+        middle = np.where(count >= CELL**2 // 2, middle, np.nan)
+        coarse = np.array([*intrinsics[:2], *(intrinsics[2:] - (CELL - 1) / 2)]) / CELL
+        v, u = np.mgrid[:height, :width]
+        points = np.stack([(u - coarse[2]) / coarse[0], (v - coarse[3]) / coarse[1], np.ones_like(u)], -1)
+        points = points * middle[..., None]
+        return cls(points, _normals(points), coarse)
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Normal equations of one pair over the left tangent of `T_ji`, in units of the sensor's standard deviation."""
+
+    first: int
+    second: int
+    hessian: np.ndarray
+    gradient: np.ndarray
+    points: int
+
+
+def align(
+    first: int, second: int, surfaces: Sequence[Surface], relative: np.ndarray, effective: float
+) -> Alignment | None:
+    """Linearise surface i = `first` against j = `second`; None where too little overlaps.
+
+    Neighbouring depths share their errors: however many points there are, they count as `effective` ones.
+    """
+    source, target = surfaces[first], surfaces[second]
+    good = np.isfinite(source.normals[..., 0])
+    points = source.points[good] @ relative[:3, :3].T + relative[:3, 3]
+    normals = source.normals[good] @ relative[:3, :3].T
+    fx, fy, cx, cy = target.intrinsics
+    height, width = target.normals.shape[:2]
+    z = np.maximum(points[:, 2], 1e-3)
+    u = np.rint(points[:, 0] / z * fx + cx).astype(int)
+    v = np.rint(points[:, 1] / z * fy + cy).astype(int)
+    inside = (points[:, 2] > 0.1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    points, normals, u, v = points[inside], normals[inside], u[inside], v[inside]
+    n, q = target.normals[v, u], target.points[v, u]
+    with np.errstate(invalid="ignore"):
+        one = (np.linalg.norm(points - q, axis=1) < FARTHEST) & ((n * normals).sum(1) > LEAST_COSINE)
+    if np.count_nonzero(one) < LEAST_POINTS:
+        return None
+    points, q, n = points[one], q[one], n[one]
+    residual = (n * (points - q)).sum(1)
+    sigma = np.sqrt(2) * np.hypot(0.0012 + 0.0019 * (q[:, 2] - 0.4) ** 2, 0.003 * q[:, 2])
+    # Tukey's biweight, wide enough for a pose that is off by a few standard deviations.
+    scale = max(float(np.median(np.abs(residual / sigma))) * 4.7, 3.0)
+    weight = np.maximum(1 - (residual / sigma / scale) ** 2, 0.0) ** 2 / sigma**2
+    weight *= min(effective / len(points), 1.0)
+    rows = np.concatenate([n, np.cross(points, n)], 1)
+    return Alignment(first, second, (rows * weight[:, None]).T @ rows, rows.T @ (weight * residual), len(points))
+
+
+def depth_prior(
+    keyframes: Sequence[Keyframe],
+    pairs: Iterable[tuple[int, int]],
+    surfaces: Sequence[Surface],
+    intrinsics: np.ndarray,
+    effective: float,
+) -> MarginalPrior:
+    """The sum of all pairs' alignments at the current poses, over the poses of `keyframes` and the intrinsics."""
+    size = 6 * len(keyframes) + 4
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    for i, j in pairs:
+        relative = keyframes[j].pose @ rigid.invert(keyframes[i].pose)
+        found = align(i, j, surfaces, relative, effective)
+        if found is None:
+            continue
+        jacobian = np.zeros((6, size))
+        jacobian[:, 6 * j : 6 * j + 6] = np.eye(6)
+        jacobian[:, 6 * i : 6 * i + 6] = -rigid.adjoint(relative)
+        rows = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+        local = jacobian[:, rows]
+        hessian[np.ix_(rows, rows)] += local.T @ found.hessian @ local
+        gradient[rows] += local.T @ found.gradient
+    root, offset = square_root(jnp.asarray(hessian), jnp.asarray(gradient))
+    poses = rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes]))
+    return MarginalPrior(root, offset, jaxlie.SE3(jnp.asarray(poses)), jnp.asarray(intrinsics))
+
+
+def _normals(points: np.ndarray) -> np.ndarray:
+    """Unit normals towards the camera, NaN at borders, holes and depth jumps."""
+    normals = np.full_like(points, np.nan)
+    right = points[1:-1, 2:] - points[1:-1, :-2]
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    normal = np.cross(down, right)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = points[1:-1, 1:-1, 2]
+        smooth = (np.abs(right[..., 2]) < 0.1 * z) & (np.abs(down[..., 2]) < 0.1 * z)
+        normal = normal / np.linalg.norm(normal, axis=2, keepdims=True)
+    normals[1:-1, 1:-1] = np.where(smooth[..., None], normal, np.nan)
+    return normals
