@@ -17,8 +17,11 @@ Levenberg-Marquardt damping multiplies the diagonal: `V (1 + l)`, `H + l diag(H)
 
 from __future__ import annotations
 
+import abc
+
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 Assembled = tuple[Float[Array, "c c"], Float[Array, " c"]]
@@ -58,7 +61,9 @@ class ArrowSystem(eqx.Module):
     landmark's gradient and its own second derivative. One array, because slicing it would copy it."""
     twist: Float[Array, "e b b"]
     """Curvature of `eta` itself, `x_j' twist (-A x_i)`; zero in a Gauss-Newton model."""
-    prior_hessian: Float[Array, "c c"]
+    prior_hessian: Float[Array, "p p"]
+    """Over the last `p` dense coordinates: `p = q` when only the shared ones have a prior, `p = c` when all may. It is
+    the only dense matrix here, so a system without a prior on the nodes grows linearly with its edges."""
     prior_gradient: Float[Array, " c"]
     free: Bool[Array, " c"]
     """False for coordinates that are held."""
@@ -96,16 +101,21 @@ def reduce(system: ArrowSystem) -> Reduced:
 
     Cost: one product of `[r, s]` with its transpose a host, the rest is small matrices.
     """
-    scaled = system.cross * inverse_landmark_hessian(system)[:, None, :]
-    products = jnp.einsum("nrs,nts->nrt", scaled, system.cross)[:, :-1, :-1]
-    schur, schur_gradient = _assemble_hosts(system, products)
-    hessian, gradient = _assemble_edges(system)
+    schur, schur_gradient = _dense(assemble_hosts(system, host_products(system), DenseLayout()))
+    hessian, gradient = _dense(assemble_edges(system, DenseLayout()))
+    outside = len(gradient) - len(system.prior_hessian)
     return Reduced(
-        hessian=hessian + system.prior_hessian,
+        hessian=hessian + jnp.pad(system.prior_hessian, (outside, 0)),
         gradient=gradient + system.prior_gradient,
         schur=schur,
         schur_gradient=schur_gradient,
     )
+
+
+def host_products(system: ArrowSystem) -> Float[Array, "n t t"]:
+    """`C V^-1 C'` of each host in relative coordinates; `t = b k + q + 1`, the gradient comes last."""
+    scaled = system.cross * inverse_landmark_hessian(system)[:, None, :]
+    return jnp.einsum("nrs,nts->nrt", scaled, system.cross)[:, :-1, :-1]
 
 
 def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "n relative"]:
@@ -133,16 +143,40 @@ def back_substitute(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Arr
 def multiply(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
     """The undamped matrix times a vector (held coordinates as if free)."""
     return ArrowVector(
-        dense=reduce(system).hessian @ vector.dense + carry_to_nodes(system, vector.landmarks),
+        dense=hessian_times(system, vector.dense) + carry_to_nodes(system, vector.landmarks),
         landmarks=couple(system, vector.dense, 0.0) + system.landmark_hessian * vector.landmarks,
     )
 
 
+def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, " c"]:
+    """`H dense`, edge by edge: no matrix over all nodes is formed."""
+    hosts, block = system.graph.of_host.shape[0], system.transport.shape[-1]
+    nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
+    at_target = nodes[system.graph.target]
+    at_source = jnp.einsum("eab,eb->ea", system.transport, nodes[system.graph.source])
+    spread = jnp.broadcast_to(shared, (len(at_target), len(shared)))
+    local = jnp.concatenate([at_target - at_source, spread], 1)
+    pulled = jnp.einsum("eab,eb->ea", system.gram[:, :-1, :-1], local)
+    bent = jnp.einsum("eba,eb->ea", system.twist, at_target)
+    nodes = _gather_at_nodes(
+        system,
+        pulled[:, :block] - jnp.einsum("eab,eb->ea", system.twist, at_source),
+        pulled[:, :block] + bent,
+    )
+    whole = jnp.concatenate([nodes.reshape(-1), pulled[:, block:].sum(0)])
+    prior = len(system.prior_hessian)
+    return whole.at[-prior:].add(system.prior_hessian @ dense[-prior:])
+
+
 def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "n s"]) -> Float[Array, " c"]:
     """`W z`: landmark values carried to the dense coordinates."""
+    return from_relative(system, jnp.einsum("nrs,ns->nr", system.cross, landmarks)[:, :-2])
+
+
+def from_relative(system: ArrowSystem, relative: Float[Array, "n relative"]) -> Float[Array, " c"]:
+    """The transpose of `to_relative`: forces on each host's relative coordinates, added up at the nodes."""
     hosts, ranks = system.graph.of_host.shape
     block = system.transport.shape[-1]
-    relative = jnp.einsum("nrs,ns->nr", system.cross, landmarks)[:, :-2]
     eta = relative[:, : ranks * block].reshape(hosts, ranks, block)
     eta = jnp.where(system.graph.of_host[..., None] < len(system.graph.source), eta, 0.0)
     to_host = -jnp.einsum("nkab,nka->nb", _transports(system), eta)
@@ -152,8 +186,62 @@ def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "n s"]) -> Float
 
 def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """Gradient of the dense coordinates and the diagonal of their Hessian (no landmark eliminated)."""
-    hessian, gradient = _assemble_edges(system)
-    return gradient + system.prior_gradient, jnp.diagonal(hessian + system.prior_hessian)
+    block = system.transport.shape[-1]
+    eta = system.gram[:, :block, :block]
+    gradients = _gather_at_nodes(system, system.gram[:, :block, -1], system.gram[:, :block, -1])
+    at_target = jnp.diagonal(eta, axis1=1, axis2=2)
+    at_source = jnp.einsum("eba,ebc,eca->ea", system.transport, eta, system.transport)
+    nodes = jnp.zeros_like(gradients).at[system.graph.target].add(at_target)
+    nodes = nodes.at[system.graph.source].add(at_source)
+    shared = system.gram[:, block:, block:].sum(0)
+    gradient = jnp.concatenate([gradients.reshape(-1), shared[:-1, -1]]) + system.prior_gradient
+    diagonal = jnp.concatenate([nodes.reshape(-1), jnp.diagonal(shared)[:-1]])
+    return gradient, diagonal.at[-len(system.prior_hessian) :].add(jnp.diagonal(system.prior_hessian))
+
+
+def _gather_at_nodes(
+    system: ArrowSystem, at_target: Float[Array, "e b"], at_source: Float[Array, "e b"]
+) -> Float[Array, "n b"]:
+    """Add forces on relative coordinates up at the nodes: `at_target` at targets, `-A' at_source` at sources."""
+    nodes = jnp.zeros((system.graph.of_host.shape[0], at_target.shape[1]), at_target.dtype)
+    carried = jnp.einsum("eba,eb->ea", system.transport, at_source)
+    return nodes.at[system.graph.target].add(at_target).at[system.graph.source].add(-carried)
+
+
+class AbstractLayout(eqx.Module):
+    """Where the blocks of a matrix over the nodes are stored: one storage a class."""
+
+    @abc.abstractmethod
+    def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
+        """Storage of zeros."""
+
+    @abc.abstractmethod
+    def add(
+        self, stored: Array, row: Int[Array, "*t"], column: Int[Array, "*t"], value: Float[Array, "*t b b"]
+    ) -> Array:
+        """Add blocks at `(row, column)`; a node index equal to the number of nodes means no block."""
+
+
+class DenseLayout(AbstractLayout):
+    """All blocks, `[n + 1, n + 1, b, b]`; the last row and column take what belongs nowhere."""
+
+    def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
+        return jnp.zeros((nodes + 1, nodes + 1, block, block), dtype)
+
+    def add(
+        self, stored: Array, row: Int[Array, "*t"], column: Int[Array, "*t"], value: Float[Array, "*t b b"]
+    ) -> Array:
+        return stored.at[row, column].add(value)
+
+
+class Blocks(eqx.Module):
+    """A symmetric matrix over nodes and shared coordinates, with a gradient as its last shared coordinate."""
+
+    nodes: Array
+    """As the layout stores it."""
+    border: Float[Array, "n b o"]
+    """`o = q + 1`."""
+    corner: Float[Array, "o o"]
 
 
 def _transports(system: ArrowSystem) -> Float[Array, "n k b b"]:
@@ -162,7 +250,7 @@ def _transports(system: ArrowSystem) -> Float[Array, "n k b b"]:
     return padded[system.graph.of_host]
 
 
-def _assemble_hosts(system: ArrowSystem, products: Float[Array, "n r r"]) -> Assembled:
+def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout: AbstractLayout) -> Blocks:
     """Carry each host's matrix from relative to node coordinates and add them all up."""
     hosts, ranks = system.graph.of_host.shape
     block = system.transport.shape[-1]
@@ -176,15 +264,16 @@ def _assemble_hosts(system: ArrowSystem, products: Float[Array, "n r r"]) -> Ass
     bottom = jnp.concatenate([to_neighbour, corner], 2)
     local = jnp.concatenate([top, bottom], 1).reshape(hosts, ranks + 1, block, ranks + 1, block)
     index = jnp.concatenate([system.graph.neighbours(), jnp.arange(hosts)[:, None]], 1)
-    blocks = jnp.zeros((hosts + 1, hosts + 1, block, block), products.dtype)
-    blocks = blocks.at[index[:, :, None], index[:, None, :]].add(local.transpose(0, 1, 3, 2, 4))[:-1, :-1]
+    rows, columns = jnp.broadcast_arrays(index[:, :, None], index[:, None, :])
+    blocks = layout.empty(hosts, block, products.dtype)
+    blocks = layout.add(blocks, rows, columns, local.transpose(0, 1, 3, 2, 4))
     border = jnp.concatenate([products[:, wide:, :wide], own[:, wide:]], 2)
     border = border.reshape(hosts, -1, ranks + 1, block).transpose(0, 2, 3, 1)
     borders = jnp.zeros((hosts + 1, block, border.shape[-1]), products.dtype).at[index].add(border)[:-1]
-    return _dense(blocks, borders, products[:, wide:, wide:].sum(0))
+    return Blocks(blocks, borders, products[:, wide:, wide:].sum(0))
 
 
-def _assemble_edges(system: ArrowSystem) -> Assembled:
+def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     """Hessian and gradient of all edges in node coordinates."""
     hosts = system.graph.of_host.shape[0]
     block = system.transport.shape[-1]
@@ -192,18 +281,20 @@ def _assemble_edges(system: ArrowSystem) -> Assembled:
     eta, border = system.gram[:, :block, :block], system.gram[:, :block, block:]
     own = jnp.einsum("eba,ebc,ecd->ead", system.transport, eta, system.transport)
     mixed = -jnp.einsum("eab,ebc->eac", eta + system.twist, system.transport)
-    blocks = jnp.zeros((hosts, hosts, block, block), eta.dtype)
-    blocks = blocks.at[target, target].add(eta).at[source, source].add(own)
-    blocks = blocks.at[target, source].add(mixed).at[source, target].add(jnp.swapaxes(mixed, 1, 2))
+    blocks = layout.empty(hosts, block, eta.dtype)
+    blocks = layout.add(layout.add(blocks, target, target, eta), source, source, own)
+    blocks = layout.add(blocks, target, source, mixed)
+    blocks = layout.add(blocks, source, target, jnp.swapaxes(mixed, 1, 2))
     borders = jnp.zeros((hosts, block, border.shape[-1]), eta.dtype).at[target].add(border)
     borders = borders.at[source].add(-jnp.einsum("eba,ebc->eac", system.transport, border))
-    return _dense(blocks, borders, system.gram[:, block:, block:].sum(0))
+    return Blocks(blocks, borders, system.gram[:, block:, block:].sum(0))
 
 
-def _dense(blocks: Float[Array, "n n b b"], borders: Float[Array, "n b o"], corner: Float[Array, "o o"]) -> Assembled:
-    """Lay blocks out as one matrix; the last shared coordinate is the gradient, returned apart."""
-    nodes = blocks.shape[0] * blocks.shape[2]
-    square = blocks.transpose(0, 2, 1, 3).reshape(nodes, nodes)
-    border = borders.reshape(nodes, -1)
-    whole = jnp.block([[square, border], [border.T, corner]])
+def _dense(blocks: Blocks) -> Assembled:
+    """Lay dense blocks out as one matrix; the last shared coordinate is the gradient, returned apart."""
+    inner = blocks.nodes[:-1, :-1]
+    nodes = inner.shape[0] * inner.shape[2]
+    square = inner.transpose(0, 2, 1, 3).reshape(nodes, nodes)
+    border = blocks.border.reshape(nodes, -1)
+    whole = jnp.block([[square, border], [border.T, blocks.corner]])
     return whole[:-1, :-1], whole[:-1, -1]

@@ -1,5 +1,7 @@
 """The exact Hessian of bundle adjustment against automatic differentiation of the readable energy."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,7 @@ def prior_on(state: State, strength: float) -> MarginalPrior:
     )
 
 
-@jax.jit
+@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiled long, run briefly
 def both(problem: Problem, state: State) -> tuple[jax.Array, ...]:
     """Gradient and Hessian, dense, of the solver's arrow and of the energy in the same coordinates."""
     ba = BundleAdjustment(problem)

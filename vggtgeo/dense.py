@@ -27,10 +27,10 @@ LARGEST_CORRECTION = 0.2
 
 def optimised_depth(keyframe: Keyframe) -> np.ndarray:
     """Depth of every pixel that has a metric prior, corrected by the slots; float32 `[H, W]` metres, NaN = none."""
-    prior = keyframe.depth.depth
+    prior = keyframe.depth.astype(np.float32)
     pixels, correction, weight = _corrections(keyframe)
     if not len(pixels):
-        return prior.copy()
+        return prior
     height, width = prior.shape
     log_depth = np.log(prior)
     low = float(np.nanmin(log_depth))
@@ -51,7 +51,7 @@ def optimised_depth(keyframe: Keyframe) -> np.ndarray:
     known = np.isfinite(log_depth)
     y, x = np.nonzero(known)
     place = np.stack([y / CELL + 1, x / CELL + 1, (log_depth[known] - low) / DEPTH_CELL + 1])
-    result = prior.copy()
+    result = prior
     result[known] = prior[known] * np.exp(map_coordinates(field, place, order=1, mode="nearest"))
     return result
 
@@ -73,7 +73,7 @@ def map_points(
     Where there is metric depth: every third pixel whose confidence is at least `least_confidence` and whose depth
     another keyframe confirms to 4 %; else the adjusted points alone. Points of one cell of `voxel` metres are averaged.
     """
-    metric = [bool(np.isfinite(keyframe.depth.depth).any()) for keyframe in keyframes]
+    metric = [bool(np.isfinite(keyframe.depth).any()) for keyframe in keyframes]
     depths = [optimised_depth(keyframe) if known else None for keyframe, known in zip(keyframes, metric, strict=True)]
     parts = []
     for i, keyframe in enumerate(keyframes):
@@ -97,7 +97,7 @@ def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray):
 def _dense_points(keyframes, depths, i: int, neighbours, intrinsics, least_confidence: float, step: int = 3):
     keyframe, depth = keyframes[i], depths[i]
     rows, columns = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step].reshape(2, -1)
-    confidence = keyframe.depth.confidence[rows, columns]
+    confidence = keyframe.depth_confidence[rows, columns] / 255.0
     good = np.isfinite(depth[rows, columns]) & (confidence >= least_confidence)
     rows, columns, confidence = rows[good], columns[good], confidence[good]
     pixels = np.column_stack([columns, rows]).astype(np.float64)

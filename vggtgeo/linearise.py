@@ -325,15 +325,19 @@ def _depth_terms(problem: Problem, state: State, wide: int, exact: bool) -> Floa
     return cross.at[:, -2].set(gradient / scale).at[:, -1].set(curvature / scale**2)
 
 
-def _dense_priors(problem: Problem, state: State, exact: bool) -> tuple[Float[Array, "c c"], Float[Array, " c"]]:
-    """Hessian and gradient of the priors on intrinsics and of the marginalisation prior."""
+def _dense_priors(problem: Problem, state: State, exact: bool) -> tuple[Float[Array, "p p"], Float[Array, " c"]]:
+    """Hessian and gradient of the priors on intrinsics and of the marginalisation prior.
+
+    Without the latter only the shared coordinates have a Hessian, and no matrix over all poses is made.
+    """
     prior = problem.intrinsics_prior
     shared = slice(-SHARED, None)
     size, dtype = problem.num_camera, state.inverse_depth.dtype
-    hessian = jnp.zeros((size, size), dtype).at[shared, shared].set(jnp.diag(prior.information))
+    hessian = jnp.diag(prior.information)
     gradient = jnp.zeros(size, dtype).at[shared].set(prior.information * (state.intrinsics - prior.mean))
     if problem.marginal is None:
         return hessian, gradient
+    hessian = jnp.pad(hessian, (size - SHARED, 0))
     jacobian = marginal_jacobian(problem.marginal, state)
     gradient = gradient + jacobian.T @ marginal_residual(problem.marginal, state)
     if exact:

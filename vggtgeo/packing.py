@@ -92,6 +92,7 @@ def pack(
     inverse_depth: np.ndarray,
     *,
     size: PaddedSize | None = None,
+    intrinsics_mean: np.ndarray | None = None,
     intrinsics_sigma: np.ndarray | float | None = None,
     fixed_pose: np.ndarray | None = None,
     fixed_intrinsics: np.ndarray | bool = False,
@@ -103,7 +104,8 @@ def pack(
     Args:
         observations: what was measured.
         poses: `[n, 7]` world -> camera, `(qw, qx, qy, qz, tx, ty, tz)`.
-        intrinsics: `[4]` fx, fy, cx, cy in pixels; also the mean of their prior.
+        intrinsics: `[4]` fx, fy, cx, cy in pixels.
+        intrinsics_mean: `[4]`: mean of their prior; None = `intrinsics`.
         inverse_depth: `[D]`, 1/m, positive.
         size: padded shape; None takes the smallest that fits.
         intrinsics_sigma: standard deviation of the intrinsics' prior in pixels; None = no prior.
@@ -113,11 +115,12 @@ def pack(
         dtype: float type of all arrays.
 
     Raises:
-        InputError: an index out of range, a landmark with both points and lines, a non-positive inverse depth, an
+        InputError: an array of a wrong shape, an index out of range, a landmark with both points and lines, a non-positive inverse depth, an
             observation between keyframes that its landmark is not hosted in, or a size that is too small.
 
     """
     count = len(observations.host)
+    _check_shapes(observations, poses, intrinsics)
     _check_indices(observations, len(poses))
     _check_positive("inverse_depth", inverse_depth, count)
     index, needed_points, needed_lines = _assign_slots(observations, len(poses))
@@ -156,7 +159,8 @@ def pack(
         lines=line_observations,
         depth=_depth_prior(observations, per_slot, count, dtype),
         intrinsics_prior=IntrinsicsPrior(
-            jnp.asarray(intrinsics, dtype), jnp.asarray(np.broadcast_to(1 / np.square(sigma), 4), dtype)
+            jnp.asarray(intrinsics if intrinsics_mean is None else intrinsics_mean, dtype),
+            jnp.asarray(np.broadcast_to(1 / np.square(sigma), 4), dtype)
         ),
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
         fixed_intrinsics=jnp.asarray(np.broadcast_to(fixed_intrinsics, 4)),
@@ -274,6 +278,28 @@ def _check_indices(observations: Observations, keyframes: int) -> None:
                 f"`{kind}_edge[{first}]` starts at keyframe {observations.edges[edge[first], 0]}, but its landmark is "
                 f"hosted in keyframe {observations.host[landmark[first]]}: an edge observes landmarks of its own host"
             )
+
+
+def _check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.ndarray) -> None:
+    edges, landmarks = len(observations.edges), len(observations.host)
+    points, lines = len(observations.point_edge), len(observations.line_edge)
+    expected = {
+        "edges": (edges, 2),
+        "pixel": (landmarks, 2),
+        "point_landmark": (points,),
+        "point_target": (points, 2),
+        "point_weight": (points,),
+        "line_landmark": (lines,),
+        "line_coefficients": (lines, 3),
+        "line_weight": (lines,),
+    }
+    optional = ("depth_mean", "depth_sigma", "depth_weight")
+    given = {name: getattr(observations, name) for name in (*expected, *optional)}
+    expected |= {name: (landmarks,) for name in optional if given[name] is not None}
+    given |= {"poses": poses, "intrinsics": intrinsics}
+    for name, shape in {**expected, "poses": (len(poses), 7), "intrinsics": (4,)}.items():
+        if np.shape(given[name]) != shape:
+            raise InputError(f"`{name}` has shape {np.shape(given[name])}; expected {shape}")
 
 
 def _check_positive(name: str, values: np.ndarray, count: int) -> None:

@@ -15,13 +15,18 @@ from vggtgeo.packing import Observations, SlotIndex, pack
 from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.kernels import Huber
 
-REQUIRED = (
-    *("edges", "T_init", "k_init", "k_prior_sigma"),
-    *("var_kf", "var_uv", "d_init", "d_prior", "d_sigma", "d_weight"),
-    *("pt_edge", "pt_var", "pt_target", "pt_weight"),
-    *("ln_edge", "ln_var", "ln_abc", "ln_weight"),
-    *("alpha", "huber"),
-)
+LAYOUT: dict[str, tuple[str | int, ...]] = {
+    "edges": ("E", 2),
+    "T_init": ("N", 7),
+    "k_init": (4,),
+    "k_prior_sigma": (4,),
+    **{"var_kf": ("D",), "var_uv": ("D", 2)},
+    **{"d_init": ("D",), "d_prior": ("D",), "d_sigma": ("D",), "d_weight": ("D",)},
+    **{"pt_edge": ("A",), "pt_var": ("A",), "pt_target": ("A", 2), "pt_weight": ("A",)},
+    **{"ln_edge": ("B",), "ln_var": ("B",), "ln_abc": ("B", 3), "ln_weight": ("B",)},
+    **{"alpha": (), "huber": ()},
+}
+"""Arrays of a problem and their shapes; the first array with a letter decides its size."""
 
 
 def load_problem(path: Path, dtype: DTypeLike = np.float64) -> tuple[Problem, State, SlotIndex]:
@@ -75,11 +80,28 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise InputError(f"`{path}` is no file; give the .npz of a bundle-adjustment problem")
     try:
-        with np.load(path) as file:
+        with open(path, "rb") as handle, np.load(handle) as file:
             arrays = {name: file[name] for name in file.files}
     except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(f"`{path}` cannot be read as .npz: {error}") from error
-    missing = [name for name in REQUIRED if name not in arrays]
+    missing = [name for name in LAYOUT if name not in arrays]
     if missing:
         raise InputError(f"`{path}` lacks the arrays {', '.join(missing)}; the layout is in docs/problem-file.md")
+    _check_shapes(path, arrays)
     return arrays
+
+
+def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    sizes: dict[str | int, int] = {}
+    for name, layout in LAYOUT.items():
+        found = arrays[name]
+        for axis, length in zip(layout, found.shape, strict=False):
+            if isinstance(axis, str):
+                sizes.setdefault(axis, length)
+        expected = tuple(sizes.get(axis, axis) for axis in layout)
+        if found.shape != expected:
+            raise InputError(
+                f"array `{name}` of `{path}` has shape {found.shape}; expected {expected}, see docs/problem-file.md"
+            )
+        if not (np.issubdtype(found.dtype, np.number) or found.dtype == bool):
+            raise InputError(f"array `{name}` of `{path}` holds {found.dtype}; expected numbers")

@@ -52,14 +52,16 @@ def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: 
 
     """
     exact, start, index = load_problem(problem)
+    energy_of = jax.jit(energy)
+    initial = float(energy_of(exact, start))
+    if not np.isfinite(initial):
+        raise InputError(f"the initial energy of `{problem}` is {initial}; look for NaN or infinity in its arrays")
     solution, compile_s, run_s = timed_solve(_cast(exact, dtype), _cast(start, dtype), max_steps, repeat)
-    if solution.result == "nonfinite_input":
-        raise InputError(f"`{problem}`: {solution.message}")
-    state, energy_of, iterations = _widen(solution.state), jax.jit(energy), int(solution.iterations)
+    state, iterations = _widen(solution.state), int(solution.iterations)
     save_solution(output, state, index)
     return Report(
         iterations=iterations,
-        energy_initial=float(energy_of(exact, start)),
+        energy_initial=initial,
         energy_final=float(energy_of(exact, state)),
         compile_s=compile_s,
         ms_per_iteration=1e3 * run_s / iterations if iterations else None,

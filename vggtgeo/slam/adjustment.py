@@ -40,7 +40,8 @@ def build(
     settings: SlamSettings,
     *,
     size: PaddedSize | None,
-    intrinsics_sigma: np.ndarray | None,
+    given_intrinsics: np.ndarray,
+    intrinsics_sigma: np.ndarray,
     fixed_pose: np.ndarray,
     marginal: MarginalPrior | None = None,
 ) -> Adjustment:
@@ -80,9 +81,9 @@ def build(
         intrinsics,
         np.maximum(depths, LEAST_INVERSE_DEPTH),
         size=size,
+        intrinsics_mean=given_intrinsics,
         intrinsics_sigma=intrinsics_sigma,
         fixed_pose=fixed_pose,
-        fixed_intrinsics=intrinsics_sigma is None,
         kernel=settings.kernel,
     )
     problem = replace(problem, marginal=marginal)

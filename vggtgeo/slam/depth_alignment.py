@@ -41,7 +41,7 @@ class Surface:
     @classmethod
     def of(cls, keyframe: Keyframe, intrinsics: np.ndarray) -> Surface:
         """Block medians of the depth, and normals from central differences that do not cross a depth jump."""
-        depth = keyframe.depth.depth
+        depth = keyframe.depth
         height, width = depth.shape[0] // CELL, depth.shape[1] // CELL
         blocks = depth[: height * CELL, : width * CELL].astype(np.float64).reshape(height, CELL, width, CELL)
         ordered = np.sort(blocks.transpose(0, 2, 1, 3).reshape(height, width, -1), axis=2)

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
@@ -49,7 +47,6 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
     solver = SchurLevenbergMarquardt(max_iterations=settings.global_iterations, rtol=1e-5)
-    initial_intrinsics = slam.intrinsics
     for _ in range(settings.global_rounds):
         adjustment = build(
             slam.keyframes,
@@ -57,14 +54,12 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             slam.intrinsics,
             settings,
             size=size,
+            given_intrinsics=slam.given_intrinsics,
             intrinsics_sigma=slam.intrinsics_sigma,
             fixed_pose=fixed,
             marginal=_surface_prior(slam, surfaces, settings),
         )
-        problem = eqx.tree_at(
-            lambda p: p.intrinsics_prior.mean, adjustment.problem, jnp.asarray(initial_intrinsics)
-        )
-        solution = solve_jit(problem, adjustment.initial, solver=solver)
+        solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
         keyframes, intrinsics = write_back(slam.keyframes, adjustment, solution.state)

@@ -33,6 +33,9 @@ class Slots:
 class Keyframe:
     """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; what the
     roles measured; and the slots of its points and line samples (`sample_segment` int [m]: segment of each sample).
+
+    depth: float16 [H, W] metres, NaN = none (its rounding, 0.5 mm at 1 m, is below any sensor's noise);
+    depth_confidence: uint8 [H, W], 255 is 1. A map lives as long as the run, so what it holds is small.
     """
 
     number: int
@@ -43,8 +46,8 @@ class Keyframe:
     features: Features
     lines: LineFeatures
     line_depths: np.ndarray
-    depth: DepthEstimate
-    confidence: np.ndarray
+    depth: np.ndarray
+    depth_confidence: np.ndarray
     points: Slots
     samples: Slots
     sample_segment: np.ndarray
@@ -78,8 +81,8 @@ def make_keyframe(
         features=features,
         lines=lines,
         line_depths=line_depths,
-        depth=depth,
-        confidence=confidence.astype(np.float16),
+        depth=depth.depth.astype(np.float16),
+        depth_confidence=np.rint(255 * depth.confidence).astype(np.uint8),
         points=points,
         samples=_with_line_depth(samples, on_line),
         sample_segment=segment,

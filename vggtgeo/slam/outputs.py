@@ -43,8 +43,7 @@ def write_depth(folder: Path, slam: Slam) -> None:
     for keyframe in slam.keyframes:
         depth = optimised_depth(keyframe)
         counts = np.clip(np.nan_to_num(depth) * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
-        confidence = (255 * keyframe.depth.confidence).round().astype(np.uint8)
-        for name, image in (("depth", counts), ("confidence", confidence)):
+        for name, image in (("depth", counts), ("confidence", keyframe.depth_confidence)):
             with atomic_path(folder / "depth" / f"{keyframe.frame:06d}.{name}.png") as temporary:
                 cv2.imwrite(os.fspath(temporary), image)
 

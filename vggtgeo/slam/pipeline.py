@@ -27,7 +27,7 @@ def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
     intrinsics = np.array(camera.intrinsics, np.float64)
     relative = settings.known_intrinsics_sigma if camera.known else settings.guessed_intrinsics_sigma
     sigma = np.full(4, relative * intrinsics[0])
-    return Slam(intrinsics=intrinsics, intrinsics_sigma=sigma, metric=roles.metric)
+    return Slam(intrinsics, intrinsics, sigma, roles.metric)
 
 
 def step(
@@ -84,7 +84,8 @@ def _follow(
         slam = enter(slam, keyframe, roles, settings)
     with clock.measure("adjust window"):
         slam = adjust(slam, settings)
-    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, found.guess.inlier_count)
+    arrival = (found.keyframe.number, pose @ rigid.invert(found.keyframe.pose))
+    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, found.guess.inlier_count, arrival)
     return replace(slam, frames=(*slam.frames, record))
 
 

@@ -76,6 +76,14 @@ def triangulate(
     return value, information * float(intrinsics[0]) ** 2
 
 
+def fraction(motion: np.ndarray, share: float) -> np.ndarray:
+    """A share in [0, 1] of a small rigid motion: of its rotation vector and of its translation."""
+    part = np.eye(4)
+    part[:3, :3] = Rotation.from_rotvec(share * Rotation.from_matrix(motion[:3, :3]).as_rotvec()).as_matrix()
+    part[:3, 3] = share * motion[:3, 3]
+    return part
+
+
 def adjoint(pose: np.ndarray) -> np.ndarray:
     """`Ad(T)`, float64 [6, 6], tangents translation first."""
     x, y, z = pose[:3, 3]

@@ -64,9 +64,25 @@ def finish(slam: Slam, roles: Roles, settings: SlamSettings, clock: Clock | None
 
 
 def frame_trajectory(slam: Slam) -> Trajectory:
-    """Camera -> world of every frame."""
-    poses = rigid.invert(np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4))
-    return Trajectory(np.array([record.timestamp for record in slam.frames]), poses)
+    """Camera -> world of every frame.
+
+    A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and
+    the next is shared out over the frames in between, in proportion to time, so that the path has no steps.
+    """
+    poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
+    times = np.array([record.timestamp for record in slam.frames])
+    last = 0
+    for row, record in enumerate(slam.frames):
+        if record.arrival is None:
+            continue
+        reference, tracked = record.arrival
+        change = poses[row] @ rigid.invert(tracked @ slam.keyframes[reference].pose)
+        between = [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
+        span = max(times[row] - times[last], 1e-9)
+        for k in between:
+            poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
+        last = row
+    return Trajectory(times, rigid.invert(poses))
 
 
 def keyframe_trajectory(slam: Slam) -> Trajectory:

@@ -68,7 +68,7 @@ class SlamSettings:
     """Weight of a match: `gain * confidence + floor`."""
     depth_weight: float = 2.0
     """The paper's alpha; 0 switches the depth prior off."""
-    known_intrinsics_sigma: float = 0.002
+    known_intrinsics_sigma: float = 0.01
     """Standard deviation of the prior on known intrinsics, relative to the focal length."""
     guessed_intrinsics_sigma: float = 0.3
     """The same for guessed ones."""

@@ -26,6 +26,9 @@ class FramePose:
     relative: np.ndarray
     tracked: bool
     inliers: int
+    arrival: tuple[int, np.ndarray] | None = None
+    """Of a frame that became a keyframe: the earlier keyframe it was tracked against, and its pose relative to that
+    one as tracked, before any adjustment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +45,8 @@ class Waiting:
 class Slam:
     """Everything known after some frames.
 
-    intrinsics: current fx, fy, cx, cy. keyframes: all, by number. pairs: all matches between them. window: numbers of
+    intrinsics: current fx, fy, cx, cy. given_intrinsics, intrinsics_sigma: mean and standard deviation of their prior,
+    pixels. keyframes: all, by number. pairs: all matches between them. window: numbers of
     the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
     solved: the last window problem and its solution. frames: every frame's pose. velocity: last motion from frame to
     frame, camera -> camera. waiting: frames before the start of an RGB sequence. lost: frames since tracking was lost.
@@ -50,6 +54,7 @@ class Slam:
     """
 
     intrinsics: np.ndarray
+    given_intrinsics: np.ndarray
     intrinsics_sigma: np.ndarray
     metric: bool
     keyframes: tuple[Keyframe, ...] = ()

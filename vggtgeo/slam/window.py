@@ -72,14 +72,14 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
 def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> Adjustment:
     """The problem of the current window."""
     fixed = np.isin([keyframe.number for keyframe in members], slam.origins)
-    sigma = None if not np.any(slam.intrinsics_sigma) else slam.intrinsics_sigma
     return build(
         members,
         window_edges(slam),
         slam.intrinsics,
         settings,
         size=window_size(settings),
-        intrinsics_sigma=sigma,
+        given_intrinsics=slam.given_intrinsics,
+        intrinsics_sigma=slam.intrinsics_sigma,
         fixed_pose=fixed,
         marginal=slam.prior if slam.prior is not None else no_prior(settings.window),
     )

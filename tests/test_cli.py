@@ -1,0 +1,196 @@
+"""The program: quick to help, one line for an error, and `solve` from file to file."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from conftest import ROOT
+from test_problem_file import SCENE, arrays_of, write
+from typer.testing import CliRunner
+
+from vggtgeo.cli.jax_flags import cache_folder
+from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command, make_app
+from vggtgeo.energy import energy
+from vggtgeo.errors import InputError
+from vggtgeo.problem_file import load_problem
+
+HEAVY = {"jax", "cv2", "matplotlib", "scipy", "onnxruntime", "rerun", "equinox", "numpy"}
+PROBE = """
+import sys
+sys.argv[1:] = {arguments!r}
+from vggtgeo.cli import main
+try:
+    main()
+finally:
+    print("heavy:", sorted({heavy!r} & set(sys.modules)), file=sys.stderr)
+"""
+
+
+def run_program(*arguments: str, cache: Path) -> subprocess.CompletedProcess[str]:
+    """The program in a process of its own; its last line on stderr names the slow packages it imported."""
+    source = PROBE.format(arguments=list(arguments), heavy=HEAVY)
+    environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
+    command = [sys.executable, "-c", source]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=120, check=False)
+
+
+def invoke(*arguments: str):
+    return CliRunner().invoke(make_app(), list(arguments))
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("solve", "--help"), ()])
+def test_help_imports_nothing_slow(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    # Proves that help is quick: no numerical package is imported for it. Oracle: `sys.modules` of a new process.
+    result = run_program(*arguments, cache=tmp_path)
+    assert result.stderr.splitlines()[-1] == "heavy: []", result.stderr
+    assert "Usage" in result.stdout + result.stderr
+
+
+def test_every_command_is_listed(tmp_path: Path) -> None:
+    # Proves that `--help` names each command of the table.
+    listing = invoke("--help").output
+    assert [entry.name for entry in COMMANDS if entry.name not in listing] == []
+
+
+@pytest.mark.parametrize("entry", COMMANDS, ids=lambda entry: entry.name)
+def test_the_table_of_commands_is_true(entry: CommandEntry) -> None:
+    # Proves that each entry finds its function, that it makes a command, and that help tells what its docstring says.
+    function = getattr(importlib.import_module(entry.module), entry.name)
+    assert function.__doc__.splitlines()[0] == entry.summary
+    assert load_command(entry).name == entry.name
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch):
+    """Puts a command that raises a given exception in the place of `solve`."""
+
+    def install(error: BaseException) -> None:
+        def raising() -> None:
+            raise error
+
+        module = type(sys)("vggtgeo_test_raising")
+        module.__dict__["solve"] = raising
+        monkeypatch.setitem(sys.modules, "vggtgeo_test_raising", module)
+        monkeypatch.setattr(
+            sys.modules["vggtgeo.cli.main"], "COMMANDS", (CommandEntry("solve", "vggtgeo_test_raising", ""),)
+        )
+
+    return install
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (InputError("`x` is 3; it must be 4"), 2, "error: `x` is 3; it must be 4"),
+        (PermissionError(13, "Permission denied", "/root/x"), 2, "error: [Errno 13] Permission denied: '/root/x'"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("by zero"), 1, "internal error: ZeroDivisionError: by zero (where: `vggtgeo --debug ...`)"),
+        (typer.Exit(7), 7, ""),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else None,
+)
+def test_an_error_is_one_line_and_a_code(failing, error: BaseException, code: int, message: str) -> None:
+    # Proves what a user sees of each kind of failure: one line on stderr, and an exit code that scripts can read.
+    failing(error)
+    result = invoke("solve")
+    assert result.exit_code == code
+    assert result.stderr.strip() == message
+    assert result.stdout == ""
+
+
+def test_debug_shows_the_traceback(failing) -> None:
+    # Proves that `--debug` lets the exception through, with its traceback.
+    failing(InputError("wrong"))
+    result = invoke("--debug", "solve")
+    assert isinstance(result.exception, InputError)
+
+
+def test_a_command_that_is_not_there() -> None:
+    # Proves that a typing error is answered with the command that was meant.
+    result = invoke("solv")
+    assert result.exit_code == 2
+    assert "solve" in result.stderr
+
+
+def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
+    # Proves that the program computes in 64 bits and keeps compiled code in the user's cache folder.
+    script = (
+        "from vggtgeo.cli.jax_flags import set_jax_flags; set_jax_flags(); import jax; "
+        "print(jax.numpy.ones(1).dtype, jax.config.jax_compilation_cache_dir, "
+        "jax.config.jax_persistent_cache_min_compile_time_secs)"
+    )
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    for name in ("JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR"):
+        environment.pop(name, None)
+    command = [sys.executable, "-c", script]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
+    assert result.stdout.split() == ["float64", str(tmp_path / "vggtgeo" / "jax"), "0.5"]
+
+
+def test_no_cache_where_none_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a cache folder that cannot be made is done without.
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert cache_folder() is None
+
+
+def test_solve_from_file_to_file(tmp_path: Path) -> None:
+    # Proves the printed object and the written arrays. Oracle: the layout, and the energies' order.
+    problem, solution = write(tmp_path), tmp_path / "out" / "solution.npz"
+    result = invoke("solve", str(problem), "-o", str(solution), "--json", "--repeat", "3", "--max-steps", "3")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert list(report) == [
+        *("iterations", "energy_initial", "energy_final", "compile_s", "ms_per_iteration", "dtype", "result")
+    ]
+    assert (report["iterations"], report["result"], report["dtype"]) == (3, "max_iterations", "float64")
+    assert 0 < report["energy_final"] < report["energy_initial"]
+    assert report["ms_per_iteration"] > 0
+    start = arrays_of_start()
+    with np.load(solution) as arrays:
+        assert {name: arrays[name].shape for name in arrays.files} == {name: start[name].shape for name in start}
+        assert all(arrays[name].dtype == np.float64 for name in arrays.files)
+        assert np.abs(arrays["T"] - start["T"]).max() > 1e-4
+        np.testing.assert_allclose(arrays["T"][0], start["T"][0], atol=1e-15)
+
+
+def test_solve_in_float32(tmp_path: Path) -> None:
+    # Proves that `--dtype` takes effect, and that its energies are those of the float64 problem all the same.
+    # Oracle: the readable energy of the file, in float64.
+    problem, solution = write(tmp_path), tmp_path / "solution.npz"
+    result = invoke("solve", str(problem), "-o", str(solution), "--dtype", "float32", "--max-steps", "30")
+    expected = float(energy(*load_problem(problem)[:2]))
+    assert result.exit_code == 0, result.output
+    assert f"converged: energy {expected:.6e} -> " in result.stdout
+    assert "float32" in result.stdout
+
+
+def test_solve_says_what_is_wrong(tmp_path: Path) -> None:
+    # Proves that a bad file or option ends with a message that names it, and writes nothing.
+    solution = tmp_path / "solution.npz"
+    spoilt = arrays_of_start()["T"]
+    spoilt[1, 4] = np.nan
+    problem = write(tmp_path, T_init=spoilt)
+    cases = [
+        ((str(tmp_path / "no.npz"),), "no.npz` is no file"),
+        ((str(problem), "--max-steps", "0"), "--max-steps"),
+        ((str(problem), "--dtype", "float16"), "--dtype"),
+        ((str(problem), "--max-steps", "3"), "is nan; look for NaN"),
+    ]
+    for arguments, message in cases:
+        result = invoke("solve", *arguments, "-o", str(solution))
+        assert result.exit_code == 2, result.output
+        assert message in result.stderr
+    assert not solution.exists()
+
+
+def arrays_of_start() -> dict[str, np.ndarray]:
+    """The start of the problem that `write` writes, as a solution's arrays."""
+    arrays = arrays_of(SCENE)
+    return {"T": arrays["T_init"].copy(), "k": arrays["k_init"], "d": arrays["d_init"]}

@@ -1,0 +1,131 @@
+"""Packing flat lists into padded arrays: nothing is lost, nothing is invented, wrong lists are refused."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import Scene, make_scene
+
+from vggtgeo.errors import InputError
+from vggtgeo.packing import Observations, PaddedSize
+from vggtgeo.problem import Problem
+
+SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)
+
+
+def shuffled(scene: Scene) -> tuple[Observations, np.ndarray]:
+    """The same observations with edges and landmarks in another order, and the landmarks' new order."""
+    seen, rng = scene.observations, np.random.default_rng(0)
+    edges, landmarks = rng.permutation(len(seen.edges)), rng.permutation(len(seen.host))
+    edge_at, landmark_at = np.argsort(edges), np.argsort(landmarks)
+    changes = {
+        name: getattr(seen, name)[landmarks] for name in ("host", "pixel", "depth_mean", "depth_sigma", "depth_weight")
+    }
+    for kind in ("point", "line"):
+        changes[f"{kind}_edge"] = edge_at[getattr(seen, f"{kind}_edge")]
+        changes[f"{kind}_landmark"] = landmark_at[getattr(seen, f"{kind}_landmark")]
+    return replace(seen, edges=seen.edges[edges], **changes), landmarks
+
+
+def observed(problem: Problem) -> set[tuple[float, ...]]:
+    """Every point observation as (host pixel, match, weight, host, target): what there is, whatever its place."""
+    edge, slot = np.nonzero(problem.points.weight > 0)
+    source, target = np.asarray(problem.edges.source)[edge], np.asarray(problem.edges.target)[edge]
+    rows = [problem.pixels[source, slot], problem.points.target[edge, slot], problem.points.weight[edge, slot][:, None]]
+    return {
+        (*map(float, row), int(i), int(j)) for row, i, j in zip(np.concatenate(rows, 1), source, target, strict=True)
+    }
+
+
+@pytest.mark.parametrize("size", [None, PaddedSize(4, 8, 6, 3), PaddedSize(3, 6, 3, 2)])
+def test_every_observation_is_packed_once(size: PaddedSize | None) -> None:
+    # Proves that packing keeps each match with its pixel, edge and weight. Oracle: the flat lists.
+    seen = SCENE.observations
+    problem, _, _ = SCENE.pack(size=size)
+    edges = seen.edges[seen.point_edge]
+    rows = [seen.pixel[seen.point_landmark], seen.point_target, seen.point_weight[:, None]]
+    expected = {(*map(float, row), int(i), int(j)) for row, (i, j) in zip(np.concatenate(rows, 1), edges, strict=True)}
+    assert observed(problem) == expected
+    assert int(jnp.sum(problem.lines.weight > 0)) == len(seen.line_edge)
+    assert float(jnp.sum(problem.depth.weight)) == pytest.approx(seen.depth_weight.sum())
+
+
+def test_the_order_of_the_lists_does_not_matter() -> None:
+    # Proves that edges need not be sorted nor landmarks grouped. Oracle: the packing of the sorted lists.
+    mixed, landmarks = shuffled(SCENE)
+    problem, _, _ = SCENE.pack()
+    scene = replace(SCENE, observations=mixed, start_inverse_depth=SCENE.start_inverse_depth[landmarks])
+    other, state, index = scene.pack()
+    assert observed(other) == observed(problem)
+    np.testing.assert_array_equal(index.gather(state.inverse_depth), scene.start_inverse_depth)
+    np.testing.assert_array_equal(index.gather(other.pixels), mixed.pixel)
+    assert np.all(np.diff(other.edges.source) >= 0)
+
+
+@pytest.mark.parametrize("size", [None, PaddedSize(5, 7, 4, 4)])
+def test_ranks_invert_the_graph(size: PaddedSize | None) -> None:
+    # Proves that `of_host` finds each edge by host and rank. Oracle: the definition of both.
+    edges = SCENE.pack(size=size)[0].edges
+    for edge, (host, rank) in enumerate(zip(edges.source, edges.rank, strict=True)):
+        assert int(edges.of_host[host, rank]) == edge
+    assert int(jnp.sum(edges.of_host < len(edges.source))) == len(edges.source)
+
+
+def test_padding_is_harmless_and_held() -> None:
+    # Proves what fills the empty places: weight 0, finite values, positive depths, poses that are held.
+    problem, state, _ = SCENE.pack(size=PaddedSize(5, 8, 6, 4))
+    assert bool(jnp.all(problem.fixed_pose[3:]))
+    assert list(problem.fixed_pose[:3]) == [True, False, False]
+    assert bool(jnp.all(state.inverse_depth > 0))
+    assert bool(jnp.all(problem.depth.sigma > 0))
+    np.testing.assert_array_equal(jnp.linalg.norm(state.poses.wxyz_xyz[:, :4], axis=1).round(12), 1.0)
+
+
+def test_dtype_goes_through_everything() -> None:
+    # Proves that one argument decides the precision of the whole problem.
+    problem, state, _ = SCENE.pack(dtype=np.float32)
+    arrays = [*vars(problem.points).values(), *vars(problem.lines).values(), *vars(problem.depth).values()]
+    arrays += [problem.pixels, problem.intrinsics_prior.information, state.intrinsics, state.inverse_depth]
+    assert {array.dtype for array in [*arrays, state.poses.wxyz_xyz]} == {np.dtype(np.float32)}
+
+
+def bad(**changes: object) -> Scene:
+    return SCENE.with_observations(**changes)
+
+
+def test_wrong_lists_are_refused_by_name() -> None:
+    # Proves that each mistake is named with the argument, what was found, and what is right.
+    seen = SCENE.observations
+    both_kinds, its_edge = seen.line_landmark.copy(), seen.line_edge.copy()
+    both_kinds[0], its_edge[0] = seen.point_landmark[0], seen.point_edge[0]
+    wrong_host = seen.point_edge.copy()
+    wrong_host[0] = len(seen.edges) - 1
+    cases = [
+        (bad(edges=seen.edges + 1), "`edges` goes from 1 to 3"),
+        (bad(host=seen.host - 1), "`host` goes from -1"),
+        (bad(point_edge=seen.point_edge + 9), "`point_edge` goes from 9"),
+        (bad(line_landmark=seen.line_landmark + 1000), "`line_landmark`"),
+        (
+            bad(point_edge=wrong_host),
+            r"`point_edge\[0\]` starts at keyframe 2, but its landmark is hosted in keyframe 0",
+        ),
+        (bad(line_landmark=both_kinds, line_edge=its_edge), "both name landmark"),
+        (bad(point_weight=seen.point_weight[1:]), "`point_weight` has shape"),
+        (replace(SCENE, start_poses=SCENE.start_poses[:, :4]), r"`poses` has shape \(3, 4\); expected \(3, 7\)"),
+        (bad(depth_sigma=0 * seen.depth_sigma), r"`depth_sigma\[0\]` is 0"),
+        (replace(SCENE, start_inverse_depth=-SCENE.start_inverse_depth), r"`inverse_depth\[0\]` is -"),
+        (replace(SCENE, start_inverse_depth=SCENE.start_inverse_depth[1:]), "`inverse_depth` has shape"),
+    ]
+    for scene, message in cases:
+        with pytest.raises(InputError, match=message):
+            scene.pack()
+
+
+@pytest.mark.parametrize("name", ["keyframes", "points", "lines", "ranks", "edges"])
+def test_a_size_that_is_too_small_is_refused(name: str) -> None:
+    # Proves that nothing is cut off silently: the error names the size and what is needed.
+    fits = PaddedSize(3, 6, 3, 2, 6)
+    SCENE.pack(size=fits)
+    with pytest.raises(InputError, match=rf"`size.{name}` is {getattr(fits, name) - 1}; this problem needs"):
+        SCENE.pack(size=replace(fits, **{name: getattr(fits, name) - 1}))

@@ -1,0 +1,125 @@
+"""Problem and solution files: what is written is what is read, and the energy is the one the layout defines."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import jax
+import numpy as np
+import pytest
+from scenes import INTRINSICS, Scene, make_scene
+
+from vggtgeo.bundle_adjustment import BundleAdjustment
+from vggtgeo.energy import energy
+from vggtgeo.errors import InputError
+from vggtgeo.problem_file import LAYOUT, load_problem, save_solution
+
+SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05, seed=7)
+
+
+def arrays_of(scene: Scene) -> dict[str, np.ndarray]:
+    """A scene in the layout of docs/problem-file.md."""
+    seen = scene.observations
+    return {
+        "edges": seen.edges.astype(np.int32),
+        "T_init": scene.start_poses,
+        "k_init": scene.start_intrinsics,
+        "k_prior_sigma": np.full(4, 5.0),
+        "var_kf": seen.host,
+        "var_uv": seen.pixel,
+        "d_init": scene.start_inverse_depth,
+        "d_prior": seen.depth_mean,
+        "d_sigma": seen.depth_sigma,
+        "d_weight": seen.depth_weight,
+        "pt_edge": seen.point_edge,
+        "pt_var": seen.point_landmark,
+        "pt_target": seen.point_target,
+        "pt_weight": seen.point_weight,
+        "ln_edge": seen.line_edge,
+        "ln_var": seen.line_landmark,
+        "ln_abc": seen.line_coefficients,
+        "ln_weight": seen.line_weight,
+        "alpha": np.float64(seen.alpha),
+        "huber": np.float64(1.5),
+    }
+
+
+def write(folder: Path, **changes: np.ndarray | None) -> Path:
+    arrays = {**arrays_of(SCENE), **changes}
+    np.savez(folder / "problem.npz", **{name: array for name, array in arrays.items() if array is not None})
+    return folder / "problem.npz"
+
+
+def test_a_file_is_the_problem(tmp_path: Path) -> None:
+    # Proves that reading loses nothing. Oracle: the same scene packed directly, leaf by leaf.
+    loaded, packed = load_problem(write(tmp_path)), SCENE.pack()
+    for found, expected in zip(jax.tree.leaves(loaded[:2]), jax.tree.leaves(packed[:2]), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("missing", LAYOUT)
+def test_a_missing_array_is_named(tmp_path: Path, missing: str) -> None:
+    # Proves that each required array is asked for by name, with where the layout is written.
+    with pytest.raises(InputError, match=rf"lacks the arrays {missing}; .*docs/problem-file.md"):
+        load_problem(write(tmp_path, **{missing: None}))
+
+
+def test_the_layout_is_documented() -> None:
+    # Proves that the page named in the error describes every array that is asked for.
+    page = (Path(__file__).parent.parent / "docs" / "problem-file.md").read_text()
+    assert [name for name in LAYOUT if f"`{name}`" not in page] == []
+
+
+def test_what_is_no_problem_file(tmp_path: Path) -> None:
+    # Proves that a missing, empty, cut-off or foreign file, and arrays that do not fit, are errors that name it.
+    good = write(tmp_path).read_bytes()
+    for name, content in {"empty.npz": b"", "cut.npz": good[:200], "text.npz": b"a picture of a cat"}.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name):
+            load_problem(tmp_path / name)
+    with pytest.raises(InputError, match="is no file"):
+        load_problem(tmp_path / "absent.npz")
+    for name, value in {
+        "T_init": np.zeros((3, 4)),
+        "pt_target": np.zeros((5, 2)),
+        "k_init": np.ones(3),
+        "d_prior": np.full(27, "far"),
+    }.items():
+        with pytest.raises(InputError, match=name):
+            load_problem(write(tmp_path, **{name: value}))
+
+
+def test_a_solution_is_written_in_the_file_s_order(tmp_path: Path) -> None:
+    # Proves the arrays of a solution: poses, intrinsics, and inverse depths by landmark. Oracle: the start itself.
+    _, state, index = load_problem(write(tmp_path))
+    save_solution(tmp_path / "deep" / "solution.npz", state, index)
+    with np.load(tmp_path / "deep" / "solution.npz") as solution:
+        np.testing.assert_allclose(solution["T"], SCENE.start_poses, atol=1e-15)
+        np.testing.assert_array_equal(solution["k"], SCENE.start_intrinsics)
+        np.testing.assert_array_equal(solution["d"], SCENE.start_inverse_depth)
+
+
+@pytest.fixture(scope="module")
+def oracle(shared_bench: Path) -> ModuleType:
+    """The numpy definition of problems and their energy, written by others."""
+    spec = importlib.util.spec_from_file_location("bench_problems", shared_bench / "problems.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("outliers", ["offset", "uniform"])
+def test_energy_is_that_of_the_shared_definition(tmp_path: Path, oracle: ModuleType, outliers: str) -> None:
+    # Proves that a file means to us what it means to its authors. Oracle: their numpy energy of the start.
+    oracle.SIZES["tiny"] = {"N": 4, "P": 12, "L": 3, "S": 4}
+    arrays = oracle.generate("tiny", seed=3, outliers=outliers)
+    np.savez(tmp_path / "tiny.npz", **arrays)
+    problem, state, index = load_problem(tmp_path / "tiny.npz")
+    expected = oracle.energy(arrays, arrays["T_init"], arrays["k_init"], arrays["d_init"]).sum()
+    fast = lambda problem, state: BundleAdjustment(problem).energy(state)
+    for found in (jax.jit(energy)(problem, state), jax.jit(fast)(problem, state)):
+        assert float(found) == pytest.approx(expected, rel=1e-10)
+    np.testing.assert_array_equal(index.gather(state.inverse_depth), arrays["d_init"])
+    assert INTRINSICS.shape == arrays["k_gt"].shape

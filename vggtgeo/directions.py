@@ -1,0 +1,61 @@
+"""Motions of poses and intrinsics that have a name, to say in words what a problem leaves open.
+
+Frames: common motions of all free keyframes are given in the axes of the anchor, the first held camera (camera 0
+without one), and rotations turn about its centre; motions of one keyframe are in its own camera axes (x right, y down,
+z forward), rotations about its own centre. Pitch turns about x, yaw about y, roll about z.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from vggtgeo import lie
+from vggtgeo.linearise import SHARED
+from vggtgeo.problem import Problem, State
+
+MOTIONS = ("translation along x", "translation along y", "translation along z", "pitch", "yaw", "roll")
+"""The names of a tangent's coordinates."""
+INTRINSICS = ("focal length", "aspect ratio", "principal point u", "principal point v")
+
+
+def direction_names(keyframes: int) -> tuple[str, ...]:
+    """Names of the rows of `named_directions`: the global ones first."""
+    each = tuple(f"keyframe {i}: {motion}" for i in range(keyframes) for motion in MOTIONS)
+    return ("scale", *MOTIONS, *INTRINSICS, *each)
+
+
+def named_directions(problem: Problem, state: State) -> Float[Array, "m c"]:
+    """One row a name, in the coordinates of the dense state: 1 m, 1 rad, 1 pixel, or 100 % of scale or focal length.
+
+    Held coordinates are not masked. The aspect ratio changes `fx` by 100 % and `fy` by -100 %.
+    """
+    keyframes = problem.num_keyframes
+    common = jnp.concatenate([_scale(problem, state)[None], _common(problem, state)])
+    common = jnp.concatenate([common, jnp.zeros((7, SHARED), common.dtype)], 1)
+    fx, fy = state.intrinsics[0], state.intrinsics[1]
+    shared = jnp.eye(SHARED, dtype=common.dtype).at[0, :2].set(jnp.stack([fx, fy]))
+    shared = shared.at[1, :2].set(jnp.stack([fx, -fy]))
+    shared = jnp.concatenate([jnp.zeros((SHARED, 6 * keyframes), common.dtype), shared], 1)
+    single = jnp.eye(6 * keyframes, problem.num_camera, dtype=common.dtype)
+    return jnp.concatenate([common, shared, single])
+
+
+def _anchor(problem: Problem, state: State) -> jaxlie.SE3:
+    return jaxlie.SE3(state.poses.wxyz_xyz[jnp.argmax(problem.fixed_pose)])
+
+
+def _scale(problem: Problem, state: State) -> Float[Array, " camera"]:
+    """All camera centres move away from the anchor's centre, by 100 %."""
+    anchor = _anchor(problem, state).inverse().translation().astype(state.inverse_depth.dtype)
+    outward = state.poses.translation() + state.poses.rotation().as_matrix() @ anchor
+    return jnp.concatenate([outward, jnp.zeros_like(outward)], 1).reshape(-1)
+
+
+def _common(problem: Problem, state: State) -> Float[Array, "6 camera"]:
+    """All cameras move as one rigid body by a unit twist in the anchor's frame: `xi_i = Ad(T_i T_anchor^-1) e_a`."""
+    anchor = _anchor(problem, state).wxyz_xyz
+    transport = lambda pose: lie.adjoint(lie.relative(jaxlie.SE3(anchor), jaxlie.SE3(pose)))
+    return jax.vmap(transport)(state.poses.wxyz_xyz).transpose(2, 0, 1).reshape(6, -1)

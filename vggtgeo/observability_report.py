@@ -1,0 +1,121 @@
+"""The words of `Observability`: weak directions by name, a table by factor kind. Plain numpy, outside `jit`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vggtgeo.directions import direction_names
+from vggtgeo.observability import KINDS, WEAK, Observability, undetermined_below
+
+ALIGNED = 0.9
+"""Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""
+NEW = 0.1
+"""Squared part of a named direction that must lie outside what was named before it."""
+WEAK_LANDMARK = 1.0
+"""`V d^2` below which a landmark counts as undetermined: known to no better than 100 % of its inverse depth."""
+SHOWN = 12
+"""Weak directions spelled out in a report; the rest are counted."""
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A direction that a set of factors leaves open."""
+
+    name: str
+    eigenvalue: float
+    """Of the balanced information matrix along it; see `observability.WEAK`."""
+    alignment: float
+    """Squared cosine between the direction and the weak subspace, 0 to 1."""
+    determined: bool
+    """False where the eigenvalue is no more than rounding error."""
+
+    def __str__(self) -> str:
+        how = f"eigenvalue {self.eigenvalue:.1e}" if self.determined else "undetermined"
+        return f"{self.name} ({how})" if self.alignment >= ALIGNED else f"a mixture, mostly {self.name} ({how})"
+
+
+def weak_directions(found: Observability, without: str | None = None) -> list[WeakDirection]:
+    """Directions weaker than `WEAK` by all factors, or by all but one kind (a name of `KINDS`), the best named first.
+
+    A weak subspace has no eigenvectors of its own, so it is taken apart by names: the first name of
+    `direction_names` (the global motions come first) that lies in it is taken out of it, then the next that also lies
+    in it and says something new, and so on; what is left in the end goes by the nearest name.
+    """
+    spectra, row = (found.whole, 0) if without is None else (found.without, _index_of(without))
+    values, vectors = np.asarray(spectra.values[row], float), np.asarray(spectra.vectors[row], float)
+    floor = undetermined_below(len(values), spectra.values.dtype)
+    weak = values < max(WEAK, floor)
+    names, named = direction_names(len(values) // 6), np.asarray(found.named, float)
+    basis, sizes = vectors[:, weak], np.maximum(values[weak], 0.0)
+    within, rest = np.sum((named @ basis) ** 2, 1), np.eye(basis.shape[1])
+    result = []
+    for _ in range(basis.shape[1]):
+        new = np.sum((named @ basis @ rest) ** 2, 1)
+        aligned = np.nonzero((within >= ALIGNED) & (new >= NEW))[0]
+        best = int(aligned[0]) if len(aligned) else int(np.argmax(new))
+        part = rest @ rest.T @ basis.T @ named[best]
+        part /= np.linalg.norm(part)
+        value = float(part**2 @ sizes)
+        result.append(WeakDirection(names[best], value, float(within[best]), value >= floor))
+        rest = rest @ _complement(rest.T @ part)
+    return result
+
+
+def undetermined_landmarks(found: Observability) -> tuple[int, int]:
+    """`(undetermined, used)`: landmarks known to no better than 100 % even if all else were, and landmarks in use."""
+    used = np.asarray(found.landmark_used)
+    return int(np.sum(used & (np.asarray(found.landmark_information) < WEAK_LANDMARK))), int(used.sum())
+
+
+def report(found: Observability) -> str:
+    """All findings as text."""
+    free, size = int(np.sum(found.free)), len(found.free)
+    values = np.asarray(found.whole.values[0])[:free]
+    lost, used = undetermined_landmarks(found)
+    lines = [
+        f"Observability of {size // 6} keyframes: {free} coordinates free, {size - free} held",
+        f"weakest eigenvalues: {'  '.join(f'{max(value, 0):.1e}' for value in values[:6])}",
+        f"weak directions: {_spell(weak_directions(found), free)}",
+        f"inverse depths in use: {used}, undetermined even with all else known: {lost}",
+    ]
+    for kind in KINDS:
+        weak = weak_directions(found, kind)
+        more = len(weak) > len(weak_directions(found))
+        lines.append(f"weak without {kind}: {_spell(weak, free) if more else 'no more than with all'}")
+    return "\n".join([*lines, "", *_table(found)])
+
+
+def _table(found: Observability) -> list[str]:
+    """Information along each free named direction, and the share of it that would be lost without each kind."""
+    names = direction_names(len(found.free) // 6)
+    along, without = np.asarray(found.whole.along[0], float), np.asarray(found.without.along, float)
+    shares = 1 - without / np.where(along > 0, along, 1.0)
+    shares = np.where(along > 0, np.clip(shares, 0.0, 1.0), 0.0)
+    present = np.any(np.asarray(found.named) != 0, 1)
+    width = max(len(name) for name in names)
+    lines = [f"{'information along':{width}}  {'all':>9}   lost without {'  '.join(f'{kind:>7}' for kind in KINDS)}"]
+    for i in np.nonzero(present)[0]:
+        lines.append(f"{names[i]:{width}}  {along[i]:9.2e}   {'':12} {'  '.join(f'{s:7.0%}' for s in shares[:, i])}")
+    return lines
+
+
+def _spell(weak: list[WeakDirection], free: int) -> str:
+    if not weak:
+        return "none"
+    if len(weak) == free and not any(direction.determined for direction in weak):
+        return f"everything ({free} directions undetermined)"
+    more = [f"and {len(weak) - SHOWN} more"] if len(weak) > SHOWN else []
+    return "; ".join([*(str(direction) for direction in weak[:SHOWN]), *more])
+
+
+def _complement(vector: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span what is orthogonal to a unit vector."""
+    return np.linalg.svd(vector[None])[2][1:].T
+
+
+def _index_of(kind: str) -> int:
+    if kind not in KINDS:
+        raise ValueError(f"`without` is {kind!r}; expected one of {', '.join(KINDS)}, or None")
+    return KINDS.index(kind)
