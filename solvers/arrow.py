@@ -20,6 +20,7 @@ from __future__ import annotations
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
@@ -114,8 +115,9 @@ def reduce(system: ArrowSystem) -> Reduced:
 
 def host_products(system: ArrowSystem) -> Float[Array, "n t t"]:
     """`C V^-1 C'` of each host in relative coordinates; `t = b k + q + 1`, the gradient comes last."""
-    scaled = system.cross * inverse_landmark_hessian(system)[:, None, :]
-    return jnp.einsum("nrs,nts->nrt", scaled, system.cross)[:, :-1, :-1]
+    # A loop over hosts: twice as fast on a CPU as one batched product (the scaled rows stay in the cache).
+    product = lambda host: (host[0] * host[1]) @ host[0].T
+    return jax.lax.map(product, (system.cross, inverse_landmark_hessian(system)))[:, :-1, :-1]
 
 
 def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "n relative"]:
@@ -179,7 +181,7 @@ def from_relative(system: ArrowSystem, relative: Float[Array, "n relative"]) -> 
     block = system.transport.shape[-1]
     eta = relative[:, : ranks * block].reshape(hosts, ranks, block)
     eta = jnp.where(system.graph.of_host[..., None] < len(system.graph.source), eta, 0.0)
-    to_host = -jnp.einsum("nkab,nka->nb", _transports(system), eta)
+    to_host = -jnp.einsum("nkab,nka->nb", padded_transports(system), eta)
     nodes = jnp.zeros((hosts + 1, block), eta.dtype).at[system.graph.neighbours()].add(eta)[:-1]
     return jnp.concatenate([(nodes + to_host).reshape(-1), relative[:, ranks * block :].sum(0)])
 
@@ -244,7 +246,7 @@ class Blocks(eqx.Module):
     corner: Float[Array, "o o"]
 
 
-def _transports(system: ArrowSystem) -> Float[Array, "n k b b"]:
+def padded_transports(system: ArrowSystem) -> Float[Array, "n k b b"]:
     """`A` of each rank of each host, zero where there is no edge."""
     padded = jnp.concatenate([system.transport, jnp.zeros_like(system.transport[:1])])
     return padded[system.graph.of_host]
@@ -255,7 +257,7 @@ def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout:
     hosts, ranks = system.graph.of_host.shape
     block = system.transport.shape[-1]
     wide = ranks * block
-    transports = _transports(system).reshape(hosts, wide, block)
+    transports = padded_transports(system).reshape(hosts, wide, block)
     own = -jnp.einsum("nrw,nwb->nrb", products[:, :, :wide], transports)
     corner = -jnp.einsum("nwa,nwb->nab", transports, own[:, :wide])
     # Local order: neighbours (k blocks), the host itself, then shared coordinates and the gradient.
@@ -288,6 +290,19 @@ def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     borders = jnp.zeros((hosts, block, border.shape[-1]), eta.dtype).at[target].add(border)
     borders = borders.at[source].add(-jnp.einsum("eba,ebc->eac", system.transport, border))
     return Blocks(blocks, borders, system.gram[:, block:, block:].sum(0))
+
+
+def add_prior_blocks(blocks: Blocks, system: ArrowSystem, layout: AbstractLayout) -> Blocks:
+    """The prior on the shared coordinates; of one that couples all nodes, the blocks of the nodes as well."""
+    hosts, block = blocks.border.shape[:2]
+    shared, prior = blocks.corner.shape[0] - 1, system.prior_hessian
+    corner = blocks.corner.at[:shared, :shared].add(prior[-shared:, -shared:])
+    nodes = blocks.nodes
+    if len(prior) > shared:
+        square = prior[: hosts * block, : hosts * block].reshape(hosts, block, hosts, block)
+        every = jnp.arange(hosts)
+        nodes = layout.add(nodes, every, every, square[every, :, every])
+    return Blocks(nodes, blocks.border, corner)
 
 
 def _dense(blocks: Blocks) -> Assembled:

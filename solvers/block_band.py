@@ -21,8 +21,16 @@ import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int
-from vggtgeo.solvers.arrow import AbstractLayout, ArrowSystem, Blocks, assemble_edges, assemble_hosts, host_products
+from jaxtyping import Array, Bool, Float, Int, Shaped
+from vggtgeo.solvers.arrow import (
+    AbstractLayout,
+    ArrowSystem,
+    Blocks,
+    add_prior_blocks,
+    assemble_edges,
+    assemble_hosts,
+    host_products,
+)
 
 
 class BandLayout(AbstractLayout):
@@ -60,8 +68,8 @@ class BandMatrix(eqx.Module):
 class BandVector(eqx.Module):
     """Columns over nodes and shared coordinates."""
 
-    nodes: Float[Array, "k w o"]
-    shared: Float[Array, "q o"]
+    nodes: Shaped[Array, "k w o"]
+    shared: Shaped[Array, "q o"]
 
 
 class BandFactor(eqx.Module):
@@ -92,12 +100,21 @@ def assemble_bands(system: ArrowSystem, reach: int) -> tuple[BandMatrix, BandMat
     block = system.transport.shape[-1]
     border = jnp.where(near[:, None, None], system.gram[:, :block, block:], 0.0)
     near_system = eqx.tree_at(lambda s: s.gram, system, system.gram.at[:, :block, block:].set(border))
-    hessian = _band(assemble_edges(near_system, layout), len(system.prior_hessian), system)
+    hessian = add_prior_blocks(assemble_edges(near_system, layout), system, layout)
     products = jnp.where(_kept(system, near), host_products(system), 0.0)
-    return hessian, _band(assemble_hosts(system, products, layout), 0, system)
+    return _band(hessian), _band(assemble_hosts(system, products, layout))
 
 
-def to_band(matrix: BandMatrix, columns: Float[Array, "c o"]) -> BandVector:
+def add_to_diagonal(matrix: BandMatrix, diagonal: Float[Array, " c"]) -> BandMatrix:
+    """`M + diag(diagonal)`."""
+    added = to_band(matrix, diagonal[:, None])
+    eye = jnp.eye(matrix.groups.shape[-1], dtype=matrix.groups.dtype)
+    return BandMatrix(
+        matrix.groups.at[:, 0].add(added.nodes * eye), matrix.border, matrix.corner + jnp.diag(added.shared[:, 0])
+    )
+
+
+def to_band(matrix: BandMatrix, columns: Shaped[Array, "c o"]) -> BandVector:
     """Columns over the dense coordinates in the layout of `matrix`."""
     groups, width, shared = matrix.border.shape
     nodes = columns[:-shared]
@@ -117,7 +134,6 @@ def factorise(matrix: BandMatrix, free: Bool[Array, " c"]) -> BandFactor:
     matrix = _hold(matrix, moves)
     nodes, shared = matrix.diagonal()
     scale = BandVector(_positive_root(nodes)[..., None], _positive_root(shared)[..., None])
-    groups = matrix.groups / scale.nodes[:, None]
     after = jnp.concatenate([scale.nodes[1:], jnp.ones_like(scale.nodes[:1])])
     groups = matrix.groups / jnp.stack([scale.nodes, after], 1) / scale.nodes[:, None, None, :, 0]
     border = matrix.border / scale.nodes / scale.shared[:, 0]
@@ -162,23 +178,41 @@ def solve_band(factor: BandFactor, columns: BandVector) -> BandVector:
     return BandVector(nodes / factor.scale.nodes, shared / factor.scale.shared)
 
 
-def _band(blocks: Blocks, prior: int, system: ArrowSystem) -> BandMatrix:
-    """Blocks as groups, without the gradient; with the priors' own blocks where `prior` is their size."""
+def _band(blocks: Blocks) -> BandMatrix:
+    """Blocks as groups, without the gradient."""
     groups, _, size, block, _, _ = blocks.nodes.shape
     shared = blocks.corner.shape[0] - 1
     border = blocks.border[:, :, :-1].reshape(-1, shared)
     border = jnp.pad(border, ((0, groups * size * block - len(border)), (0, 0)))
-    matrix = BandMatrix(
+    return BandMatrix(
         blocks.nodes.reshape(groups, 2, size * block, size * block),
         border.reshape(groups, size * block, shared),
         blocks.corner[:-1, :-1],
     )
-    if prior == 0:
-        return matrix
-    own = system.prior_hessian[-shared:, -shared:]
-    matrix = eqx.tree_at(lambda m: m.corner, matrix, matrix.corner + own)
-    if prior == shared:
-        return matrix
-    # Of a prior that couples all nodes the block of each node is kept.
-    nodes = system.prior_hessian[:-shared, :-shared].reshape(-1, block, prior // block * block)
-    raise NotImplementedError(nodes.shape)
+
+
+def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "n t t"]:
+    """Which entries of the hosts' products couple no far edge with anything else."""
+    block, tail = system.transport.shape[-1], system.gram.shape[-1] - system.transport.shape[-1]
+    hosts, ranks = system.graph.of_host.shape
+    far = jnp.append(~near, False)[system.graph.of_host]
+    # A far edge is a class of its own (1 + its rank); near edges, shared coordinates and the gradient are class 0.
+    classes = jnp.repeat(jnp.where(far, 1 + jnp.arange(ranks), 0), block, axis=1)
+    classes = jnp.concatenate([classes, jnp.zeros((hosts, tail), classes.dtype)], 1)
+    return classes[:, :, None] == classes[:, None, :]
+
+
+def _hold(matrix: BandMatrix, moves: BandVector) -> BandMatrix:
+    """Unit rows and columns for coordinates that do not move."""
+    nodes, shared = moves.nodes[..., 0], moves.shared[..., 0]
+    after = jnp.concatenate([nodes[1:], jnp.zeros_like(nodes[:1])])
+    rows = jnp.stack([nodes, after], 1)
+    groups = jnp.where(rows[..., None] & nodes[:, None, None, :], matrix.groups, 0.0)
+    unit = jnp.where(nodes, 0.0, 1.0).astype(groups.dtype)[..., None] * jnp.eye(groups.shape[-1], dtype=groups.dtype)
+    border = jnp.where(nodes[..., None] & shared, matrix.border, 0.0)
+    corner = jnp.where(shared[:, None] & shared, matrix.corner, jnp.eye(len(shared), dtype=border.dtype))
+    return BandMatrix(groups.at[:, 0].add(unit), border, corner)
+
+
+def _positive_root(diagonal: Array) -> Array:
+    return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))

@@ -35,6 +35,10 @@ class Termination(eqx.Enumeration):
         "Failed: the energy of the initial state is not finite. Look for NaN or infinite poses, intrinsics, inverse "
         "depths, targets or weights; the initial state was returned."
     )
+    nonfinite_step = (
+        "Failed: the normal equations have no finite solution. Look for weights or standard deviations that are far too "
+        "large or too small; the last state that was accepted was returned."
+    )
 
 
 CONVERGED = (Termination.energy_converged, Termination.gradient_converged, Termination.step_converged)
@@ -77,6 +81,8 @@ class _Try(eqx.Module):
     history: Float[Array, " h"]
     accepted: Bool[Array, ""]
     stuck: Bool[Array, ""]
+    finite: Bool[Array, ""]
+    """Whether the step was."""
 
 
 class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -127,7 +133,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             step, predicted = self.reduced_solver.step(system, prepared, trial.damping)
             return self._judge(args, y, state.energy, trial, step, predicted)
 
-        first = _Try(y, state.energy, state.damping, state.growth, state.iterations, state.history, *_both_false())
+        first = _Try(y, state.energy, state.damping, state.growth, state.iterations, state.history, *_nothing_tried())
         last = self._loop(attempt, first)
         gradient_norm = _gradient_norm(system)
         new = LevenbergMarquardtState(
@@ -189,6 +195,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             history=trial.history.at[iterations].set(kept),
             accepted=accepted,
             stuck=~accepted & (_negligible(predicted, energy) | (damping > self.max_damping)),
+            finite=jnp.isfinite(predicted),
         )
 
     def _terminate(self, energy: Float[Array, ""], last: _Try, gradient_norm: Float[Array, ""]) -> Termination:
@@ -197,6 +204,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             (last.iterations >= self.max_iterations, _CODES.max_iterations),
             (small, _CODES.energy_converged),
             (last.stuck, _CODES.step_converged),
+            (last.stuck & ~last.finite, _CODES.nonfinite_step),
             (gradient_norm <= self.atol, _CODES.gradient_converged),
         ]
         termination: Termination = _CODES.running
@@ -205,8 +213,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return termination
 
 
-def _both_false() -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    return jnp.asarray(False), jnp.asarray(False)
+def _nothing_tried() -> tuple[Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    return jnp.asarray(False), jnp.asarray(False), jnp.asarray(True)
 
 
 def _negligible(predicted: Float[Array, ""], energy: Float[Array, ""]) -> Bool[Array, ""]:

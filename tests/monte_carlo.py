@@ -19,7 +19,7 @@ from vggtgeo.solvers.kernels import AbstractKernel
 
 from vggtgeo import lie
 from vggtgeo.problem import Problem, State
-from vggtgeo.solve import solve
+from vggtgeo.solution import solve
 from vggtgeo.uncertainty import covariances
 
 PIXEL = 0.25

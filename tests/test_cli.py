@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from vggtgeo.cli.jax_flags import cache_folder
 from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command, make_app
-from vggtgeo.energy import energy
+from vggtgeo.objective import energy
 from vggtgeo.errors import InputError
 from vggtgeo.problem_file import load_problem
 

@@ -10,7 +10,7 @@ import pytest
 from scenes import Scene, make_scene, matrix
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.energy import EnergyTerms, energy_terms
+from vggtgeo.objective import EnergyTerms, energy_terms
 from vggtgeo.packing import PaddedSize
 from vggtgeo.problem import Problem, State
 

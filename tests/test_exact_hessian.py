@@ -13,7 +13,7 @@ from scenes import make_scene
 from vggtgeo.solvers.arrow import multiply, reduce
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.energy import energy
+from vggtgeo.objective import energy
 from vggtgeo.problem import MarginalPrior, Problem, State
 
 SCENE = make_scene(2, 4, 1, 2, noise=0.7, outliers=0.3, depth_error=0.2, seed=3)

@@ -14,7 +14,7 @@ from test_exact_hessian import prior_on
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 from vggtgeo.problem import Problem, State
-from vggtgeo.solve import solve
+from vggtgeo.solution import solve
 
 SCENE = make_scene(3, 5, 1, 2, noise=0.5, outliers=0.1, depth_error=0.05, seed=4)
 SOLVER = SchurLevenbergMarquardt(rtol=1e-9, max_iterations=60)

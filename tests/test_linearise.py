@@ -13,7 +13,7 @@ from vggtgeo.solvers.reduced import DenseCholesky
 
 from vggtgeo import lie
 from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.energy import relative_poses
+from vggtgeo.objective import relative_poses
 from vggtgeo.problem import Problem, State
 from vggtgeo.residuals import MIN_RELATIVE_DEPTH, depth_residual, line_residual, point_residual
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scenes import make_scene
 
-from vggtgeo.energy import energy
+from vggtgeo.objective import energy
 from vggtgeo.linearise import edge_observations, linearise
-from vggtgeo.marginalise import marginalise, no_prior, reorder
+from vggtgeo.marginalisation import marginalise, no_prior, reorder
 from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.adjoint import solve_exactly
 from vggtgeo.solvers.arrow import ArrowVector, reduce

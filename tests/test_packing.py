@@ -99,6 +99,8 @@ def test_wrong_lists_are_refused_by_name() -> None:
     seen = SCENE.observations
     both_kinds, its_edge = seen.line_landmark.copy(), seen.line_edge.copy()
     both_kinds[0], its_edge[0] = seen.point_landmark[0], seen.point_edge[0]
+    twice = seen.point_landmark.copy()
+    twice[1] = twice[0]
     wrong_host = seen.point_edge.copy()
     wrong_host[0] = len(seen.edges) - 1
     cases = [
@@ -111,6 +113,9 @@ def test_wrong_lists_are_refused_by_name() -> None:
             r"`point_edge\[0\]` starts at keyframe 2, but its landmark is hosted in keyframe 0",
         ),
         (bad(line_landmark=both_kinds, line_edge=its_edge), "both name landmark"),
+        (bad(point_landmark=twice), r"name landmark 0 on edge 0 more than once"),
+        (replace(SCENE, start_intrinsics=np.array([300.0, -1.0, 0.0, 0.0])), "focal lengths must be positive"),
+        (replace(SCENE, start_poses=2 * SCENE.start_poses), r"`poses\[0\]` has a quaternion of length 2"),
         (bad(point_weight=seen.point_weight[1:]), "`point_weight` has shape"),
         (replace(SCENE, start_poses=SCENE.start_poses[:, :4]), r"`poses` has shape \(3, 4\); expected \(3, 7\)"),
         (bad(depth_sigma=0 * seen.depth_sigma), r"`depth_sigma\[0\]` is 0"),

@@ -10,7 +10,7 @@ import pytest
 from scenes import INTRINSICS, Scene, make_scene
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.energy import energy
+from vggtgeo.objective import energy
 from vggtgeo.errors import InputError
 from vggtgeo.problem_file import LAYOUT, load_problem, save_solution
 

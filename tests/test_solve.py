@@ -13,7 +13,7 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 from vggtgeo.packing import PaddedSize
 from vggtgeo.problem import Problem, State
-from vggtgeo.solve import Solution, solve
+from vggtgeo.solution import Solution, solve
 
 EXACT = make_scene()
 NOISY = make_scene(noise=0.5, outliers=0.15, depth_error=0.05, seed=2)
@@ -107,6 +107,16 @@ def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
     assert not bool(solution.converged)
     np.testing.assert_array_equal(solution.state.inverse_depth, start.inverse_depth)
     np.testing.assert_array_equal(solution.state.poses.wxyz_xyz, start.poses.wxyz_xyz)
+
+
+def test_a_step_that_is_not_finite(solved: Solve) -> None:
+    # Proves that equations beyond the range of numbers end as a failure, not as convergence, with a finite state.
+    problem, start, _ = NOISY.pack(**OPTIONS)
+    problem = eqx.tree_at(lambda p: p.depth.mean, problem, start.inverse_depth)
+    solution = solved(eqx.tree_at(lambda p: p.depth.sigma, problem, replace_fn=lambda leaf: leaf * 1e-200), start)
+    assert solution.result == "nonfinite_step"
+    assert not bool(solution.converged)
+    assert finite(solution)
 
 
 def test_no_weight_at_all(solved: Solve) -> None:

@@ -1,3 +1,72 @@
-"""Dense indoor SLAM with a functional, differentiable bundle adjustment in JAX."""
+"""Dense indoor SLAM with a functional, differentiable bundle adjustment in JAX.
+
+`import vggtgeo as vg` is all a user needs; each name is loaded when it is first asked for, so that the program's
+`--help` imports neither JAX nor OpenCV.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from vggtgeo import _source_tree as _source_tree  # first: in a source tree it finds `solvers` and `models`
+
+if TYPE_CHECKING:
+    from vggtgeo.camera import Camera as Camera
+    from vggtgeo.datasets import Frame as Frame
+    from vggtgeo.datasets import open_sequence as open_sequence
+    from vggtgeo.objective import energy as energy
+    from vggtgeo.objective import energy_terms as energy_terms
+    from vggtgeo.errors import InputError as InputError
+    from vggtgeo.evaluation import evaluate_trajectory as evaluate_trajectory
+    from vggtgeo.marginalisation import marginalise as marginalise
+    from vggtgeo.marginalisation import no_prior as no_prior
+    from vggtgeo.packing import Observations as Observations
+    from vggtgeo.packing import PaddedSize as PaddedSize
+    from vggtgeo.packing import pack as pack
+    from vggtgeo.problem import Problem as Problem
+    from vggtgeo.problem import State as State
+    from vggtgeo.problem_file import load_problem as load_problem
+    from vggtgeo.simulation import simulate as simulate
+    from vggtgeo.slam.run import finish as finish
+    from vggtgeo.slam.run import frame_trajectory as frame_trajectory
+    from vggtgeo.slam.run import run as run
+    from vggtgeo.slam.settings import Roles as Roles
+    from vggtgeo.slam.settings import SlamSettings as SlamSettings
+    from vggtgeo.solution import Solution as Solution
+    from vggtgeo.solution import solve as solve
+    from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
+    from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt as SchurLevenbergMarquardt
+    from vggtgeo.trajectory import Trajectory as Trajectory
+
+_HOME = {
+    "camera": ("Camera",),
+    "datasets": ("Frame", "open_sequence"),
+    "objective": ("energy", "energy_terms"),
+    "errors": ("InputError",),
+    "evaluation": ("evaluate_trajectory",),
+    "marginalisation": ("marginalise", "no_prior"),
+    "packing": ("Observations", "PaddedSize", "pack"),
+    "problem": ("Problem", "State"),
+    "problem_file": ("load_problem",),
+    "simulation": ("simulate",),
+    "slam.run": ("finish", "frame_trajectory", "run"),
+    "slam.settings": ("Roles", "SlamSettings"),
+    "solution": ("Solution", "solve"),
+    "solvers.adjoint": ("ArrowAdjoint",),
+    "solvers.levenberg_marquardt": ("SchurLevenbergMarquardt",),
+    "trajectory": ("Trajectory",),
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = sorted(_MODULE_OF)  # noqa: PLE0605
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module `vggtgeo` has no attribute `{name}`")
+    return getattr(importlib.import_module(f"vggtgeo.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo import lie
-from vggtgeo.energy import energy_terms, marginal_energy, marginal_residual, relative_poses
+from vggtgeo.objective import energy_terms, marginal_energy, marginal_residual, relative_poses
 from vggtgeo.problem import Edges, LineObservations, MarginalPrior, PointObservations, Problem, State
 from vggtgeo.residuals import MIN_RELATIVE_DEPTH
 from vggtgeo.second_order import Camera, Projection, second_order, twist
@@ -66,7 +66,7 @@ class _Hosts(NamedTuple):
 
 
 def fast_energy(problem: Problem, observations: EdgeObservations, state: State) -> Float[Array, ""]:
-    """The energy of `energy.energy`, by one pass over the edges."""
+    """The energy of `objective.energy`, by one pass over the edges."""
     hosts = _hosts(problem, state)
     relative = relative_poses(problem, state)
 

@@ -39,11 +39,11 @@ known. Well-posed windows lie above 1e-4 (tests/test_observability.py)."""
 class Spectra(eqx.Module):
     """Eigenvalues of balanced information matrices, one a selection of factors."""
 
-    values: Float[Array, "k c"]
+    values: Float[Array, "*k c"]
     """Ascending; infinite for held coordinates, which come last."""
-    vectors: Float[Array, "k c c"]
+    vectors: Float[Array, "*k c c"]
     """Columns, in balanced coordinates `D^1/2 x`."""
-    along: Float[Array, "k m"]
+    along: Float[Array, "*k m"]
     """`d' S d` for each named direction: per m^2, rad^2, pixel^2, or per 100 % of scale or focal length."""
 
 

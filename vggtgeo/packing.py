@@ -115,7 +115,7 @@ def pack(
         dtype: float type of all arrays.
 
     Raises:
-        InputError: an array of a wrong shape, an index out of range, a landmark with both points and lines, a non-positive inverse depth, an
+        InputError: an array of a wrong shape, an index out of range, a match given twice, a landmark with both points and lines, a non-positive inverse depth, an
             observation between keyframes that its landmark is not hosted in, or a size that is too small.
 
     """
@@ -123,6 +123,7 @@ def pack(
     _check_shapes(observations, poses, intrinsics)
     _check_indices(observations, len(poses))
     _check_positive("inverse_depth", inverse_depth, count)
+    _check_camera(poses, intrinsics, intrinsics_sigma)
     index, needed_points, needed_lines = _assign_slots(observations, len(poses))
     edges, order, ranks = _sort_edges(observations.edges, len(poses))
     size = size or PaddedSize(len(poses), needed_points, needed_lines, ranks, len(edges))
@@ -160,7 +161,7 @@ def pack(
         depth=_depth_prior(observations, per_slot, count, dtype),
         intrinsics_prior=IntrinsicsPrior(
             jnp.asarray(intrinsics if intrinsics_mean is None else intrinsics_mean, dtype),
-            jnp.asarray(np.broadcast_to(1 / np.square(sigma), 4), dtype)
+            jnp.asarray(np.broadcast_to(1 / np.square(sigma), 4), dtype),
         ),
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
         fixed_intrinsics=jnp.asarray(np.broadcast_to(fixed_intrinsics, 4)),
@@ -278,6 +279,13 @@ def _check_indices(observations: Observations, keyframes: int) -> None:
                 f"`{kind}_edge[{first}]` starts at keyframe {observations.edges[edge[first], 0]}, but its landmark is "
                 f"hosted in keyframe {observations.host[landmark[first]]}: an edge observes landmarks of its own host"
             )
+        _, first_seen = np.unique(edge * landmarks + landmark, return_index=True)
+        if len(first_seen) < len(edge):
+            twice = np.delete(np.arange(len(edge)), first_seen)[0]
+            raise InputError(
+                f"`{kind}_edge` and `{kind}_landmark` name landmark {landmark[twice]} on edge {edge[twice]} more than "
+                "once; a landmark has one match an edge"
+            )
 
 
 def _check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.ndarray) -> None:
@@ -300,6 +308,17 @@ def _check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.
     for name, shape in {**expected, "poses": (len(poses), 7), "intrinsics": (4,)}.items():
         if np.shape(given[name]) != shape:
             raise InputError(f"`{name}` has shape {np.shape(given[name])}; expected {shape}")
+
+
+def _check_camera(poses: np.ndarray, intrinsics: np.ndarray, sigma: np.ndarray | float | None) -> None:
+    if np.any(np.asarray(intrinsics)[:2] <= 0):
+        raise InputError(f"`intrinsics` is {np.asarray(intrinsics)}; both focal lengths must be positive")
+    if sigma is not None and not np.all(np.asarray(sigma) > 0):
+        raise InputError(f"`intrinsics_sigma` is {sigma}; it must be positive (None = no prior)")
+    lengths = np.linalg.norm(poses[:, :4], axis=1)
+    wrong = np.nonzero(np.abs(lengths - 1) > 1e-3)[0]
+    if len(wrong):
+        raise InputError(f"`poses[{wrong[0]}]` has a quaternion of length {lengths[wrong[0]]:.3g}; expected 1")
 
 
 def _check_positive(name: str, values: np.ndarray, count: int) -> None:

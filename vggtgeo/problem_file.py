@@ -54,6 +54,8 @@ def load_problem(path: Path, dtype: DTypeLike = np.float64) -> tuple[Problem, St
         depth_weight=arrays["d_weight"],
         alpha=float(arrays["alpha"]),
     )
+    if not arrays["huber"] > 0:
+        raise InputError(f"array `huber` of `{path}` is {arrays['huber']}; it must be positive")
     return pack(
         observations,
         arrays["T_init"],

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from vggtgeo.energy import energy
+from vggtgeo.objective import energy
 from vggtgeo.errors import InputError
 from vggtgeo.problem import Problem, State
 from vggtgeo.problem_file import load_problem, save_solution
-from vggtgeo.solve import Solution, solve
+from vggtgeo.solution import Solution, solve
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from vggtgeo.marginalise import square_root
+from vggtgeo.marginalisation import square_root
 from vggtgeo.problem import MarginalPrior
 from vggtgeo.slam import rigid
 from vggtgeo.slam.keyframe import Keyframe

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
-from vggtgeo.marginalise import no_prior
+from vggtgeo.marginalisation import no_prior
 from vggtgeo.packing import PaddedSize
 from vggtgeo.problem import MarginalPrior
 from vggtgeo.slam import rigid

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vggtgeo.marginalise import marginalise_jit, no_prior, reorder
+from vggtgeo.marginalisation import marginalise_jit, no_prior, reorder
 from vggtgeo.packing import PaddedSize
 from vggtgeo.problem import MarginalPrior
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
@@ -16,7 +16,7 @@ from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.solve import solve
+from vggtgeo.solution import solve
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 solve_jit = eqx.filter_jit(solve)

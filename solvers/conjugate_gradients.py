@@ -1,0 +1,213 @@
+"""Reduced system by preconditioned conjugate gradients: no matrix over all nodes is ever formed.
+
+The damped Schur complement is applied as `S x = H x + l D x - W V^-1 W' x / (1 + l)`: `H` edge by edge, the rest host
+by host. Cost of a product: linear in the edges. The iteration stops where the residual, in the norm of the
+preconditioner, has fallen by the forcing term of an inexact Newton method (Dembo, Eisenstat and Steihaug 1982).
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    ArrowVector,
+    back_substitute,
+    carry_to_nodes,
+    couple,
+    dense_gradient,
+    from_relative,
+    hessian_times,
+    host_products,
+    inverse_landmark_hessian,
+    to_relative,
+)
+from vggtgeo.solvers.band_cholesky import Bands, factorise_bands, prepare_bands
+from vggtgeo.solvers.block_band import from_band, solve_band, to_band
+from vggtgeo.solvers.block_jacobi import JacobiBlocks, apply_blocks, invert_blocks, prepare_blocks
+from vggtgeo.solvers.flat_directions import flat_stiffness, free_gauge
+from vggtgeo.solvers.reduced import MIN_DIAGONAL, AbstractReducedSolver, predicted_decrease
+
+Apply = Callable[[Float[Array, " c"]], Float[Array, " c"]]
+Prepared = TypeVar("Prepared")
+
+
+class AbstractProduct(eqx.Module):
+    """How `W V^-1 W'` is applied: one way a class."""
+
+    @abc.abstractmethod
+    def prepare(self, system: ArrowSystem) -> Array:
+        """Work shared by all products at one linearisation."""
+
+    @abc.abstractmethod
+    def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
+        """`W V^-1 W' dense`."""
+
+
+class ImplicitProduct(AbstractProduct):
+    """Through the landmarks: two passes over the cross terms `[n, b k + q + 2, s]` a product, nothing stored."""
+
+    def prepare(self, system: ArrowSystem) -> Array:
+        return inverse_landmark_hessian(system)
+
+    def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
+        return carry_to_nodes(system, prepared * couple(system, dense, 0.0))
+
+
+class HostProduct(AbstractProduct):
+    """Through one matrix `[b k + q, b k + q]` a host, formed once: pays from about five products on."""
+
+    def prepare(self, system: ArrowSystem) -> Array:
+        return host_products(system)
+
+    def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
+        relative = jnp.pad(to_relative(system, dense), ((0, 0), (0, 1)))
+        return from_relative(system, jnp.einsum("nrt,nt->nr", prepared, relative)[:, :-1])
+
+
+class AbstractPreconditioner(eqx.Module, Generic[Prepared]):
+    """An approximate inverse of the damped Schur complement: symmetric, positive definite."""
+
+    @abc.abstractmethod
+    def prepare(self, system: ArrowSystem) -> Prepared:
+        """Work shared by all dampings."""
+
+    @abc.abstractmethod
+    def inverse(self, system: ArrowSystem, prepared: Prepared, damping: Float[Array, ""]) -> Apply:
+        """The approximate inverse at one damping; held coordinates pass through."""
+
+
+class BlockJacobi(AbstractPreconditioner[JacobiBlocks]):
+    """The diagonal blocks of the nodes and the block of the shared coordinates (Schur-Jacobi)."""
+
+    def prepare(self, system: ArrowSystem) -> JacobiBlocks:
+        return prepare_blocks(system)
+
+    def inverse(self, system: ArrowSystem, prepared: JacobiBlocks, damping: Float[Array, ""]) -> Apply:
+        inverses = invert_blocks(system, prepared, damping)
+        return lambda residual: apply_blocks(inverses, residual)
+
+
+class BandPreconditioner(AbstractPreconditioner[Bands]):
+    """Block-banded Cholesky of what edges of a reach up to `reach` couple: exact but for the longer edges."""
+
+    reach: int = eqx.field(static=True)
+
+    def prepare(self, system: ArrowSystem) -> Bands:
+        return prepare_bands(system, self.reach)
+
+    def inverse(self, system: ArrowSystem, prepared: Bands, damping: Float[Array, ""]) -> Apply:
+        factor = factorise_bands(system, prepared, damping)
+
+        def apply(residual: Array) -> Array:
+            return from_band(solve_band(factor, to_band(prepared.hessian, residual[:, None])), len(residual))[:, 0]
+
+        return apply
+
+
+class _Prepared(eqx.Module):
+    product: Array
+    preconditioner: Any
+    gradient: Float[Array, " c"]
+    schur_gradient: Float[Array, " c"]
+    diagonal: Float[Array, " c"]
+    stiffness: Float[Array, " g"]
+
+
+class ConjugateGradients(AbstractReducedSolver[_Prepared]):
+    """Inexact Newton steps by preconditioned conjugate gradients; right for thousands of nodes and any graph."""
+
+    preconditioner: AbstractPreconditioner = BlockJacobi()
+    product: AbstractProduct = HostProduct()
+    rtol: float = 1e-2
+    """Largest forcing term: fall of the residual that ends the iteration."""
+    max_iterations: int = eqx.field(static=True, default=200)
+
+    def prepare(self, system: ArrowSystem) -> _Prepared:
+        gradient, diagonal = dense_gradient(system)
+        eliminated = carry_to_nodes(system, inverse_landmark_hessian(system) * system.landmark_gradient)
+        return _Prepared(
+            product=self.product.prepare(system),
+            preconditioner=self.preconditioner.prepare(system),
+            gradient=gradient,
+            schur_gradient=eliminated,
+            diagonal=jnp.maximum(diagonal, MIN_DIAGONAL),
+            stiffness=flat_stiffness(system),
+        )
+
+    def step(
+        self, system: ArrowSystem, prepared: _Prepared, damping: Float[Array, ""]
+    ) -> tuple[ArrowVector, Float[Array, ""]]:
+        solved = self.solve(system, prepared, damping)
+        landmarks = back_substitute(system, solved.solution) / (1 + damping)
+        step = ArrowVector(solved.solution, landmarks)
+        predicted = predicted_decrease(system, prepared.gradient, prepared.diagonal, step, damping)
+        # The formula is that of the exact minimiser; the residual of an inexact one corrects it.
+        return step, predicted + solved.solution @ solved.residual / 2
+
+    def solve(self, system: ArrowSystem, prepared: _Prepared, damping: Float[Array, ""]) -> Solved:
+        """The dense part of the step, and how it was found."""
+        shrink, gauge = 1 / (1 + damping), free_gauge(system)
+
+        def apply(dense: Array) -> Array:
+            eliminated = shrink * self.product.apply(system, prepared.product, dense)
+            whole = hessian_times(system, dense) + damping * prepared.diagonal * dense - eliminated
+            return jnp.where(system.free, whole + gauge @ (prepared.stiffness * (gauge.T @ dense)), 0.0)
+
+        rhs = jnp.where(system.free, shrink * prepared.schur_gradient - prepared.gradient, 0.0)
+        inverse = self.preconditioner.inverse(system, prepared.preconditioner, damping)
+        return conjugate_gradients(apply, inverse, rhs, self.rtol, self.max_iterations)
+
+
+class Solved(NamedTuple):
+    """Outcome of `conjugate_gradients`."""
+
+    solution: Float[Array, " c"]
+    residual: Float[Array, " c"]
+    iterations: Int[Array, ""]
+
+
+class _Loop(NamedTuple):
+    solution: Array
+    residual: Array
+    direction: Array
+    squared: Array
+    iterations: Array
+
+
+def conjugate_gradients(
+    apply: Apply, inverse: Apply, rhs: Float[Array, " c"], rtol: float, max_iterations: int
+) -> Solved:
+    """Solve `A x = rhs` from zero until `sqrt(r' P r)` falls below the forcing term times its first value.
+
+    The forcing term is `min(rtol, sqrt(r0' P r0))`: residuals are in units of their standard deviation, so near the
+    optimum, where the whole decrease to be had is a fraction of one, steps become as exact as they matter.
+    """
+    first = inverse(rhs)
+    start = rhs @ first
+    forcing = jnp.minimum(rtol, jnp.sqrt(jnp.abs(start)))
+    goal = forcing**2 * start
+
+    def go_on(loop: _Loop) -> Bool[Array, ""]:
+        return (loop.squared > goal) & (loop.iterations < max_iterations)
+
+    def body(loop: _Loop) -> _Loop:
+        image = apply(loop.direction)
+        length = loop.squared / (loop.direction @ image)
+        solution = loop.solution + length * loop.direction
+        residual = loop.residual - length * image
+        preconditioned = inverse(residual)
+        squared = residual @ preconditioned
+        direction = preconditioned + squared / loop.squared * loop.direction
+        return _Loop(solution, residual, direction, squared, loop.iterations + 1)
+
+    last = jax.lax.while_loop(go_on, body, _Loop(jnp.zeros_like(rhs), rhs, first, start, jnp.asarray(0)))
+    # A preconditioner that is not definite (NaN) must not pass for a zero step.
+    solution = jnp.where(jnp.isfinite(last.squared), last.solution, jnp.nan)
+    return Solved(solution, last.residual, last.iterations)

@@ -1,0 +1,39 @@
+"""Directions along which the energy is flat for a known reason, without forming a matrix over all nodes."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from vggtgeo.solvers.arrow import ArrowSystem, couple, hessian_times, inverse_landmark_hessian
+
+
+def free_gauge(system: ArrowSystem) -> Float[Array, "c g"]:
+    """The gauge directions over the free coordinates."""
+    return jnp.where(system.free[:, None], system.gauge, 0.0)
+
+
+def flat_stiffness(system: ArrowSystem) -> Float[Array, " g"]:
+    """The stiffness of `reduced.gauge_stiffness`, from one product of the system with each gauge direction.
+
+    `d' H d - d' W V^-1 W' d` against `d' H d`: flat where elimination takes all but `sqrt(eps)` of the curvature away.
+    """
+    inverse = inverse_landmark_hessian(system)
+
+    def curvatures(direction: Array) -> tuple[Array, Array]:
+        whole = direction @ hessian_times(system, direction)
+        return whole, whole - jnp.sum(inverse * couple(system, direction, 0.0) ** 2)
+
+    whole, left = jax.vmap(curvatures, in_axes=1)(free_gauge(system))
+    return jnp.where(left < jnp.sqrt(jnp.finfo(left.dtype).eps) * whole, whole, 0.0)
+
+
+def pins(system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Array, " c"]) -> Float[Array, "c g"]:
+    """Stiffness on one coordinate a flat direction, the one that moves most along it.
+
+    It removes the flatness while a banded matrix stays banded. Columns hold that stiffness at the pinned coordinate;
+    they are zero where nothing is flat.
+    """
+    at = jnp.argmax(jnp.abs(free_gauge(system)), axis=0)
+    pinned = jnp.zeros_like(system.gauge).at[at, jnp.arange(len(at))].set(1.0)
+    return pinned * jnp.where(stiffness > 0, diagonal[at], 0.0)

@@ -1,0 +1,163 @@
+"""Observability: constructed problems whose weak direction is known, and the definition of the shares."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from degenerate_scenes import (
+    HELD,
+    KEYFRAMES,
+    POINTS,
+    WELL,
+    one_plane,
+    packed,
+    parallel_lines,
+    pure_rotation,
+    without,
+    without_matches_of,
+)
+from scenes import Scene
+from vggtgeo.solvers.arrow import ArrowVector
+
+from vggtgeo.bundle_adjustment import BundleAdjustment
+from vggtgeo.directions import MOTIONS, direction_names, named_directions
+from vggtgeo.observability import KINDS, WEAK, Observability, observability
+from vggtgeo.observability_report import undetermined_landmarks, weak_directions
+from vggtgeo.problem import Problem, State
+
+Observe = Callable[[Problem, State], Observability]
+LOST = [f"keyframe 2: {motion}" for motion in MOTIONS]
+NO_PRIOR = {"intrinsics_sigma": None}
+
+
+@pytest.fixture(scope="module")
+def observed() -> Observe:
+    """`observability`, compiled once for all tests of this file."""
+    return jax.jit(observability)
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "expected"),
+    [
+        (WELL, {}, []),
+        (WELL, NO_PRIOR, []),
+        (without(WELL, "depth"), {}, ["scale"]),
+        (one_plane(), {}, ["scale"]),
+        (parallel_lines(), {"fixed_intrinsics": HELD}, ["translation along x", "keyframe 1: translation along x"]),
+        (without_matches_of(2), {}, LOST),
+    ],
+    ids=["all factors", "no prior", "no depth", "one plane", "parallel lines", "unmatched keyframe"],
+)
+def test_the_weak_direction_by_name(observed: Observe, scene: Scene, options: dict, expected: list[str]) -> None:
+    # Proves that exactly what the construction leaves open is found, named and called undetermined.
+    found = observed(*packed(scene, at_truth=True, **options))
+    weak = weak_directions(found)
+    assert [direction.name for direction in weak] == expected, found.report()
+    assert not any(direction.determined for direction in weak)
+    assert all(direction.alignment > 0.999 for direction in weak)
+    values = np.asarray(found.whole.values[0])
+    assert values[len(expected)] > 10 * WEAK, values
+
+
+def test_nothing_at_all(observed: Observe) -> None:
+    # Proves that zero weights everywhere leave every free direction open, and that the report says so.
+    found = observed(*packed(without(WELL, "point", "line", "depth"), at_truth=True, **NO_PRIOR))
+    assert len(weak_directions(found)) == 6 * (KEYFRAMES - 1) + 4
+    assert "everything (16 directions undetermined)" in found.report()
+    assert undetermined_landmarks(found) == (0, 0)
+    assert not any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves(found))
+
+
+def test_no_parallax(observed: Observe) -> None:
+    # Proves that under pure rotation every inverse depth is undetermined, and none in the well-posed problem.
+    turning = undetermined_landmarks(observed(*packed(pure_rotation(), at_truth=True)))
+    assert turning == (KEYFRAMES * POINTS, KEYFRAMES * POINTS)
+    lost, used = undetermined_landmarks(observed(*packed(WELL, at_truth=True)))
+    assert (lost, used) == (0, WELL.observations.host.size)
+
+
+def test_what_each_kind_is_worth(observed: Observe) -> None:
+    # Proves that without the depth priors the scale goes, that they carry all of it, and that no other kind is needed
+    # alone. Oracle: the problem is built so.
+    found = observed(*packed(WELL, at_truth=True))
+    assert [direction.name for direction in weak_directions(found, "depth")] == ["scale"]
+    assert all(weak_directions(found, kind) == [] for kind in KINDS if kind != "depth")
+    scale = direction_names(KEYFRAMES).index("scale")
+    assert float(found.without.along[KINDS.index("depth"), scale]) < 1e-9 * float(found.whole.along[0, scale])
+    assert float(found.alone.along[KINDS.index("depth"), scale]) == 0
+    with pytest.raises(ValueError, match="`without` is 'imu'; expected one of points, lines, depth, priors"):
+        weak_directions(found, "imu")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_a_kind_is_the_problem_without_it(observed: Observe, kind: str) -> None:
+    # Proves the information of a selection. Oracle: the whole of a problem that never had the kind, and super-additivity.
+    problem, truth = packed(WELL, at_truth=True)
+    weight = {
+        "points": lambda p: p.points.weight,
+        "lines": lambda p: p.lines.weight,
+        "depth": lambda p: p.depth.weight,
+        "priors": lambda p: p.intrinsics_prior.information,
+    }[kind]
+    found = observed(problem, truth)
+    lacking = observed(eqx.tree_at(weight, problem, replace_fn=jnp.zeros_like), truth)
+    row, whole = KINDS.index(kind), np.asarray(found.whole.along[0])
+    np.testing.assert_allclose(found.without.along[row], lacking.whole.along[0], rtol=1e-9, atol=1e-9 * whole.max())
+    apart = np.asarray(found.without.along[row] + found.alone.along[row])
+    assert np.all(apart <= whole + 1e-9 * whole.max())
+
+
+@jax.jit
+def moved_along_all(problem: Problem, state: State, step: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Camera centres and axes (in the world) and intrinsics after a small step along each named direction."""
+
+    def moved(direction: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        vector = ArrowVector(step * direction, jnp.zeros_like(state.inverse_depth))
+        new = BundleAdjustment(problem).retract(state, vector)
+        back = new.poses.inverse()
+        return back.translation(), back.rotation().as_matrix(), new.intrinsics
+
+    return jax.vmap(moved)(named_directions(problem, state))
+
+
+def test_directions_are_the_motions_they_name() -> None:
+    # Proves scale, common motions and focal length. Oracle: camera centres and axes moved by hand, first order.
+    problem, state = packed(WELL, at_truth=True)
+    names, step = direction_names(KEYFRAMES), 1e-6
+    centres_of, axes_of, intrinsics_of = moved_along_all(problem, state, jnp.asarray(step))
+    assert len(centres_of) == len(names)
+    moved = {name: (centres_of[i], axes_of[i], intrinsics_of[i]) for i, name in enumerate(names)}
+    back = state.poses.inverse()
+    centres, axes = np.asarray(back.translation()), np.asarray(back.rotation().as_matrix())
+    close = lambda found, expected: np.testing.assert_allclose(found, expected, atol=10 * step**2)
+    close(moved["scale"][0] - centres, step * (centres - centres[0]))
+    close(moved["scale"][1], axes)
+    # A left tangent moves the world in the camera: the camera itself goes the other way.
+    close(moved["translation along z"][0] - centres, np.broadcast_to(-step * axes[0][:, 2], centres.shape))
+    turn = -step * np.cross(axes[0][:, 1], centres - centres[0])
+    close(moved["yaw"][0] - centres, turn)
+    close(moved["keyframe 1: roll"][0], centres)
+    close(moved["keyframe 2: translation along x"][0][2] - centres[2], -step * axes[2][:, 0])
+    close(moved["focal length"][2], np.asarray(state.intrinsics) * (1 + step * np.array([1, 1, 0, 0])))
+
+
+def test_the_report_reads_well(observed: Observe) -> None:
+    # Proves that what a person needs stands in the text, and that `print` shows it.
+    found = observed(*packed(without(WELL, "depth"), at_truth=True))
+    text = str(found)
+    assert "weak directions: scale (undetermined)" in text
+    assert "weak without lines: no more than with all" in text
+    assert "keyframe 2: roll" in text
+    assert "keyframe 0: roll" not in text
+    assert max(map(len, text.splitlines())) <= 110
+
+
+def test_it_traces_under_vmap() -> None:
+    # Proves that the numeric part is pure: a batch has a leading axis everywhere.
+    pairs = [packed(scene, at_truth=True) for scene in (WELL, without(WELL, "depth"))]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)
+    shapes = jax.eval_shape(jax.vmap(observability), *stacked)
+    assert all(leaf.shape[0] == 2 for leaf in jax.tree.leaves(shapes))
