@@ -73,7 +73,7 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
 
     def stationarity(moving: Any) -> ArrowVector:
         shifted, start = eqx.combine(moving, fixed)
-        return gradient(shifted, shifted.hold(point, start), system)
+        return _free(shifted.gradient(shifted.hold(point, start)), system)
 
     _, right_hand_side = jax.jvp(stationarity, (moving,), (input_tangents,))
     step = jax.lax.custom_linear_solve(
@@ -89,12 +89,6 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
 
     zero = problem.zero_step(point)
     return jax.jvp(optimum, (moving, zero), (input_tangents, step))
-
-
-def gradient(problem: AbstractArrowProblem, point: Point, system: ArrowSystem) -> ArrowVector:
-    """Gradient of the energy in tangent coordinates at `point`, by automatic differentiation; zero where held."""
-    energy = lambda step: problem.energy(problem.retract(point, step))
-    return _free(jax.grad(energy)(problem.zero_step(point)), system)
 
 
 def solve_exactly(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
@@ -123,10 +117,10 @@ def _eliminated_gradient(system: ArrowSystem) -> Float[Array, " c"]:
 def _newton_step(problem: AbstractArrowProblem, point: Point) -> Point:
     """One exact Newton step, kept only if it shrinks the gradient."""
     system = problem.hessian(point)
-    before = gradient(problem, point, system)
+    before = _free(problem.gradient(point), system)
     step = solve_exactly(system, jax.tree.map(jnp.negative, before))
     moved = problem.retract(point, step)
-    better = _size(gradient(problem, moved, system), system) < _size(before, system)
+    better = _size(_free(problem.gradient(moved), system), system) < _size(before, system)
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), moved, point)
 
 

@@ -23,7 +23,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from vggtgeo.solvers.arrow import ArrowSystem, Reduced, inverse_landmark_hessian, reduce
+from vggtgeo.solvers.arrow import ArrowSystem, Reduced, inverse_landmark_hessian, padded_transports, reduce
 from vggtgeo.solvers.reduced import MIN_DIAGONAL, gauge_stiffness
 
 
@@ -90,10 +90,9 @@ def to_relative_matrix(system: ArrowSystem, matrix: Float[Array, "c c"]) -> Floa
     index = jnp.concatenate([index.reshape(hosts, -1), tail], 1)
     local = matrix[index[:, :, None], index[:, None, :]]
     wide = ranks * block
-    padded = jnp.concatenate([system.transport, jnp.zeros_like(system.transport[:1])])
     carry = jnp.zeros((hosts, wide + shared, wide + block + shared), matrix.dtype)
     carry = carry.at[:, jnp.arange(wide), jnp.arange(wide)].set(jnp.repeat(present, block, 1).astype(matrix.dtype))
-    carry = carry.at[:, :wide, wide : wide + block].set(-padded[system.graph.of_host].reshape(hosts, wide, block))
+    carry = carry.at[:, :wide, wide : wide + block].set(-padded_transports(system).reshape(hosts, wide, block))
     carry = carry.at[:, wide:, wide + block :].set(jnp.eye(shared, dtype=matrix.dtype))
     return jnp.einsum("nra,nab,ntb->nrt", carry, local, carry)
 

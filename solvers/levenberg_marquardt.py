@@ -36,8 +36,8 @@ class Termination(eqx.Enumeration):
         "depths, targets or weights; the initial state was returned."
     )
     nonfinite_step = (
-        "Failed: the normal equations have no finite solution. Look for weights or standard deviations that are far too "
-        "large or too small; the last state that was accepted was returned."
+        "Failed: the normal equations have no finite solution. Look for weights or standard deviations that are far "
+        "too large or too small; the last state that was accepted was returned."
     )
 
 

@@ -24,6 +24,10 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
         """Exact gradient and the Gauss-Newton (reweighted) approximation of the Hessian at `point`."""
 
     @abc.abstractmethod
+    def gradient(self, point: Point) -> ArrowVector:
+        """Exact gradient in the coordinates of `retract`, held coordinates as if free; differentiable once more."""
+
+    @abc.abstractmethod
     def hessian(self, point: Point) -> ArrowSystem:
         """Exact gradient and exact Hessian at `point`, in the coordinates of `retract`."""
 

@@ -4,11 +4,13 @@ Three keyframes, 8 points and 4 segments of 2 samples hosted in each, observed i
 are free with a prior of 5 pixels unless said otherwise. Noise-free; the guess lies 1 cm, 0.3 degrees and 5 % away.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import scenes
 from scenes import SIGMA, Scene, make_scene
+from scipy.spatial.transform import Rotation
 
 from vggtgeo.packing import Observations, PaddedSize
 from vggtgeo.problem import Problem, State
@@ -37,9 +39,8 @@ def scene_of(
     samples = segments.reshape(-1, 3)
     pixels = np.concatenate([pixel.reshape(-1, 2), scenes._project(samples)])
     depths = np.concatenate([inverse_depth.reshape(-1), 1 / samples[:, 2]])
-    world = [
-        (segments[i, line] - translation[i]) @ rotation[i] for i in range(keyframes) for line in range(LINES)
-    ]  # fmt: skip
+    hosts = np.repeat(np.arange(keyframes), LINES)
+    world = [(ends - translation[i]) @ rotation[i] for i, ends in zip(hosts, segments.reshape(-1, 2, 3), strict=True)]
     edges = np.array([(i, j) for i in range(keyframes) for j in range(keyframes) if i != j])
     seen = scenes._observe(poses, edges, host, pixels, depths, world, (POINTS, LINES, SAMPLES))
     observations = Observations(
@@ -116,22 +117,33 @@ def one_plane() -> Scene:
 
 
 def negative_depth() -> Scene:
-    """Matches mirrored about the point at infinity: the poses are held by depth-free far points, depths want < 0."""
+    """Matches mirrored about the image of the point at infinity: with the true poses every inverse depth wants `-d`."""
     seen = WELL.observations
-    edge, landmark = seen.point_edge, seen.point_landmark
-    far = WELL.inverse_depth * 0
-    rotation, translation = scenes.matrix(WELL.poses)
-    infinite = scenes._observe(
-        WELL.poses, seen.edges, seen.host, seen.pixel, far + 1e-6, _no_ends(), (POINTS, 0, SAMPLES)
-    )
-    at_infinity = {(e, s): t for e, s, t in zip(*(infinite[f"point_{k}"] for k in ("edge", "landmark", "target")))}
-    centre = np.stack([at_infinity.get((e, s), t) for e, s, t in zip(edge, landmark, seen.point_target)])
-    del rotation, translation
-    return without(WELL.with_observations(point_target=2 * centre - seen.point_target), "line", "depth")
+    landmarks = (WELL.poses, seen.edges, seen.host, seen.pixel)
+    far = scenes._observe(*landmarks, np.full_like(WELL.inverse_depth, 1e-9), [], (POINTS, 0, SAMPLES))
+    images = zip(far["point_edge"], far["point_landmark"], far["point_target"], strict=True)
+    at_infinity = {(edge, landmark): image for edge, landmark, image in images}
+    rows = zip(seen.point_edge, seen.point_landmark, seen.point_target, strict=True)
+    mirrored = [2 * at_infinity.get((edge, landmark), image) - image for edge, landmark, image in rows]
+    return without(WELL.with_observations(point_target=np.stack(mirrored)), "line", "depth")
 
 
-def _no_ends() -> list:
-    return []
+def wild_start(seed: int = 0) -> Scene:
+    """The well-posed scene, started from random rotations, metres away, depths from 1 mm to 1 km, absurd intrinsics."""
+    rng = np.random.default_rng(seed)
+    poses = WELL.poses.copy()
+    poses[1:, :4] = Rotation.random(KEYFRAMES - 1, rng=rng).as_quat(scalar_first=True)
+    poses[1:, 4:] = rng.normal(0, 10, (KEYFRAMES - 1, 3))
+    depth = 10 ** rng.uniform(-3, 3, len(WELL.inverse_depth))
+    intrinsics = np.array([30.0, 3000, 0, 900])
+    return replace(WELL, start_poses=poses, start_inverse_depth=depth, start_intrinsics=intrinsics)
+
+
+def behind_the_camera() -> Scene:
+    """The well-posed scene, started with two cameras so far ahead that all points lie behind them."""
+    poses = WELL.poses.copy()
+    poses[1:, 4:] = [0.0, 0.0, -50.0]
+    return replace(WELL, start_poses=poses)
 
 
 def packed(scene: Scene, at_truth: bool = False, **options: Any) -> tuple[Problem, State]:

@@ -64,9 +64,7 @@ def problems(kernel: AbstractKernel, count: int, first: int = 0) -> tuple[Proble
 def _problem(kernel: AbstractKernel, seed: int) -> tuple[Problem, State]:
     scene = make_scene(KEYFRAMES, POINTS, LINES, SAMPLES, seed=seed)
     seen = scene.observations
-    scene = scene.with_observations(
-        point_weight=seen.point_weight / PIXEL**2, line_weight=seen.line_weight / PIXEL**2
-    )
+    scene = scene.with_observations(point_weight=seen.point_weight / PIXEL**2, line_weight=seen.line_weight / PIXEL**2)
     return packed(scene, at_truth=True, kernel=kernel)
 
 
@@ -91,7 +89,8 @@ def noisy(problem: Problem, key: Array) -> Problem:
 
 @jax.jit
 def _errors(problems: Problem, truths: State, keys: Array) -> dict[str, Array]:
-    def one(problem: Problem, truth: State, key: Array) -> dict[str, Array]:
+    def one(drawing: tuple[Problem, State, Array]) -> dict[str, Array]:
+        problem, truth, key = drawing
         drawn = noisy(problem, key)
         state = solve(drawn, truth).state
         found = covariances(drawn, state)
@@ -106,7 +105,8 @@ def _errors(problems: Problem, truths: State, keys: Array) -> dict[str, Array]:
             "variance factor": found.variance_factor,
         }
 
-    return jax.vmap(one)(problems, truths, keys)
+    # One after the other: compiles in half the time of `vmap`, and 200 small problems take less than a second.
+    return jax.lax.map(one, (problems, truths, keys))
 
 
 DEGREES = {"keyframe 1": 6, "keyframe 2": 6, "intrinsics": 4}

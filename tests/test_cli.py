@@ -6,7 +6,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import typer
@@ -16,8 +19,9 @@ from typer.testing import CliRunner
 
 from vggtgeo.cli.jax_flags import cache_folder
 from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command, make_app
-from vggtgeo.objective import energy
 from vggtgeo.errors import InputError
+from vggtgeo.objective import energy
+from vggtgeo.problem import Problem, State
 from vggtgeo.problem_file import load_problem
 
 HEAVY = {"jax", "cv2", "matplotlib", "scipy", "onnxruntime", "rerun", "equinox", "numpy"}
@@ -160,15 +164,25 @@ def test_solve_from_file_to_file(tmp_path: Path) -> None:
         np.testing.assert_allclose(arrays["T"][0], start["T"][0], atol=1e-15)
 
 
-def test_solve_in_float32(tmp_path: Path) -> None:
-    # Proves that `--dtype` takes effect, and that its energies are those of the float64 problem all the same.
-    # Oracle: the readable energy of the file, in float64.
+def test_float32_reaches_the_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that `--dtype` casts the whole problem, and that energies and solution are in float64 all the same.
+    # Oracle: what the solver is given; it answers with its start, whose energy is known (test_solve.py does the rest).
+    def return_the_start(problem: Problem, start: State, max_steps: int, repeat: int):
+        leaves = jax.tree.leaves((problem, start))
+        assert {leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)} == {np.dtype(np.float32)}
+        return SimpleNamespace(state=start, iterations=0, result="max_iterations"), 1.0, 1.0
+
+    monkeypatch.setattr("vggtgeo.cli.timed_solve.timed_solve", return_the_start)
     problem, solution = write(tmp_path), tmp_path / "solution.npz"
-    result = invoke("solve", str(problem), "-o", str(solution), "--dtype", "float32", "--max-steps", "30")
-    expected = float(energy(*load_problem(problem)[:2]))
+    result = invoke("solve", str(problem), "-o", str(solution), "--dtype", "float32", "--json")
     assert result.exit_code == 0, result.output
-    assert f"converged: energy {expected:.6e} -> " in result.stdout
-    assert "float32" in result.stdout
+    report, expected = json.loads(result.stdout), float(energy(*load_problem(problem)[:2]))
+    assert (report["dtype"], report["ms_per_iteration"]) == ("float32", None)
+    assert report["energy_initial"] == pytest.approx(expected, rel=1e-12)
+    assert report["energy_final"] == pytest.approx(expected, rel=1e-4)
+    assert report["energy_final"] != report["energy_initial"]
+    with np.load(solution) as arrays:
+        assert all(arrays[name].dtype == np.float64 for name in arrays.files)
 
 
 def test_solve_says_what_is_wrong(tmp_path: Path) -> None:

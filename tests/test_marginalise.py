@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import make_scene
-
-from vggtgeo.objective import energy
-from vggtgeo.linearise import edge_observations, linearise
-from vggtgeo.marginalisation import marginalise, no_prior, reorder
-from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.adjoint import solve_exactly
 from vggtgeo.solvers.arrow import ArrowVector, reduce
 from vggtgeo.solvers.kernels import Square
+
+from vggtgeo.linearise import edge_observations, linearise
+from vggtgeo.marginalisation import marginalise, no_prior, reorder
+from vggtgeo.objective import energy
+from vggtgeo.problem import Problem, State
 
 
 class _Made(NamedTuple):
@@ -62,9 +62,7 @@ def test_marginalise_then_solve_equals_solve_all(leaving: int) -> None:
 
     prior = marginalise(whole, made.initial, jnp.asarray(leaving))
     rest = _without(whole, source == leaving, leaving)
-    rest = eqx.tree_at(
-        lambda p: (p.marginal, p.fixed_pose), rest, (prior, whole.fixed_pose.at[leaving].set(True))
-    )
+    rest = eqx.tree_at(lambda p: (p.marginal, p.fixed_pose), rest, (prior, whole.fixed_pose.at[leaving].set(True)))
     step = _gauss_newton_step(rest, made.initial)
 
     remaining = np.repeat(np.arange(4) != leaving, 6)

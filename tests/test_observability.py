@@ -94,7 +94,8 @@ def test_what_each_kind_is_worth(observed: Observe) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_without_a_kind_is_the_problem_without_it(observed: Observe, kind: str) -> None:
-    # Proves the information of a selection. Oracle: the whole of a problem that never had the kind, and super-additivity.
+    # Proves the information of a selection, and that kinds never add up to more than the whole. Oracle: the whole of a
+    # problem that never had the kind.
     problem, truth = packed(WELL, at_truth=True)
     weight = {
         "points": lambda p: p.points.weight,

@@ -8,12 +8,12 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from vggtgeo.models.classical import NoDepth, SiftMatcher
 
 from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.errors import InputError
 from vggtgeo.evaluation import evaluate_trajectory
-from vggtgeo.models.classical import NoDepth, SiftMatcher
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
@@ -33,11 +33,7 @@ def room() -> tuple[list[Frame], Camera, object]:
 
 
 def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES, settings: SlamSettings = SETTINGS) -> Slam:
-    slam: Slam | None = None
-    for slam in run_frames(iter(frames), camera, roles, settings, Clock()):
-        pass
-    assert slam is not None
-    return slam
+    return list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1]
 
 
 @pytest.fixture(scope="module")

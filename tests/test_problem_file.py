@@ -10,8 +10,8 @@ import pytest
 from scenes import INTRINSICS, Scene, make_scene
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.objective import energy
 from vggtgeo.errors import InputError
+from vggtgeo.objective import energy
 from vggtgeo.problem_file import LAYOUT, load_problem, save_solution
 
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05, seed=7)

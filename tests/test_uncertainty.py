@@ -16,7 +16,6 @@ from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.kernels import Huber
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.objective import energy
 from vggtgeo.linearise import scale_direction
 from vggtgeo.objective import energy
 from vggtgeo.problem import Problem, State
@@ -42,7 +41,9 @@ def dense_information(problem: Problem, state: State) -> jax.Array:
         vector = ArrowVector(step[:CAMERA], step[CAMERA:].reshape(slots))
         return energy(problem, BundleAdjustment(problem).retract(state, vector))
 
-    return jax.hessian(moved)(jnp.zeros(CAMERA + state.inverse_depth.size))
+    zero = jnp.zeros(CAMERA + state.inverse_depth.size)
+    column = lambda tangent: jax.jvp(jax.grad(moved), (zero,), (tangent,))[1]
+    return jax.lax.map(column, jnp.eye(len(zero)))
 
 
 def dense_covariance(problem: Problem, state: State, held: np.ndarray | None = None) -> np.ndarray:
@@ -87,8 +88,8 @@ def test_a_free_scale_is_held(estimated: Estimate) -> None:
 
 
 def test_what_nothing_determines(estimated: Estimate) -> None:
-    # Proves that an unmatched keyframe has infinite variances and spoils no other. Oracle: the problem in which its pose
-    # is held.
+    # Proves that an unmatched keyframe has infinite variances and spoils no other. Oracle: the problem that holds its
+    # pose.
     problem, truth = packed(lacking.without_matches_of(2), at_truth=True, **OPTIONS)
     found = estimated(problem, truth)
     held = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[2].set(True))
@@ -162,7 +163,9 @@ def test_on_a_system_that_no_camera_made() -> None:
     expected[DENSE:][np.ravel(system.landmark_hessian == 0)] = np.inf
     found = jax.jit(covariance)(system)
     inside = free[free < DENSE]
-    np.testing.assert_allclose(np.asarray(found.dense)[np.ix_(inside, inside)], inverse[: len(inside), : len(inside)], rtol=1e-7)
+    np.testing.assert_allclose(
+        np.asarray(found.dense)[np.ix_(inside, inside)], inverse[: len(inside), : len(inside)], rtol=1e-7
+    )
     np.testing.assert_allclose(np.ravel(found.landmarks), expected[DENSE:], rtol=1e-7)
     assert int(found.rank) == len(free)
 

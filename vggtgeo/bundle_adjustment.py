@@ -7,6 +7,7 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from vggtgeo import lie
+from vggtgeo.gradient import energy_gradient
 from vggtgeo.linearise import EdgeObservations, edge_observations, fast_energy, free_coordinates, linearise
 from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
@@ -14,6 +15,8 @@ from vggtgeo.solvers.problem import AbstractArrowProblem
 
 MIN_SHRINK = 0.1
 """An inverse depth falls at most to this fraction in one step, so it stays positive."""
+MIN_INVERSE_DEPTH = 1e-6
+"""1/m: no step goes below it (1000 km), however often a depth wants to be negative; fractions alone underflow."""
 
 
 class BundleAdjustment(AbstractArrowProblem[State]):
@@ -32,15 +35,22 @@ class BundleAdjustment(AbstractArrowProblem[State]):
     def linearise(self, point: State) -> ArrowSystem:
         return linearise(self.problem, self.observations, point)
 
+    def gradient(self, point: State) -> ArrowVector:
+        return energy_gradient(self.problem, self.observations, point)
+
     def hessian(self, point: State) -> ArrowSystem:
         return linearise(self.problem, self.observations, point, exact=True)
 
     def retract(self, point: State, step: ArrowVector) -> State:
         """Poses move by `exp(xi) T`, intrinsics and inverse depths by addition."""
+        depth = point.inverse_depth
+        moved, least = depth + step.landmarks, jnp.minimum(depth, MIN_INVERSE_DEPTH)
+        least = jnp.maximum(MIN_SHRINK * depth, least)
         return State(
             poses=lie.move(point.poses, step.dense[:-4].reshape(-1, 6)),
             intrinsics=point.intrinsics + step.dense[-4:],
-            inverse_depth=jnp.maximum(point.inverse_depth + step.landmarks, MIN_SHRINK * point.inverse_depth),
+            # Not `maximum`, whose derivative is one half where a zero step meets the bound.
+            inverse_depth=jnp.where(moved < least, least, moved),
         )
 
     def hold(self, point: State, initial: State) -> State:

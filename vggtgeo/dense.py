@@ -17,6 +17,8 @@ from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam import rigid
 from vggtgeo.slam.keyframe import Keyframe
 
+_Weighted = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Points, colours, weights."""
 CELL = 24.0
 """Pixels a grid cell."""
 DEPTH_CELL = 0.08
@@ -86,7 +88,7 @@ def map_points(
     return _average_in_voxels(points, colours, weight, voxel)
 
 
-def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray):
+def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray) -> _Weighted:
     slots = keyframe.points
     known = np.isfinite(slots.inverse_depth) & (slots.inverse_depth > 0.02)
     points = rigid.unproject(slots.pixels[known], slots.inverse_depth[known], keyframe.pose, intrinsics)
@@ -94,8 +96,18 @@ def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray):
     return points, keyframe.image[rows, columns], slots.confidence[known]
 
 
-def _dense_points(keyframes, depths, i: int, neighbours, intrinsics, least_confidence: float, step: int = 3):
+def _dense_points(
+    keyframes: Sequence[Keyframe],
+    depths: Sequence[np.ndarray | None],
+    i: int,
+    neighbours: Sequence[int],
+    intrinsics: np.ndarray,
+    least_confidence: float,
+    step: int = 3,
+) -> _Weighted:
+    """Points, colours and weights of keyframe i; `depths[k]` is None where keyframe k has no metric depth."""
     keyframe, depth = keyframes[i], depths[i]
+    assert depth is not None
     rows, columns = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step].reshape(2, -1)
     confidence = keyframe.depth_confidence[rows, columns] / 255.0
     good = np.isfinite(depth[rows, columns]) & (confidence >= least_confidence)
@@ -104,9 +116,12 @@ def _dense_points(keyframes, depths, i: int, neighbours, intrinsics, least_confi
     points = rigid.unproject(pixels, 1.0 / depth[rows, columns].astype(np.float64), keyframe.pose, intrinsics)
     confirmed = np.zeros(len(points), bool)
     for j in neighbours:
-        confirmed |= _agrees(points, keyframes[j], depths[j], intrinsics)
+        other = depths[j]
+        if other is not None:
+            confirmed |= _agrees(points, keyframes[j], other, intrinsics)
     if neighbours:
-        points, rows, columns, confidence = points[confirmed], rows[confirmed], columns[confirmed], confidence[confirmed]
+        points, confidence = points[confirmed], confidence[confirmed]
+        rows, columns = rows[confirmed], columns[confirmed]
     # Near measurements are better: the noise of a depth sensor grows with the square of the distance.
     z = depth[rows, columns]
     return points, keyframe.image[rows, columns], confidence / np.maximum(z, 0.3) ** 2

@@ -2,7 +2,8 @@
 
 Frames: common motions of all free keyframes are given in the axes of the anchor, the first held camera (camera 0
 without one), and rotations turn about its centre; motions of one keyframe are in its own camera axes (x right, y down,
-z forward), rotations about its own centre. Pitch turns about x, yaw about y, roll about z.
+z forward), rotations about its own centre. Pitch turns about x, yaw about y, roll about z. All are left tangents: they
+move the world before the camera, so the camera itself goes the other way.
 """
 
 from __future__ import annotations

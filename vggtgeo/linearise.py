@@ -67,14 +67,14 @@ class _Hosts(NamedTuple):
 
 def fast_energy(problem: Problem, observations: EdgeObservations, state: State) -> Float[Array, ""]:
     """The energy of `objective.energy`, by one pass over the edges."""
-    hosts = _hosts(problem, state)
+    hosts = rays_of(problem, state)
     relative = relative_poses(problem, state)
 
     def body(total: Array, edge: Any) -> tuple[Array, None]:
         host, rotation, translation, seen = edge
-        point, line = _project(problem, hosts, host, rotation, translation)
-        squared, _, _ = _point_residual(state.intrinsics, point, seen)
-        distance = _line_residual(state.intrinsics, line, seen)
+        point, line = project_host(problem, hosts, host, rotation, translation)
+        squared, _, _ = point_residual(state.intrinsics, point, seen)
+        distance = line_residual(state.intrinsics, line, seen)
         rho = problem.kernel.rho
         terms = jnp.sum(rho(seen.point_weight * squared)) + jnp.sum(rho(seen.line_weight * distance**2))
         return total + terms, None
@@ -93,7 +93,7 @@ def linearise(problem: Problem, observations: EdgeObservations, state: State, ex
     intrinsics and inverse depths).
     """
     ranks = problem.edges.of_host.shape[1]
-    hosts = _hosts(problem, state)
+    hosts = rays_of(problem, state)
     relative = relative_poses(problem, state)
     wide = 6 * ranks
 
@@ -119,15 +119,15 @@ def linearise(problem: Problem, observations: EdgeObservations, state: State, ex
         *(relative.rotation().as_matrix(), relative.translation(), observations),
     )
     cross, gram = jax.lax.scan(body, _depth_terms(problem, state, wide, exact), edges)
-    prior_hessian, prior_gradient = _dense_priors(problem, state, exact)
+    of_priors = _dense_priors(problem, state, exact)
     return ArrowSystem(
         graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
         transport=lie.adjoint(relative),
         gram=gram[:, :-1, :-1],
         cross=cross,
         twist=twist(gram[:, :6, 10]) if exact else jnp.zeros_like(gram, shape=(len(gram), 6, 6)),
-        prior_hessian=prior_hessian,
-        prior_gradient=prior_gradient,
+        prior_hessian=of_priors[0],
+        prior_gradient=of_priors[1],
         free=free_coordinates(problem),
         gauge=scale_direction(problem, state),
     )
@@ -161,13 +161,14 @@ def _no_edges(problem: Problem) -> tuple[Edges, PointObservations, LineObservati
     return edges, jax.tree.map(empty, problem.points), jax.tree.map(empty, problem.lines)
 
 
-def _hosts(problem: Problem, state: State) -> _Hosts:
+def rays_of(problem: Problem, state: State) -> _Hosts:
+    """Viewing rays and inverse depths of all slots."""
     fx, fy, cx, cy = state.intrinsics
     pixels = problem.pixels
     return _Hosts((pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy, state.inverse_depth)
 
 
-def _project(
+def project_host(
     problem: Problem, hosts: _Hosts, host: Array, rotation: Array, translation: Array
 ) -> tuple[Projection, Projection]:
     """Project the point slots and the line slots of one host into one target camera."""
@@ -188,7 +189,7 @@ def _project_slots(ray_x: Array, ray_y: Array, depth: Array, rotation: Array, tr
     return Projection(ray_x, ray_y, depth, point, inverse_z, rows[0] * inverse_z, rows[1] * inverse_z, in_front)
 
 
-def _point_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservations) -> tuple[Array, Array, Array]:
+def point_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservations) -> tuple[Array, Array, Array]:
     """Squared norm, and both entries."""
     fx, fy, cx, cy = intrinsics
     horizontal = fx * seen_from.x + cx - seen.point_u
@@ -196,7 +197,8 @@ def _point_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservat
     return horizontal * horizontal + vertical * vertical, horizontal, vertical
 
 
-def _line_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservations) -> Array:
+def line_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservations) -> Array:
+    """Distance of each projected sample to its line, pixels."""
     fx, fy, cx, cy = intrinsics
     return seen.line_a * (fx * seen_from.x + cx) + seen.line_b * (fy * seen_from.y + cy) + seen.line_c
 
@@ -210,15 +212,15 @@ def _edge_columns(
 ) -> Float[Array, "12 rows"]:
     """Weighted derivatives of one edge: 6 relative pose, 4 intrinsics, residual, inverse depth; rows u, v, lines."""
     intrinsics, rotation, translation = camera
-    point, line = _project(problem, hosts, host, rotation, translation)
-    squared, horizontal, vertical = _point_residual(intrinsics, point, seen)
+    point, line = project_host(problem, hosts, host, rotation, translation)
+    squared, horizontal, vertical = point_residual(intrinsics, point, seen)
     root = _root_weight(problem.kernel, seen.point_weight, squared)
-    distance = _line_residual(intrinsics, line, seen)
+    distance = line_residual(intrinsics, line, seen)
     line_root = _root_weight(problem.kernel, seen.line_weight, distance * distance)
     parts = [
-        _row(camera, point, root, None, root * horizontal),
-        _row(camera, point, None, root, root * vertical),
-        _row(camera, line, line_root * seen.line_a, line_root * seen.line_b, line_root * distance),
+        derivative_row(camera, point, root, None, root * horizontal),
+        derivative_row(camera, point, None, root, root * vertical),
+        derivative_row(camera, line, line_root * seen.line_a, line_root * seen.line_b, line_root * distance),
     ]
     return jnp.concatenate([jnp.stack(part) for part in parts], 1)
 
@@ -228,9 +230,9 @@ def _edge_second_order(
 ) -> tuple[Float[Array, "10 10"], Float[Array, "11 s"]]:
     """What the exact Hessian adds for one edge: Gram matrix `[10, 10]`, cross terms `[11, s]`."""
     intrinsics, rotation, translation = camera
-    point, line = _project(problem, hosts, host, rotation, translation)
-    squared, horizontal, vertical = _point_residual(intrinsics, point, seen)
-    distance = _line_residual(intrinsics, line, seen)
+    point, line = project_host(problem, hosts, host, rotation, translation)
+    squared, horizontal, vertical = point_residual(intrinsics, point, seen)
+    distance = line_residual(intrinsics, line, seen)
     point_pull, point_bend = _pull_and_bend(problem.kernel, seen.point_weight, squared)
     line_pull, line_bend = _pull_and_bend(problem.kernel, seen.line_weight, distance * distance)
     forces = (
@@ -239,7 +241,7 @@ def _edge_second_order(
     )
     parts = []
     for at, force, bend in forces:
-        derivative = _row(camera, at, *force, jnp.zeros_like(at.inverse_z))
+        derivative = derivative_row(camera, at, *force, jnp.zeros_like(at.inverse_z))
         geometry = [_row_of_point(camera, at, axis) for axis in range(3)]
         whole, first, second, third = (jnp.stack([*row[:10], row[-1]]) for row in (derivative, *geometry))
         rows = (whole, third * at.inverse_z * at.in_front, first, second)
@@ -257,7 +259,7 @@ def _pull_and_bend(kernel: AbstractKernel, weight: Array, squared: Array) -> tup
 
 
 def _row_of_point(camera: Camera, at: Projection, axis: int) -> list[Array]:
-    """The derivatives of one entry of the scaled point `Y`, in the order of `_row`."""
+    """The derivatives of one entry of the scaled point `Y`, in the order of `derivative_row`."""
     (fx, fy, _, _), rotation, translation = camera
     y, zero, ones = at.point, jnp.zeros_like(at.depth), jnp.ones_like(at.depth)
     translations = [at.depth if i == axis else zero for i in range(3)]
@@ -267,7 +269,7 @@ def _row_of_point(camera: Camera, at: Projection, axis: int) -> list[Array]:
     return [*translations, *turns, *intrinsics, zero, translation[axis] * ones]
 
 
-def _row(camera: Camera, at: Projection, a: Array | None, b: Array | None, residual: Array) -> list[Array]:
+def derivative_row(camera: Camera, at: Projection, a: Array | None, b: Array | None, residual: Array) -> list[Array]:
     """The twelve columns of one residual row with image gradient `(a, b)`; None is zero."""
     (fx, fy, _, _), rotation, translation = camera
     zero = jnp.zeros_like(residual)
@@ -310,6 +312,14 @@ def _times_depth_column(columns: Float[Array, "12 rows"], points: int) -> Float[
 
 def _depth_terms(problem: Problem, state: State, wide: int, exact: bool) -> Float[Array, "n r s"]:
     """Cross terms before any edge: the depth priors' gradient and curvature in the last two rows."""
+    gradient, curvature = depth_derivatives(problem, state, exact)
+    keyframes, slots = state.inverse_depth.shape
+    cross = jnp.zeros((keyframes, wide + SHARED + 2, slots), state.inverse_depth.dtype)
+    return cross.at[:, -2].set(gradient).at[:, -1].set(curvature)
+
+
+def depth_derivatives(problem: Problem, state: State, exact: bool) -> tuple[Float[Array, "n s"], Float[Array, "n s"]]:
+    """First and second (reweighted, or exact) derivatives of the depth priors by inverse depth."""
     prior = problem.depth
     known = prior.weight > 0
     scale = jnp.where(known, prior.sigma, 1.0)
@@ -320,9 +330,7 @@ def _depth_terms(problem: Problem, state: State, wide: int, exact: bool) -> Floa
     gradient = curvature * residual
     if exact:
         curvature = curvature + 2 * weight * squared * problem.kernel.curvature(squared)
-    keyframes, slots = state.inverse_depth.shape
-    cross = jnp.zeros((keyframes, wide + SHARED + 2, slots), state.inverse_depth.dtype)
-    return cross.at[:, -2].set(gradient / scale).at[:, -1].set(curvature / scale**2)
+    return gradient / scale, curvature / scale**2
 
 
 def _dense_priors(problem: Problem, state: State, exact: bool) -> tuple[Float[Array, "p p"], Float[Array, " c"]]:
@@ -330,19 +338,24 @@ def _dense_priors(problem: Problem, state: State, exact: bool) -> tuple[Float[Ar
 
     Without the latter only the shared coordinates have a Hessian, and no matrix over all poses is made.
     """
-    prior = problem.intrinsics_prior
-    shared = slice(-SHARED, None)
-    size, dtype = problem.num_camera, state.inverse_depth.dtype
-    hessian = jnp.diag(prior.information)
-    gradient = jnp.zeros(size, dtype).at[shared].set(prior.information * (state.intrinsics - prior.mean))
+    hessian, gradient = jnp.diag(problem.intrinsics_prior.information), prior_gradient(problem, state)
     if problem.marginal is None:
         return hessian, gradient
-    hessian = jnp.pad(hessian, (size - SHARED, 0))
+    hessian = jnp.pad(hessian, (problem.num_camera - SHARED, 0))
     jacobian = marginal_jacobian(problem.marginal, state)
-    gradient = gradient + jacobian.T @ marginal_residual(problem.marginal, state)
     if exact:
         return hessian + _marginal_hessian(problem.marginal, state), gradient
     return hessian + jacobian.T @ jacobian, gradient
+
+
+def prior_gradient(problem: Problem, state: State) -> Float[Array, " c"]:
+    """Gradient of the priors on intrinsics and of the marginalisation prior."""
+    prior = problem.intrinsics_prior
+    gradient = jnp.zeros(problem.num_camera, state.inverse_depth.dtype)
+    gradient = gradient.at[-SHARED:].set(prior.information * (state.intrinsics - prior.mean))
+    if problem.marginal is None:
+        return gradient
+    return gradient + marginal_jacobian(problem.marginal, state).T @ marginal_residual(problem.marginal, state)
 
 
 def _marginal_hessian(prior: MarginalPrior, state: State) -> Float[Array, "c c"]:

@@ -18,11 +18,13 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.linearise import SHARED, edge_observations, linearise
 from vggtgeo.problem import MarginalPrior, Problem, State
 from vggtgeo.solvers.arrow import reduce
+
+_Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
 def no_prior(keyframes: int, dtype: np.dtype | type = np.float64) -> MarginalPrior:
@@ -84,7 +86,7 @@ def _linearisation_point(prior: MarginalPrior, state: State) -> State:
     )
 
 
-def _quadratic(problem: Problem, point: State, leaving):
+def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""]) -> _Quadratic:
     """Hessian and gradient of the leaving factors over the dense coordinates, landmarks eliminated."""
     hosted = problem.edges.source == leaving
     own = jnp.arange(problem.num_keyframes) == leaving
@@ -102,7 +104,9 @@ def _quadratic(problem: Problem, point: State, leaving):
     return reduced.hessian - reduced.schur, reduced.gradient - reduced.schur_gradient
 
 
-def _eliminate(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows, held):
+def _eliminate(
+    quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows: Bool[Array, " c"], held: Bool[Array, " c"]
+) -> _Quadratic:
     """Condition on held coordinates, then take the leaving rows out by a Schur complement (pseudo-inverse)."""
     free = ~held
     quadratic = jnp.where(free[:, None] & free[None, :], quadratic, 0.0)
@@ -116,7 +120,7 @@ def _eliminate(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], row
     return (remaining + remaining.T) / 2, gradient
 
 
-def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]):
+def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) -> _Quadratic:
     """`R, r0` with `R' R = H` and `R' r0 = g` on the part of the space where `H` is positive."""
     # Metres, radians and pixels differ by orders of magnitude: balance before cutting off what is rounding error.
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(quadratic), 0.0))

@@ -140,7 +140,10 @@ def undetermined_below(size: int, dtype: np.dtype) -> float:
 
 
 def _spectrum(
-    information: Float[Array, "c c"], free: Bool[Array, " c"], scale: Float[Array, " c"], directions: Float[Array, "m c"]
+    information: Float[Array, "c c"],
+    free: Bool[Array, " c"],
+    scale: Float[Array, " c"],
+    directions: Float[Array, "m c"],
 ) -> Spectra:
     both = free[:, None] & free[None, :]
     balanced = jnp.where(both, (information + information.T) / 2, 0.0) / scale[:, None] / scale[None, :]

@@ -115,8 +115,9 @@ def pack(
         dtype: float type of all arrays.
 
     Raises:
-        InputError: an array of a wrong shape, an index out of range, a match given twice, a landmark with both points and lines, a non-positive inverse depth, an
-            observation between keyframes that its landmark is not hosted in, or a size that is too small.
+        InputError: an array of a wrong shape, an index out of range, a match given twice, a landmark with both points
+            and lines, an observation between keyframes that its landmark is not hosted in, an inverse depth, focal
+            length or standard deviation that is not positive, or a size that is too small.
 
     """
     count = len(observations.host)

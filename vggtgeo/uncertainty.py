@@ -14,8 +14,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtgeo.objective import energy
 from vggtgeo.linearise import SHARED, edge_observations, linearise
+from vggtgeo.objective import energy
 from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from vggtgeo.objective import energy
 from vggtgeo.errors import InputError
+from vggtgeo.objective import energy
 from vggtgeo.problem import Problem, State
 from vggtgeo.problem_file import load_problem, save_solution
 from vggtgeo.solution import Solution, solve

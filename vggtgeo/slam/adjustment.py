@@ -139,7 +139,9 @@ class _Selection:
         return cls(host, np.concatenate([*chosen, np.zeros(0, int)]).astype(int), tuple(tables))
 
     @classmethod
-    def points(cls, keyframes, edges, local, settings: SlamSettings) -> _Selection:
+    def points(
+        cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], local: dict[int, int], settings: SlamSettings
+    ) -> _Selection:
         counts = [np.zeros(len(keyframe.features)) for keyframe in keyframes]
         for edge in edges:
             counts[local[edge.host]][edge.slots] += 1 + 0.1 * edge.confidence
@@ -150,7 +152,9 @@ class _Selection:
         return cls.of(chosen, [len(c) for c in counts])
 
     @classmethod
-    def lines(cls, keyframes, edges, local, settings: SlamSettings) -> _Selection:
+    def lines(
+        cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], local: dict[int, int], settings: SlamSettings
+    ) -> _Selection:
         counts = [np.zeros(len(keyframe.lines)) for keyframe in keyframes]
         for edge in edges:
             counts[local[edge.host]][edge.line_slots] += 1 + 0.1 * edge.line_confidence
@@ -165,8 +169,15 @@ class _Selection:
         return cls.of(chosen, [len(keyframe.sample_segment) for keyframe in keyframes])
 
 
-def _point_rows(keyframes, edges, local, points: _Selection, settings: SlamSettings) -> dict[str, np.ndarray]:
-    edge_ids, landmarks, targets, weights = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros(0)]
+def _point_rows(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    points: _Selection,
+    settings: SlamSettings,
+) -> dict[str, np.ndarray]:
+    edge_ids, landmarks = [np.zeros(0, int)], [np.zeros(0, int)]
+    targets, weights = [np.zeros((0, 2))], [np.zeros(0)]
     for number, edge in enumerate(edges):
         host = local[edge.host]
         landmark = points.table[host][edge.slots]
@@ -177,15 +188,22 @@ def _point_rows(keyframes, edges, local, points: _Selection, settings: SlamSetti
         targets.append(edge.pixels[chosen])
         omega = keyframes[host].points.confidence[edge.slots[chosen]]
         weights.append(_weight(edge.confidence[chosen] * omega, settings))
-    return dict(
-        point_edge=np.concatenate(edge_ids),
-        point_landmark=np.concatenate(landmarks),
-        point_target=np.concatenate(targets),
-        point_weight=np.concatenate(weights),
-    )
+    return {
+        "point_edge": np.concatenate(edge_ids),
+        "point_landmark": np.concatenate(landmarks),
+        "point_target": np.concatenate(targets),
+        "point_weight": np.concatenate(weights),
+    }
 
 
-def _line_rows(keyframes, edges, local, lines: _Selection, settings: SlamSettings, offset: int):
+def _line_rows(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    lines: _Selection,
+    settings: SlamSettings,
+    offset: int,
+) -> dict[str, np.ndarray]:
     edge_ids, landmarks, coefficients, weights = (
         [np.zeros(0, int)],
         [np.zeros(0, int)],
@@ -206,12 +224,12 @@ def _line_rows(keyframes, edges, local, lines: _Selection, settings: SlamSetting
         coefficients.append(of_line[edge.line_targets[of_sample[chosen]]])
         omega = keyframes[host].samples.confidence[chosen]
         weights.append(_weight(edge.line_confidence[of_sample[chosen]] * omega, settings) * settings.line_weight)
-    return dict(
-        line_edge=np.concatenate(edge_ids),
-        line_landmark=np.concatenate(landmarks),
-        line_coefficients=np.concatenate(coefficients),
-        line_weight=np.concatenate(weights),
-    )
+    return {
+        "line_edge": np.concatenate(edge_ids),
+        "line_landmark": np.concatenate(landmarks),
+        "line_coefficients": np.concatenate(coefficients),
+        "line_weight": np.concatenate(weights),
+    }
 
 
 def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:
@@ -220,7 +238,13 @@ def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:
     return settings.confidence_gain * confidence + settings.confidence_floor
 
 
-def _initial_depths(keyframes, edges, local, points: _Selection, intrinsics) -> tuple[np.ndarray, np.ndarray]:
+def _initial_depths(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    points: _Selection,
+    intrinsics: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth of each point landmark: its estimate, else triangulated; and whether views determine it."""
     current = np.array([keyframes[h].points.inverse_depth[s] for h, s in zip(points.host, points.slot, strict=True)])
     weighted, information = np.zeros(len(current)), np.zeros(len(current))

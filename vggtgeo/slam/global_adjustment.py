@@ -1,5 +1,6 @@
 """The last look at the whole map: edges between keyframes that saw the same place at different times, and one
-adjustment of all keyframes."""
+adjustment of all keyframes.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
 from vggtgeo.marginalisation import no_prior
+from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
 from vggtgeo.packing import PaddedSize
 from vggtgeo.problem import MarginalPrior
 from vggtgeo.slam import rigid
@@ -41,9 +42,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
     edges = _thin(edges, len(slam.keyframes), settings)
     ranks = max(np.bincount([edge.host for edge in edges]))
-    size = PaddedSize(
-        len(slam.keyframes), settings.point_slots, settings.line_slots, int(ranks), len(edges)
-    )
+    size = PaddedSize(len(slam.keyframes), settings.point_slots, settings.line_slots, int(ranks), len(edges))
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
     solver = SchurLevenbergMarquardt(max_iterations=settings.global_iterations, rtol=1e-5)

@@ -61,9 +61,7 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
     )
 
 
-def _follow(
-    slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock
-) -> Slam:
+def _follow(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
     predicted = slam.velocity @ slam.last_pose
     recent = [slam.keyframes[number] for number in reversed(slam.window[-3:])]
     with clock.measure("track"):
@@ -105,9 +103,7 @@ def _missed(slam: Slam, frame: Frame, features: Features, found: Track, roles: R
 
 def _record(slam: Slam, frame: Frame, pose: np.ndarray, found: Track) -> Slam:
     relative = pose @ rigid.invert(found.keyframe.pose)
-    record = FramePose(
-        frame.index, frame.timestamp, found.keyframe.number, relative, True, found.guess.inlier_count
-    )
+    record = FramePose(frame.index, frame.timestamp, found.keyframe.number, relative, True, found.guess.inlier_count)
     return replace(slam, frames=(*slam.frames, record))
 
 

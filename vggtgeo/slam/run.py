@@ -91,9 +91,7 @@ def keyframe_trajectory(slam: Slam) -> Trajectory:
     return Trajectory(np.array([keyframe.timestamp for keyframe in slam.keyframes]), poses)
 
 
-def _described(
-    frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock
-) -> Iterator[tuple[Frame, Features]]:
+def _described(frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock) -> Iterator[tuple[Frame, Features]]:
     """Undistorted frames with their key points, prepared in a thread of their own while earlier ones are tracked."""
     undistorter = camera.undistorter()
 
@@ -112,9 +110,7 @@ def _described(
 
     source = iter(frames)
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames") as pool:
-        queue: deque[Future[tuple[Frame, Features] | None]] = deque(
-            pool.submit(read_and_prepare) for _ in range(AHEAD)
-        )
+        queue: deque[Future[tuple[Frame, Features] | None]] = deque(pool.submit(read_and_prepare) for _ in range(AHEAD))
         try:
             while (ready := queue.popleft().result()) is not None:
                 queue.append(pool.submit(read_and_prepare))

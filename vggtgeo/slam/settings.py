@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import jax.numpy as jnp
+
 from vggtgeo.errors import InputError
 from vggtgeo.models.classical import (
     BandLineMatcher,
@@ -15,8 +17,8 @@ from vggtgeo.models.classical import (
     SiftMatcher,
     StructureTensor,
 )
-from vggtgeo.solvers.kernels import AbstractKernel, Cauchy, Huber, GemanMcClure
 from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector, LineMatcher, MetricDepth, PointMatcher
+from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class SlamSettings:
     """The same for the epipolar distance, where depth is not known, pixels."""
     least_overlap: float = 0.25
     """Share of a keyframe's points that must fall into another's image before the two are matched at all."""
-    kernel: AbstractKernel = field(default_factory=lambda: Cauchy(2.0))
+    kernel: AbstractKernel = field(default_factory=lambda: Cauchy(jnp.asarray(2.0)))
     point_slots: int = 320
     line_slots: int = 192
     line_spacing: float = 10.0

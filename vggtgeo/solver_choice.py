@@ -1,0 +1,45 @@
+"""Which linear solver suits a problem: decided outside `jit`, by its size and its graph."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vggtgeo.problem import Problem
+from vggtgeo.solvers.band_cholesky import BandCholesky
+from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
+from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+
+DENSE_LIMIT = 40
+"""Keyframes up to which a dense factor costs no more than the linearisation before it."""
+BAND_LIMIT = 12
+"""Longest reach of a band: a group of `2 * 12` keyframes has 144 coordinates."""
+SHORT_SHARE = 0.5
+"""Least share of edges that a band must hold to be worth factorising."""
+
+
+def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
+    """A linear solver for `SchurLevenbergMarquardt(reduced_solver=...)`.
+
+    Small problems and those with a marginalisation prior: dense Cholesky. Sequences, whose edges join keyframes near in
+    their order: block-banded Cholesky, linear in the number of keyframes. Sequences with closed loops: conjugate
+    gradients with the band as their preconditioner. Any other graph: conjugate gradients with one block a keyframe.
+
+    Args:
+        problem: concrete arrays (not traced); the choice holds for every problem with the same graph.
+    """
+    if problem.num_keyframes <= DENSE_LIMIT or problem.marginal is not None:
+        return DenseCholesky()
+    lengths = edge_lengths(problem)
+    reach = int(lengths.max(initial=1))
+    if reach <= BAND_LIMIT:
+        return BandCholesky(reach)
+    short = lengths[lengths <= BAND_LIMIT]
+    if len(short) < SHORT_SHARE * len(lengths):
+        return ConjugateGradients(BlockJacobi())
+    return ConjugateGradients(BandPreconditioner(int(short.max(initial=1))))
+
+
+def edge_lengths(problem: Problem) -> np.ndarray:
+    """`|i - j|` of every edge that observes anything, `int[e']`."""
+    seen = np.any(np.asarray(problem.points.weight) > 0, 1) | np.any(np.asarray(problem.lines.weight) > 0, 1)
+    return np.abs(np.asarray(problem.edges.source) - np.asarray(problem.edges.target))[seen]
