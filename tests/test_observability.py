@@ -11,6 +11,7 @@ from degenerate_scenes import (
     HELD,
     KEYFRAMES,
     POINTS,
+    QUICK,
     WELL,
     one_plane,
     packed,
@@ -36,7 +37,7 @@ NO_PRIOR = {"intrinsics_sigma": None}
 @pytest.fixture(scope="module")
 def observed() -> Observe:
     """`observability`, compiled once for all tests of this file."""
-    return jax.jit(observability)
+    return jax.jit(observability, compiler_options=QUICK)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Covariances: against dense inverses of the energy's own Hessian, and against the errors of 200 solved problems."""
 
+import functools
 from collections.abc import Callable
 
 import degenerate_scenes as lacking
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import monte_carlo
 import numpy as np
 import pytest
-from degenerate_scenes import WELL, packed
+from degenerate_scenes import QUICK, WELL, packed
 from test_arrow import DENSE, assemble, free_part, random_system
 from vggtgeo.solvers.arrow import ArrowVector
 from vggtgeo.solvers.covariance import covariance
@@ -29,10 +30,10 @@ Estimate = Callable[[Problem, State], Covariances]
 @pytest.fixture(scope="module")
 def estimated() -> Estimate:
     """`covariances`, compiled once for all tests of this file."""
-    return jax.jit(covariances)
+    return jax.jit(covariances, compiler_options=QUICK)
 
 
-@jax.jit
+@functools.partial(jax.jit, compiler_options=QUICK)
 def dense_information(problem: Problem, state: State) -> jax.Array:
     """Exact Hessian of the readable energy by all unknowns; at zero residuals the Gauss-Newton matrix is the same."""
     slots = state.inverse_depth.shape
@@ -142,6 +143,7 @@ def test_scaled_by_the_variance_factor(estimated: Estimate) -> None:
     )
 
 
+@pytest.mark.slow
 def test_float32_stays_float32(estimated: Estimate) -> None:
     # Proves that single precision costs digits only. Oracle: the float64 result.
     exact, single = (estimated(*packed(WELL, at_truth=True, dtype=dtype)) for dtype in (np.float64, np.float32))

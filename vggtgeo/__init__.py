@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from vggtgeo.marginalisation import no_prior as no_prior
     from vggtgeo.objective import energy as energy
     from vggtgeo.objective import energy_terms as energy_terms
+    from vggtgeo.observability import Observability as Observability
+    from vggtgeo.observability import observability as observability
     from vggtgeo.packing import Observations as Observations
     from vggtgeo.packing import PaddedSize as PaddedSize
     from vggtgeo.packing import pack as pack
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
     from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
     from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt as SchurLevenbergMarquardt
     from vggtgeo.trajectory import Trajectory as Trajectory
+    from vggtgeo.uncertainty import Covariances as Covariances
+    from vggtgeo.uncertainty import covariances as covariances
 
 _HOME = {
     "camera": ("Camera",),
@@ -46,6 +50,7 @@ _HOME = {
     "errors": ("InputError",),
     "evaluation": ("evaluate_trajectory",),
     "marginalisation": ("marginalise", "no_prior"),
+    "observability": ("Observability", "observability"),
     "packing": ("Observations", "PaddedSize", "pack"),
     "problem": ("Problem", "State"),
     "problem_file": ("load_problem",),
@@ -56,6 +61,7 @@ _HOME = {
     "solvers.adjoint": ("ArrowAdjoint",),
     "solvers.levenberg_marquardt": ("SchurLevenbergMarquardt",),
     "trajectory": ("Trajectory",),
+    "uncertainty": ("Covariances", "covariances"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 

@@ -204,7 +204,9 @@ def line_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservatio
 
 
 def _root_weight(kernel: AbstractKernel, weight: Array, squared: Array) -> Array:
-    return jnp.sqrt(weight * kernel.weight(weight * squared))
+    present = weight > 0  # the root has no derivative at zero: an absent observation would make it NaN
+    root = jnp.sqrt(jnp.where(present, weight * kernel.weight(weight * squared), 1.0))
+    return jnp.where(present, root, 0.0)
 
 
 def _edge_columns(

@@ -35,7 +35,7 @@ class Covariances(eqx.Module):
     """Variances, 1/m^2; infinite for slots that hold nothing."""
     variance_factor: Float[Array, ""]
     """Estimated variance of a residual of weight 1: `2 energy / (rows - unknowns)`, 1 without redundancy. About 1 if
-    the weights are right; 7 % low under Huber with delta 1.5, which caps the large residuals."""
+    the weights are right; 4 to 7 % low under Huber with delta 1.5, which caps large residuals."""
 
     def scaled(self) -> Covariances:
         """The covariances if only the ratios of the weights are trusted: times the variance factor."""

@@ -23,6 +23,7 @@ from vggtgeo.slam.run import finish
 from vggtgeo.slam.run import run as run_slam
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.window import warm_up
 from vggtgeo.trajectory import Trajectory
 
 Init = Literal["pnp", "constant-velocity"]
@@ -102,12 +103,15 @@ def run_and_write(
     """Run a sequence with a progress bar, write every output into `folder`, and print the report."""
     console = Console(stderr=False, quiet=quiet)
     clock, began = Clock(), time.perf_counter()
+    with clock.measure("compile"):
+        warm_up(settings)
+    started = time.perf_counter()
     estimated, truth = _set_apart(sequence)
     folder.mkdir(parents=True, exist_ok=True)
     slam, interrupted = _fold(estimated, roles, settings, selection, clock, console)
     if slam is None or not slam.frames:
         raise InputError(f"`{sequence.name}` gave no frame that could be used; nothing was written")
-    frames_per_second = len(slam.frames) / (time.perf_counter() - began)
+    frames_per_second = len(slam.frames) / (time.perf_counter() - started)
     outputs.write_trajectories(folder, slam)
     if not interrupted:
         slam = finish(slam, roles, settings, clock)

@@ -1,4 +1,5 @@
-"""Dense depth between keyframes: projective point-to-plane alignment (Chen & Medioni 1991; Newcombe et al. 2011) as a quadratic on relative poses, so that surfaces without texture speak in the adjustment too.
+"""Dense depth between keyframes: projective point-to-plane alignment as a quadratic on relative poses, so that surfaces
+without texture speak in the adjustment too (Chen & Medioni 1991; Newcombe et al., KinectFusion, 2011).
 
 At the current poses every pair (i, j) gives residuals `n . (T_ji p - q)` in standard deviations of the sensor, where
 `q, n` is the surface of j at the pixel that `p` of i falls on. Their normal equations `H, g` over the left tangent

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import resource
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,7 @@ def write_summary(
         "keyframes": len(slam.keyframes),
         "pairs": len(slam.pairs),
         "origins": len(slam.origins),
+        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
         "scale": "metric" if slam.metric else "free (no metric depth): lengths have no unit",
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
         "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},

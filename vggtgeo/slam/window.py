@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.marginalisation import marginalise_jit, no_prior, reorder
-from vggtgeo.packing import PaddedSize
+from vggtgeo.packing import Observations, PaddedSize, pack
 from vggtgeo.problem import MarginalPrior
+from vggtgeo.slam import rigid
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.keyframe import Keyframe
@@ -25,6 +26,31 @@ solve_jit = eqx.filter_jit(solve)
 def window_size(settings: SlamSettings) -> PaddedSize:
     """The one padded shape that all windows of a run share."""
     return PaddedSize(settings.window, settings.point_slots, settings.line_slots, settings.window - 1)
+
+
+def warm_up(settings: SlamSettings) -> None:
+    """Compile what every window needs, on a problem of the right shape that holds one observation."""
+    one = Observations(
+        edges=np.array([[0, 1]]),
+        host=np.zeros(1, int),
+        pixel=np.zeros((1, 2)),
+        point_edge=np.zeros(1, int),
+        point_landmark=np.zeros(1, int),
+        point_target=np.zeros((1, 2)),
+        point_weight=np.ones(1),
+    )
+    poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
+    intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
+    options = {"size": window_size(settings), "kernel": settings.kernel}
+    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), **options)
+    problem = replace(problem, marginal=no_prior(settings.window))
+    solution = solve_jit(problem, initial, solver=window_solver(settings))
+    marginalise_jit(problem, solution.state, jnp.asarray(0)).root.block_until_ready()
+
+
+def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
+    """The solver of every window: a tracker's start is near, and the next window goes on from here."""
+    return SchurLevenbergMarquardt(max_iterations=settings.window_iterations, rtol=1e-5)
 
 
 def make_room(slam: Slam, settings: SlamSettings) -> Slam:
@@ -58,8 +84,7 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
     members = [slam.keyframes[number] for number in slam.window]
     adjustment = window_problem(slam, members, settings)
-    solver = SchurLevenbergMarquardt(max_iterations=settings.window_iterations, rtol=1e-5)
-    solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
+    solution = solve_jit(adjustment.problem, adjustment.initial, solver=window_solver(settings))
     if not np.isfinite(float(solution.energy)):
         return replace(slam, notes=(*slam.notes, f"window at keyframe {members[-1].number}: {solution.message}"))
     updated, intrinsics = write_back(members, adjustment, solution.state)
@@ -105,8 +130,6 @@ def scale_anchor(slam: Slam, settings: SlamSettings) -> MarginalPrior:
 
 
 def _with_row(prior: MarginalPrior, row: np.ndarray, poses: np.ndarray) -> MarginalPrior:
-    from vggtgeo.slam import rigid
-
     points = np.asarray(prior.poses.wxyz_xyz).copy()
     points[: len(poses)] = rigid.to_quaternion(poses)
     return eqx.tree_at(
