@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from vggtgeo.marginalisation import no_prior as no_prior
     from vggtgeo.objective import energy as energy
     from vggtgeo.objective import energy_terms as energy_terms
-    from vggtgeo.observability import Observability as Observability
-    from vggtgeo.observability import observability as observability
+    from vggtgeo.degeneracy import Observability as Observability
+    from vggtgeo.degeneracy import observability as observability
     from vggtgeo.packing import Observations as Observations
     from vggtgeo.packing import PaddedSize as PaddedSize
     from vggtgeo.packing import pack as pack
@@ -50,7 +50,7 @@ _HOME = {
     "errors": ("InputError",),
     "evaluation": ("evaluate_trajectory",),
     "marginalisation": ("marginalise", "no_prior"),
-    "observability": ("Observability", "observability"),
+    "degeneracy": ("Observability", "observability"),
     "packing": ("Observations", "PaddedSize", "pack"),
     "problem": ("Problem", "State"),
     "problem_file": ("load_problem",),

@@ -66,7 +66,7 @@ class Observability(eqx.Module):
 
     def report(self) -> str:
         """The findings in words (outside `jit`, for one problem)."""
-        from vggtgeo.observability_report import report
+        from vggtgeo.degeneracy_report import report
 
         return report(self)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.directions import direction_names
-from vggtgeo.observability import KINDS, WEAK, Observability, undetermined_below
+from vggtgeo.degeneracy import KINDS, WEAK, Observability, undetermined_below
 
 ALIGNED = 0.9
 """Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""

@@ -1,0 +1,225 @@
+"""Every way to solve the reduced system gives the same step and ends at the same energy as dense Cholesky."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import Scene, make_scene
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
+from vggtgeo.solvers.band_cholesky import BandCholesky
+from vggtgeo.solvers.block_band import assemble_bands
+from vggtgeo.solvers.conjugate_gradients import (
+    BandPreconditioner,
+    BlockJacobi,
+    ConjugateGradients,
+    HostProduct,
+    ImplicitProduct,
+)
+from vggtgeo.solvers.flat_directions import flat_stiffness
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+
+from vggtgeo.bundle_adjustment import BundleAdjustment
+from vggtgeo.marginalisation import no_prior
+from vggtgeo.problem import Problem, State
+from vggtgeo.solution import solve
+from vggtgeo.solver_choice import choose_reduced_solver
+
+KEYFRAMES, REACH = 7, 2
+TIGHT: dict[str, Any] = {"rtol": 1e-13, "max_iterations": 400}
+SOLVERS = {
+    "band": BandCholesky(REACH),
+    "wider band": BandCholesky(REACH + 1),
+    "conjugate gradients, block Jacobi": ConjugateGradients(BlockJacobi(), HostProduct(), **TIGHT),
+    "conjugate gradients, nothing stored": ConjugateGradients(BlockJacobi(), ImplicitProduct(), **TIGHT),
+    "conjugate gradients, narrow band": ConjugateGradients(BandPreconditioner(1), HostProduct(), **TIGHT),
+}
+Step = tuple[ArrowVector, jax.Array]
+
+
+def sequence(reach: int = REACH, loops: tuple[tuple[int, int], ...] = (), **options: Any) -> Scene:
+    """A scene whose edges join keyframes at most `reach` apart, and the pairs of `loops` both ways."""
+    scene = make_scene(KEYFRAMES, points=8, lines=1, samples=3, noise=0.5, depth_error=0.05, seed=4, **options)
+    return restrict(scene, lambda i, j: (abs(i - j) <= reach) | np.isin(i * KEYFRAMES + j, _codes(loops)))
+
+
+def _codes(loops: tuple[tuple[int, int], ...]) -> list[int]:
+    return [a * KEYFRAMES + b for pair in loops for a, b in (pair, pair[::-1])]
+
+
+def restrict(scene: Scene, keep: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Scene:
+    """The scene with only some of its edges."""
+    seen = scene.observations
+    kept = keep(*seen.edges.T)
+    renumbered = np.cumsum(kept) - 1
+    points, lines = kept[seen.point_edge], kept[seen.line_edge]
+    observations = replace(
+        seen,
+        edges=seen.edges[kept],
+        point_edge=renumbered[seen.point_edge[points]],
+        **{name: getattr(seen, name)[points] for name in ("point_landmark", "point_target", "point_weight")},
+        line_edge=renumbered[seen.line_edge[lines]],
+        **{name: getattr(seen, name)[lines] for name in ("line_landmark", "line_coefficients", "line_weight")},
+    )
+    return replace(scene, observations=observations)
+
+
+@cache
+def linearised(loops: tuple[tuple[int, int], ...] = ()) -> ArrowSystem:
+    """A system with a held pose in the middle and one held intrinsic, besides the first pose."""
+    held = np.isin(np.arange(KEYFRAMES), [0, 3])
+    problem, state, _ = sequence(loops=loops).pack(
+        fixed_pose=held, fixed_intrinsics=np.array([False, True, False, False])
+    )
+    return jax.jit(lambda problem, state: BundleAdjustment(problem).linearise(state))(problem, state)
+
+
+@eqx.filter_jit
+def damped_step(solver: AbstractReducedSolver, system: ArrowSystem, damping: jax.Array) -> Step:
+    return solver.step(system, solver.prepare(system), damping)
+
+
+def step_error(solver: AbstractReducedSolver, system: ArrowSystem, damping: float) -> tuple[float, float]:
+    """Largest relative difference to the step of dense Cholesky, and that of the predicted decreases."""
+    expected, decrease = damped_step(DenseCholesky(), system, jnp.asarray(damping))
+    step, predicted = damped_step(solver, system, jnp.asarray(damping))
+    error = lambda a, b: float(jnp.abs(a - b).max() / jnp.abs(b).max())
+    worst = max(error(step.dense, expected.dense), error(step.landmarks, expected.landmarks))
+    assert np.all(np.asarray(step.dense)[~np.asarray(system.free)] == 0)
+    return worst, abs(float(predicted / decrease) - 1)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_step_is_that_of_dense_cholesky(name: str) -> None:
+    # Proves each solver's step and predicted decrease, held coordinates included. Oracle: dense Cholesky.
+    for damping in (1e-6, 1.0):
+        error, decrease = step_error(SOLVERS[name], linearised(), damping)
+        assert error < 1e-8, (damping, error)
+        assert decrease < 1e-10, (damping, decrease)
+
+
+@pytest.mark.parametrize("name", [name for name in SOLVERS if "conjugate" in name])
+def test_closed_loops_leave_the_step_exact(name: str) -> None:
+    # Proves that edges longer than the band only slow conjugate gradients down. Oracle: dense Cholesky.
+    error, decrease = step_error(SOLVERS[name], linearised(((0, 6), (1, 5))), 1e-4)
+    assert error < 1e-8
+    assert decrease < 1e-10
+
+
+def test_a_band_that_leaves_edges_out_stays_positive() -> None:
+    # Proves that the preconditioner of a graph with loops is positive definite without any damping. Oracle: eigenvalues
+    # of the band written out as a dense matrix.
+    hessian, schur = jax.jit(assemble_bands, static_argnums=1)(linearised(((0, 6), (1, 5), (2, 6))), 1)
+    band = jax.tree.map(lambda a, b: np.asarray(a - b), hessian, schur)
+    groups, width, shared = band.border.shape
+    size = groups * width
+    matrix = np.zeros((size + shared, size + shared))
+    for group in range(groups):
+        rows = slice(group * width, (group + 1) * width)
+        matrix[rows, rows] = band.groups[group, 0]
+        if group + 1 < groups:
+            matrix[rows.stop : rows.stop + width, rows] = band.groups[group, 1]
+    matrix[:size, size:] = band.border.reshape(size, shared)
+    matrix[size:, size:] = band.corner
+    matrix = np.tril(matrix) + np.tril(matrix, -1).T
+    matrix[size:, :size] = band.border.reshape(size, shared).T
+    matrix[:size, size:] = matrix[size:, :size].T
+    used = np.diag(matrix) > 0
+    scale = 1 / np.sqrt(np.diag(matrix)[used])
+    assert np.linalg.eigvalsh(scale[:, None] * matrix[np.ix_(used, used)] * scale).min() > 0
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_free_scale_is_held(name: str) -> None:
+    # Proves that without depth priors the step does not change the scale. Oracle: dense Cholesky, and the direction.
+    scene = sequence()
+    scene = scene.with_observations(depth_weight=np.zeros(len(scene.observations.host)))
+    problem, state, _ = scene.pack(fixed_intrinsics=True)
+    system = jax.jit(lambda problem, state: BundleAdjustment(problem).linearise(state))(problem, state)
+    assert float(flat_stiffness(system)[0]) > 0
+    error, _ = step_error(SOLVERS[name], system, 0.0)
+    assert error < 1e-6
+    step, _ = damped_step(SOLVERS[name], system, jnp.asarray(0.0))
+    assert abs(float(system.gauge[:, 0] @ step.dense)) < 1e-8 * float(jnp.linalg.norm(step.dense))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_same_energy_is_reached(name: str) -> None:
+    # Proves that whole solves agree. Oracle: the energy that dense Cholesky reaches.
+    problem, state, _ = sequence().pack()
+    expected, found = (converged(problem, state, solver) for solver in (DenseCholesky(), SOLVERS[name]))
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def converged(problem: Problem, state: State, solver: AbstractReducedSolver) -> float:
+    """Energy at the optimum."""
+    iteration = SchurLevenbergMarquardt(rtol=1e-13, max_iterations=60, reduced_solver=solver)
+    return float(eqx.filter_jit(solve)(problem, state, solver=iteration).energy)
+
+
+def test_inexact_steps_reach_the_same_energy() -> None:
+    # Proves that the default forcing term costs no accuracy at the end, loops included. Oracle: dense Cholesky.
+    problem, state, _ = sequence(loops=((0, 6),)).pack()
+    expected = converged(problem, state, DenseCholesky())
+    assert converged(problem, state, ConjugateGradients()) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_marginalisation_prior_needs_no_band() -> None:
+    # Proves that conjugate gradients take a prior that couples all poses. Oracle: dense Cholesky. The band refuses it.
+    system = linearised()
+    root = np.random.default_rng(0).normal(size=(len(system.free),) * 2) * 10
+    prior = jnp.asarray(root @ root.T).at[-4:, -4:].add(system.prior_hessian)
+    coupled = eqx.tree_at(lambda s: s.prior_hessian, system, prior)
+    for name in ("conjugate gradients, block Jacobi", "conjugate gradients, narrow band"):
+        error, _ = step_error(SOLVERS[name], coupled, 1e-4)
+        assert error < 1e-8
+    with pytest.raises(ValueError, match="marginalisation prior"):
+        damped_step(BandCholesky(REACH), coupled, jnp.asarray(1e-4))
+
+
+def test_a_reach_below_one_is_refused() -> None:
+    # Proves the message. Oracle: its text.
+    with pytest.raises(ValueError, match="`reach` is 0; it must be at least 1"):
+        BandCholesky(0)
+
+
+def many(keyframes: int, pairs: np.ndarray) -> Problem:
+    """A problem of so many keyframes, one landmark each, observed along the given edges."""
+    scene = make_scene(2, points=1, lines=0)
+    seen = replace(
+        scene.observations,
+        edges=pairs,
+        host=np.arange(keyframes),
+        pixel=np.full((keyframes, 2), 100.0),
+        point_edge=np.arange(len(pairs)),
+        point_landmark=pairs[:, 0],
+        point_target=np.full((len(pairs), 2), 90.0),
+        point_weight=np.ones(len(pairs)),
+        **{name: np.ones(keyframes) for name in ("depth_mean", "depth_sigma", "depth_weight")},
+    )
+    poses = np.tile(scene.poses[:1], (keyframes, 1))
+    guess = replace(scene, observations=seen, start_poses=poses, start_inverse_depth=np.ones(keyframes))
+    return guess.pack()[0]
+
+
+def test_the_choice_follows_the_graph() -> None:
+    # Proves the rule of `choose_reduced_solver`. Oracle: graphs whose shape is known by construction.
+    i = np.arange(60)
+    chain = np.stack([i[:-2], i[2:]], 1)
+    loops = np.stack([i[:5], i[-5:]], 1)
+    scattered = np.stack([i, (i * 31 + 20) % 60], 1)
+    scattered = scattered[scattered[:, 0] != scattered[:, 1]]
+    assert choose_reduced_solver(many(20, chain[:18])) == DenseCholesky()
+    assert choose_reduced_solver(many(60, chain)) == BandCholesky(2)
+    assert choose_reduced_solver(many(60, np.concatenate([chain, loops]))) == ConjugateGradients(BandPreconditioner(2))
+    assert choose_reduced_solver(many(60, scattered)) == ConjugateGradients()
+    marginal = eqx.tree_at(
+        lambda p: p.marginal, many(60, chain), no_prior(60, jnp.float64), is_leaf=lambda leaf: leaf is None
+    )
+    assert choose_reduced_solver(marginal) == DenseCholesky()
