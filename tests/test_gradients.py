@@ -137,10 +137,23 @@ def test_differentiating_the_loop_gives_the_same(both: Both, reverse: Both) -> N
     unrolled = eqx.filter_jit(
         eqx.filter_grad(lambda both: loss_of(solve(*both, solver=solver, adjoint=adjoint).state))
     )(both)
-    for name in ("point targets", "depth prior", "point weights"):
-        found, oracle = (LEAVES[name][0](tree) for tree in (reverse, unrolled))
+    for name, (where, _) in LEAVES.items():
+        along = jnp.asarray(direction(name, both)) if "pose" in name else 1.0  # a quaternion counts along the sphere
+        found, oracle = where(reverse) * along, where(unrolled) * along
+        if "pose" in name:
+            found, oracle = jnp.sum(found), jnp.sum(oracle)
         error = float(jnp.abs(found - oracle).max() / jnp.abs(oracle).max())
-        assert error < 1e-4, (name, error)
+        assert error < 1e-5, (name, error)
+
+
+@pytest.mark.parametrize("name", ["point weights", "point targets"])
+def test_what_is_absent_has_no_derivative(name: str, both: Both, reverse: Both) -> None:
+    # Proves that a match of weight 0 counts as absent for derivatives too: whatever its place holds, they are zero.
+    where, _ = LEAVES[name]
+    weight = both[0].points.weight
+    absent = (weight == 0)[(...,) + (None,) * (where(both).ndim - 2)]
+    assert bool(jnp.any(absent))
+    assert float(jnp.abs(jnp.where(absent, where(reverse), 0.0)).max()) == 0.0
 
 
 def test_what_is_not_determined_has_no_derivative(both: Both, value_and_gradient: Callable) -> None:

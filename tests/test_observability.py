@@ -24,9 +24,9 @@ from scenes import Scene
 from vggtgeo.solvers.arrow import ArrowVector
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.directions import MOTIONS, direction_names, named_directions
 from vggtgeo.degeneracy import KINDS, WEAK, Observability, observability
 from vggtgeo.degeneracy_report import undetermined_landmarks, weak_directions
+from vggtgeo.directions import MOTIONS, direction_names, named_directions
 from vggtgeo.problem import Problem, State
 
 Observe = Callable[[Problem, State], Observability]

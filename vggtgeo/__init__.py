@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from vggtgeo.camera import Camera as Camera
     from vggtgeo.datasets import Frame as Frame
     from vggtgeo.datasets import open_sequence as open_sequence
+    from vggtgeo.degeneracy import Observability as Observability
+    from vggtgeo.degeneracy import observability as observability
     from vggtgeo.errors import InputError as InputError
     from vggtgeo.evaluation import evaluate_trajectory as evaluate_trajectory
     from vggtgeo.marginalisation import marginalise as marginalise
     from vggtgeo.marginalisation import no_prior as no_prior
     from vggtgeo.objective import energy as energy
     from vggtgeo.objective import energy_terms as energy_terms
-    from vggtgeo.degeneracy import Observability as Observability
-    from vggtgeo.degeneracy import observability as observability
     from vggtgeo.packing import Observations as Observations
     from vggtgeo.packing import PaddedSize as PaddedSize
     from vggtgeo.packing import pack as pack

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.directions import direction_names
 from vggtgeo.degeneracy import KINDS, WEAK, Observability, undetermined_below
+from vggtgeo.directions import direction_names
 
 ALIGNED = 0.9
 """Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""

@@ -52,9 +52,14 @@ def edge_observations(problem: Problem) -> EdgeObservations:
     point = jnp.where(problem.points.weight[..., None] > 0, problem.points.target, 0.0)
     line = jnp.where(problem.lines.weight[..., None] > 0, problem.lines.coefficients, 0.0)
     return EdgeObservations(
-        *(point[..., 0], point[..., 1], jnp.maximum(problem.points.weight, 0.0)),
-        *(line[..., 0], line[..., 1], line[..., 2], jnp.maximum(problem.lines.weight, 0.0)),
+        *(point[..., 0], point[..., 1], _present(problem.points.weight)),
+        *(line[..., 0], line[..., 1], line[..., 2], _present(problem.lines.weight)),
     )
+
+
+def _present(weight: Array) -> Array:
+    """Weights with zero for absent; unlike a maximum, with zero derivative there."""
+    return jnp.where(weight > 0, weight, 0.0)
 
 
 class _Hosts(NamedTuple):
@@ -204,9 +209,19 @@ def line_residual(intrinsics: Array, seen_from: Projection, seen: EdgeObservatio
 
 
 def _root_weight(kernel: AbstractKernel, weight: Array, squared: Array) -> Array:
-    present = weight > 0  # the root has no derivative at zero: an absent observation would make it NaN
-    root = jnp.sqrt(jnp.where(present, weight * kernel.weight(weight * squared), 1.0))
-    return jnp.where(present, root, 0.0)
+    return _root(weight * kernel.weight(weight * squared))
+
+
+@jax.custom_jvp
+def _root(value: Array) -> Array:
+    """Square root whose derivative at zero is zero, so that an absent observation makes no NaN in it."""
+    return jnp.sqrt(value)
+
+
+@_root.defjvp
+def _root_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    root = _root(*primals)
+    return root, jnp.where(root > 0, tangents[0] / jnp.where(root > 0, 2 * root, 1.0), 0.0)
 
 
 def _edge_columns(

@@ -41,8 +41,7 @@ def warm_up(settings: SlamSettings) -> None:
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
     intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
-    options = {"size": window_size(settings), "kernel": settings.kernel}
-    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), **options)
+    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=window_size(settings), kernel=settings.kernel)
     problem = replace(problem, marginal=no_prior(settings.window))
     solution = solve_jit(problem, initial, solver=window_solver(settings))
     marginalise_jit(problem, solution.state, jnp.asarray(0)).root.block_until_ready()
