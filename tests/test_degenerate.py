@@ -48,8 +48,8 @@ CASES: dict[str, tuple[Scene, dict[str, Any], float]] = {
     "negative depths": (negative_depth(), {}, 1.0),
     "behind the camera": (behind_the_camera(), {}, 0.03),
 }
-# Points behind the camera project nowhere near their matches: which valley a single-precision path falls into depends on
-# the order of its sums. There the test asks for a good end, not for the best one.
+# Points behind the camera project nowhere near their matches: which valley a single-precision path falls into depends
+# on the order of its sums. There the test asks for a good end, not for the best one.
 CHAOTIC = {("behind the camera", np.float32)}
 Solve = Callable[[Problem, State], Solution]
 
