@@ -8,7 +8,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from vggtgeo.models.classical import NoDepth, SiftMatcher
+from vggtgeo.models.classical import ConstantVelocity, NoDepth, SiftMatcher
 
 from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame
@@ -89,6 +89,16 @@ def test_rgb_recovers_the_shape(room) -> None:
     assert not slam.metric
     assert len(slam.frames) == len(frames)
     assert error < 0.03, f"ATE after Sim(3) {error:.4f} m"
+
+
+def test_constant_velocity_start_stays_rigid(room) -> None:
+    """A start by prediction alone gives finite, rigid poses over the whole sequence; oracle: orthonormality."""
+    frames, camera, _ = room
+    slam = _run(frames, camera, replace(ROLES, geometry=ConstantVelocity()))
+    rotations = frame_trajectory(slam).rotations
+    error = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max()
+    assert len(slam.frames) == len(frames)
+    assert error < 1e-9, f"rotations are off by {error:.1e}"
 
 
 def _black(frame: Frame) -> Frame:

@@ -57,11 +57,11 @@ def build(
     host = np.concatenate([points.host, lines.host])
     slots = [(keyframes[h].points, s) for h, s in zip(points.host, points.slot, strict=True)]
     slots += [(keyframes[h].samples, s) for h, s in zip(lines.host, lines.slot, strict=True)]
-    read = lambda name: np.array([getattr(group, name)[s] for group, s in slots]).reshape(len(slots), -1)
-    prior, sigma = read("prior")[:, 0], read("sigma")[:, 0]
+    read = lambda name: np.array([getattr(group, name)[s] for group, s in slots], np.float64)
+    prior, sigma = read("prior"), read("sigma")
     has_prior = np.isfinite(prior) & np.isfinite(sigma)
     depths = np.concatenate([depths, np.where(np.isfinite(prior[len(points.host) :]), prior[len(points.host) :], 0.5)])
-    weight = np.where(has_prior, read("prior_confidence")[:, 0] if settings.use_confidence else 1.0, 0.0)
+    weight = np.where(has_prior, read("prior_confidence") if settings.use_confidence else 1.0, 0.0)
     point_rows = _point_rows(keyframes, edges, local, points, settings)
     line_rows = _line_rows(keyframes, edges, local, lines, settings, len(points.host))
     observations = Observations(

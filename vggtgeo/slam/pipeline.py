@@ -62,7 +62,7 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
 
 
 def _follow(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
-    predicted = slam.velocity @ slam.last_pose
+    predicted = rigid.orthonormal(slam.velocity @ slam.last_pose)
     recent = [slam.keyframes[number] for number in reversed(slam.window[-3:])]
     with clock.measure("track"):
         found = track_any(

@@ -76,6 +76,13 @@ def triangulate(
     return value, information * float(intrinsics[0]) ** 2
 
 
+def orthonormal(pose: np.ndarray) -> np.ndarray:
+    """The nearest rigid motion: products of many poses drift away from orthonormal rotations."""
+    result = pose.copy()
+    result[:3, :3] = Rotation.from_matrix(pose[:3, :3]).as_matrix()
+    return result
+
+
 def fraction(motion: np.ndarray, share: float) -> np.ndarray:
     """A share in [0, 1] of a small rigid motion: of its rotation vector and of its translation."""
     part = np.eye(4)
