@@ -1,5 +1,5 @@
-"""Residuals of bundle adjustment, each written for ONE observation: no mask, no batch, no weight (the reprojection, line
-and depth terms of the VGGT-Geo paper).
+"""Residuals of bundle adjustment, each written for ONE observation: no mask, no batch, no weight (the reprojection,
+line and depth terms of the VGGT-Geo paper).
 
 Notation: host camera `i` sees a point at pixel `u` with inverse depth `d`; `M = T_j T_i^-1` maps host to target camera.
 The point is carried scaled by `d`: `Y = R [(u - c) / f, 1] + d t`, which stays finite for points at infinity.
