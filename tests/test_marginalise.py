@@ -75,8 +75,8 @@ def test_marginalise_then_solve_equals_solve_all(leaving: int) -> None:
     assert depth_error < 1e-9, f"inverse depths differ by {depth_error:.2e}"
 
 
-def test_prior_is_exact_at_its_linearisation_point() -> None:
-    """Energy of the prior along random directions: gradient and curvature equal the reduced quadratic's."""
+def test_prior_is_silent_about_what_left_and_never_negative() -> None:
+    """The prior says nothing of the keyframe that left, and its information is positive semidefinite and finite."""
     made = _made(3, 6, 1)
     problem = eqx.tree_at(lambda p: p.marginal, made.problem, no_prior(3), is_leaf=lambda leaf: leaf is None)
     prior = marginalise(problem, made.initial, jnp.asarray(0))
