@@ -20,8 +20,12 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
         """The energy to minimise."""
 
     @abc.abstractmethod
-    def linearise(self, point: Point) -> ArrowSystem:
-        """Exact gradient and the Gauss-Newton (reweighted) approximation of the Hessian at `point`."""
+    def linearise(self, point: Point, correction: Float[Array, ""] | None = None) -> ArrowSystem:
+        """Exact gradient and the Gauss-Newton (reweighted) approximation of the Hessian at `point`.
+
+        `correction`, in [0, 1): the part of the robust kernels' own (negative) curvature that the Hessian takes along;
+        it stays positive definite.
+        """
 
     @abc.abstractmethod
     def gradient(self, point: Point) -> ArrowVector:

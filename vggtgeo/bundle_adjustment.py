@@ -32,8 +32,8 @@ class BundleAdjustment(AbstractArrowProblem[State]):
     def energy(self, point: State) -> Float[Array, ""]:
         return fast_energy(self.problem, self.observations, point)
 
-    def linearise(self, point: State) -> ArrowSystem:
-        return linearise(self.problem, self.observations, point)
+    def linearise(self, point: State, correction: Float[Array, ""] | None = None) -> ArrowSystem:
+        return linearise(self.problem, self.observations, point, correction)
 
     def gradient(self, point: State) -> ArrowVector:
         return energy_gradient(self.problem, self.observations, point)
@@ -43,14 +43,11 @@ class BundleAdjustment(AbstractArrowProblem[State]):
 
     def retract(self, point: State, step: ArrowVector) -> State:
         """Poses move by `exp(xi) T`, intrinsics and inverse depths by addition."""
-        depth = point.inverse_depth
-        moved, least = depth + step.landmarks, jnp.minimum(depth, MIN_INVERSE_DEPTH)
-        least = jnp.maximum(MIN_SHRINK * depth, least)
+        moved = point.inverse_depth + step.landmarks
         return State(
             poses=lie.move(point.poses, step.dense[:-4].reshape(-1, 6)),
             intrinsics=point.intrinsics + step.dense[-4:],
-            # Not `maximum`, whose derivative is one half where a zero step meets the bound.
-            inverse_depth=jnp.where(moved < least, least, moved),
+            inverse_depth=_positive(point.inverse_depth, moved) if self.problem.positive_depth else moved,
         )
 
     def hold(self, point: State, initial: State) -> State:
@@ -64,3 +61,9 @@ class BundleAdjustment(AbstractArrowProblem[State]):
             jnp.zeros(free_coordinates(self.problem).shape, point.inverse_depth.dtype),
             jnp.zeros_like(point.inverse_depth),
         )
+
+
+def _positive(depth: Float[Array, "n s"], moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
+    least = jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
+    # Not `maximum`, whose derivative is one half where a zero step meets the bound.
+    return jnp.where(moved < least, least, moved)

@@ -54,7 +54,7 @@ def energy_gradient(problem: Problem, observations: EdgeObservations, state: Sta
         problem.edges.source, relative.rotation().as_matrix(), relative.translation(), observations
     )
     dense = _to_nodes(problem, local, lie.adjoint(relative)) + prior_gradient(problem, state)
-    landmarks, _ = depth_derivatives(problem, state, exact=False)
+    landmarks, _ = depth_derivatives(problem, state)
     return ArrowVector(dense, landmarks.at[problem.edges.source].add(of_depth))
 
 

@@ -91,11 +91,18 @@ def fast_energy(problem: Problem, observations: EdgeObservations, state: State) 
     return total / 2 + rest.depth + rest.intrinsics + rest.marginal
 
 
-def linearise(problem: Problem, observations: EdgeObservations, state: State, exact: bool = False) -> ArrowSystem:
+def linearise(
+    problem: Problem,
+    observations: EdgeObservations,
+    state: State,
+    correction: Float[Array, ""] | None = None,
+    exact: bool = False,
+) -> ArrowSystem:
     """Second-order model of the energy at `state`, with its exact gradient.
 
     The Hessian is the reweighted Gauss-Newton one, or the exact one (in the coordinates of `exp(x) T` and additive
-    intrinsics and inverse depths).
+    intrinsics and inverse depths). With a `correction` the reweighted one is corrected for that part of the kernels'
+    curvature, see `_softened`.
     """
     ranks = problem.edges.of_host.shape[1]
     hosts = rays_of(problem, state)
@@ -105,7 +112,7 @@ def linearise(problem: Problem, observations: EdgeObservations, state: State, ex
     def body(cross: Array, edge: Any) -> tuple[Array, Array]:
         host, rank, rotation, translation, seen = edge
         camera = (state.intrinsics, rotation, translation)
-        columns = _edge_columns(problem, hosts, host, camera, seen)
+        columns = _edge_columns(problem, hosts, host, camera, seen, correction)
         columns = jax.lax.optimization_barrier(columns)
         coupled = _times_depth_column(columns, problem.num_points)
         gram = columns @ columns.T
@@ -123,7 +130,7 @@ def linearise(problem: Problem, observations: EdgeObservations, state: State, ex
         *(problem.edges.source, problem.edges.rank),
         *(relative.rotation().as_matrix(), relative.translation(), observations),
     )
-    cross, gram = jax.lax.scan(body, _depth_terms(problem, state, wide, exact), edges)
+    cross, gram = jax.lax.scan(body, _depth_terms(problem, state, wide, correction, exact), edges)
     of_priors = _dense_priors(problem, state, exact)
     return ArrowSystem(
         graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
@@ -225,7 +232,12 @@ def _root_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arr
 
 
 def _edge_columns(
-    problem: Problem, hosts: _Hosts, host: Array, camera: Camera, seen: EdgeObservations
+    problem: Problem,
+    hosts: _Hosts,
+    host: Array,
+    camera: Camera,
+    seen: EdgeObservations,
+    correction: Float[Array, ""] | None,
 ) -> Float[Array, "12 rows"]:
     """Weighted derivatives of one edge: 6 relative pose, 4 intrinsics, residual, inverse depth; rows u, v, lines."""
     intrinsics, rotation, translation = camera
@@ -234,12 +246,43 @@ def _edge_columns(
     root = _root_weight(problem.kernel, seen.point_weight, squared)
     distance = line_residual(intrinsics, line, seen)
     line_root = _root_weight(problem.kernel, seen.line_weight, distance * distance)
-    parts = [
-        derivative_row(camera, point, root, None, root * horizontal),
-        derivative_row(camera, point, None, root, root * vertical),
-        derivative_row(camera, line, line_root * seen.line_a, line_root * seen.line_b, line_root * distance),
-    ]
+    if correction is None:
+        rows = ((root, None, root * horizontal), (None, root, root * vertical))
+        line_pull = line_root * distance
+    else:
+        soft = _softened(problem.kernel, seen.point_weight * squared, correction)
+        rows = _triggs_rows(root, soft, horizontal, vertical, squared)
+        line_soft = _softened(problem.kernel, seen.line_weight * distance * distance, correction)
+        line_pull, line_root = line_root * distance / line_soft, line_root * line_soft
+    parts = [derivative_row(camera, point, *row) for row in rows]
+    parts.append(derivative_row(camera, line, line_root * seen.line_a, line_root * seen.line_b, line_pull))
     return jnp.concatenate([jnp.stack(part) for part in parts], 1)
+
+
+def _softened(kernel: AbstractKernel, s: Array, correction: Float[Array, ""]) -> Array:
+    """Root of the ratio of the second derivative of `rho / 2` along the residual to that across it, which is all that
+    reweighting knows: `1 + 2 s rho'' / rho'` for the whole correction, here for a part of it and never below what the
+    same part leaves of 0 (Triggs et al. 1999, section 4.3).
+    """
+    weight = kernel.weight(s)
+    pulled = weight > 0
+    lost = -2 * s * kernel.curvature(s) / jnp.where(pulled, weight, 1.0)
+    return jnp.sqrt(1 - correction * jnp.clip(lost, 0.0, 1.0))
+
+
+def _triggs_rows(
+    root: Array, soft: Array, horizontal: Array, vertical: Array, squared: Array
+) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+    """Image gradients and residuals of the two rows of a point: `root (I - (1 - soft) r r' / |r|^2)` and
+    `root r / soft`, whose product is the gradient as it was.
+    """
+    share = (1 - soft) / jnp.where(squared > 0, squared, 1.0)
+    mixed = -root * share * horizontal * vertical
+    pull = root / soft
+    return (
+        (root * (1 - share * horizontal * horizontal), mixed, pull * horizontal),
+        (mixed, root * (1 - share * vertical * vertical), pull * vertical),
+    )
 
 
 def _edge_second_order(
@@ -327,16 +370,20 @@ def _times_depth_column(columns: Float[Array, "12 rows"], points: int) -> Float[
     return jnp.concatenate([horizontal + vertical, columns[:, 2 * points :] * depth[2 * points :]], 1)
 
 
-def _depth_terms(problem: Problem, state: State, wide: int, exact: bool) -> Float[Array, "n r s"]:
+def _depth_terms(
+    problem: Problem, state: State, wide: int, correction: Float[Array, ""] | None, exact: bool
+) -> Float[Array, "n r s"]:
     """Cross terms before any edge: the depth priors' gradient and curvature in the last two rows."""
-    gradient, curvature = depth_derivatives(problem, state, exact)
+    gradient, curvature = depth_derivatives(problem, state, correction, exact)
     keyframes, slots = state.inverse_depth.shape
     cross = jnp.zeros((keyframes, wide + SHARED + 2, slots), state.inverse_depth.dtype)
     return cross.at[:, -2].set(gradient).at[:, -1].set(curvature)
 
 
-def depth_derivatives(problem: Problem, state: State, exact: bool) -> tuple[Float[Array, "n s"], Float[Array, "n s"]]:
-    """First and second (reweighted, or exact) derivatives of the depth priors by inverse depth."""
+def depth_derivatives(
+    problem: Problem, state: State, correction: Float[Array, ""] | None = None, exact: bool = False
+) -> tuple[Float[Array, "n s"], Float[Array, "n s"]]:
+    """First and second (reweighted, corrected, or exact) derivatives of the depth priors by inverse depth."""
     prior = problem.depth
     known = prior.weight > 0
     scale = jnp.where(known, prior.sigma, 1.0)
@@ -347,6 +394,8 @@ def depth_derivatives(problem: Problem, state: State, exact: bool) -> tuple[Floa
     gradient = curvature * residual
     if exact:
         curvature = curvature + 2 * weight * squared * problem.kernel.curvature(squared)
+    elif correction is not None:
+        curvature = curvature * _softened(problem.kernel, squared, correction) ** 2
     return gradient / scale, curvature / scale**2
 
 

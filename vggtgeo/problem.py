@@ -106,6 +106,8 @@ class Problem(eqx.Module):
     """Intrinsics that are held."""
     kernel: AbstractKernel = Huber()
     marginal: MarginalPrior | None = None
+    positive_depth: bool = eqx.field(static=True, default=True)
+    """Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver without bounds."""
 
     @property
     def num_keyframes(self) -> int:
