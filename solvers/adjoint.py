@@ -8,7 +8,9 @@ one reduction and one factorisation, whatever the number of iterations; nothing 
 reverse mode are both exact, because the solve with the symmetric `H` is its own transpose.
 
 The formula holds at a stationary point, and the optimum must be tighter for it than a solve needs: so, only when
-differentiated, a few exact Newton steps polish the optimum first.
+differentiated, it is polished first by chord steps, `y <- y - H0^-1 g(y)` with the exact Hessian where the iteration
+ended. One costs a gradient and a back-substitution, and so near the optimum gains almost the digits of a Newton step.
+Then the Hessian is taken once more. Cost: two exact Hessians, their factorisations, and a gradient for each step.
 """
 
 from __future__ import annotations
@@ -20,13 +22,15 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import jax.scipy as jsp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
     ArrowVector,
-    back_substitute,
     carry_to_nodes,
+    couple,
+    dense_gradient,
     inverse_landmark_hessian,
     multiply,
     reduce,
@@ -42,8 +46,8 @@ class ArrowAdjoint(optx.AbstractAdjoint):
     is that of the coordinates that are determined; where no finite answer exists it is zero.
     """
 
-    polish: int = 3
-    """Exact Newton steps before differentiating."""
+    polish: int = 6
+    """Chord steps before differentiating, at most: they end when the gradient no longer shrinks."""
 
     def apply(self, primal_fn: Any, rewrite_fn: Any, inputs: Any, tags: Any) -> Any:
         del rewrite_fn, tags
@@ -67,9 +71,8 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     inputs, input_tangents = (problem, initial), tangents[:2]
     absent = jax.tree.map(lambda leaf: leaf is None, input_tangents, is_leaf=lambda leaf: leaf is None)
     fixed, moving = eqx.partition(inputs, absent, is_leaf=lambda leaf: leaf is None)
-    # A loop, not unrolled: one compiled body, whatever the number of steps.
-    point = jax.lax.fori_loop(0, polish, lambda _, point: _newton_step(problem, point), point)
-    system = problem.hessian(point)
+    point, model = _polish(problem, point, polish)
+    system = model.system
 
     def stationarity(moving: Any) -> ArrowVector:
         shifted, start = eqx.combine(moving, fixed)
@@ -79,7 +82,7 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     step = jax.lax.custom_linear_solve(
         lambda vector: _free(multiply(system, _free(vector, system)), system),
         jax.tree.map(jnp.negative, right_hand_side),
-        lambda _, vector: solve_exactly(system, vector),
+        lambda _, vector: model.solve(vector),
         symmetric=True,
     )
 
@@ -91,42 +94,70 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     return jax.jvp(optimum, (moving, zero), (input_tangents, step))
 
 
-def solve_exactly(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
-    """`H^-1 vector` over the free coordinates, symmetric `H` definite or not; zero where held, undetermined or lost.
+class ExactModel(eqx.Module):
+    """A Hessian, definite or not, and the factors of its Schur complement `S` over the free coordinates."""
 
-    `S x = v_c - W V^-1 v_d`, `z = V^-1 (v_d - W' x)`, with a stiffness added along flat gauge directions.
-    """
-    reduced = reduce(system)
-    diagonal = jnp.maximum(jnp.diagonal(reduced.hessian), MIN_DIAGONAL)
-    stiffness = gauge_stiffness(system, reduced, diagonal)
-    matrix = reduced.hessian - reduced.schur + (system.gauge * stiffness) @ system.gauge.T
-    free, both = system.free, system.free[:, None] & system.free[None, :]
-    matrix = jnp.where(both, matrix, jnp.eye(len(free), dtype=matrix.dtype))
-    # The landmark part of the right-hand side enters as the gradient row of the cross terms would.
-    shifted = eqx.tree_at(lambda s: s.cross, system, system.cross.at[:, -2].set(-vector.landmarks))
-    eliminated = _eliminated_gradient(shifted)
-    dense = jnp.linalg.solve(matrix, jnp.where(free, vector.dense + eliminated, 0.0))
-    dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
-    return ArrowVector(dense, back_substitute(shifted, dense))
+    system: ArrowSystem
+    factors: tuple[Float[Array, "c c"], Int[Array, " c"]]
+    diagonal: Float[Array, " c"]
+
+    def __init__(self, system: ArrowSystem):
+        reduced = reduce(system)
+        self.system = system
+        self.diagonal = jnp.maximum(jnp.diagonal(reduced.hessian), MIN_DIAGONAL)
+        stiffness = gauge_stiffness(system, reduced, self.diagonal)
+        matrix = reduced.hessian - reduced.schur + (system.gauge * stiffness) @ system.gauge.T
+        both = system.free[:, None] & system.free[None, :]
+        self.factors = jsp.linalg.lu_factor(jnp.where(both, matrix, jnp.eye(len(matrix), dtype=matrix.dtype)))
+
+    def solve(self, vector: ArrowVector) -> ArrowVector:
+        """`H^-1 vector` over the free coordinates; zero where held, undetermined or lost.
+
+        `S x = v_c - W V^-1 v_d`, `z = V^-1 (v_d - W' x)`, with a stiffness added along flat gauge directions.
+        """
+        inverse = inverse_landmark_hessian(self.system)
+        rest = vector.dense - carry_to_nodes(self.system, inverse * vector.landmarks)
+        dense = jsp.linalg.lu_solve(self.factors, jnp.where(self.system.free, rest, 0.0))
+        dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
+        return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0)))
+
+    def size(self, gradient: ArrowVector) -> Float[Array, ""]:
+        """Squared norm of a gradient, each entry in units of its own curvature."""
+        landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
+        return jnp.sum(gradient.dense**2 / self.diagonal) + jnp.sum(landmarks)
 
 
-def _eliminated_gradient(system: ArrowSystem) -> Float[Array, " c"]:
-    return carry_to_nodes(system, inverse_landmark_hessian(system) * system.landmark_gradient)
+def _polish(problem: AbstractArrowProblem, point: Point, steps: int) -> tuple[Point, ExactModel]:
+    """The optimum near `point`, and the exact model there (of the point before the last, negligible, chord steps)."""
+    empty = jax.tree.map(jnp.zeros_like, jax.eval_shape(lambda point: ExactModel(problem.hessian(point)), point))
+
+    def turn(_: Any, carry: tuple[Point, ExactModel]) -> tuple[Point, ExactModel]:
+        model = ExactModel(problem.hessian(carry[0]))
+        return _chord_steps(problem, model, carry[0], steps), model
+
+    # A loop, not two calls: the Hessian is compiled once.
+    polished: tuple[Point, ExactModel] = jax.lax.fori_loop(0, 2, turn, (point, empty))
+    return polished
 
 
-def _newton_step(problem: AbstractArrowProblem, point: Point) -> Point:
-    """One exact Newton step, kept only if it shrinks the gradient."""
-    system = problem.hessian(point)
-    before = _free(problem.gradient(point), system)
-    step = solve_exactly(system, jax.tree.map(jnp.negative, before))
-    moved = problem.retract(point, step)
-    better = _size(_free(problem.gradient(moved), system), system) < _size(before, system)
-    return jax.tree.map(lambda new, old: jnp.where(better, new, old), moved, point)
+def _chord_steps(problem: AbstractArrowProblem, model: ExactModel, point: Point, steps: int) -> Point:
+    """Move by `-H^-1 g`, the Hessian kept, as long as the gradient shrinks."""
 
+    def body(carry: Any) -> Any:
+        point, gradient, size, step, _ = carry
+        moved = problem.retract(point, jax.tree.map(jnp.negative, model.solve(gradient)))
+        new = _free(problem.gradient(moved), model.system)
+        new_size = model.size(new)
+        better = new_size < size
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), (moved, new, new_size), (point, gradient, size))
+        return *kept, step + 1, new_size < 0.1 * size
 
-def _size(vector: ArrowVector, system: ArrowSystem) -> Float[Array, ""]:
-    dense = jnp.sum(vector.dense**2 / jnp.maximum(jnp.diagonal(reduce(system).hessian), MIN_DIAGONAL))
-    return dense + jnp.sum(vector.landmarks**2 * jnp.abs(inverse_landmark_hessian(system)))
+    # The Hessian's system holds the gradient as well.
+    gradient = ArrowVector(dense_gradient(model.system)[0], model.system.landmark_gradient)
+    gradient = _free(gradient, model.system)
+    first = (point, gradient, model.size(gradient), jnp.asarray(0), jnp.asarray(True))
+    last: tuple[Point, Any] = jax.lax.while_loop(lambda carry: carry[-1] & (carry[-2] < steps), body, first)
+    return last[0]
 
 
 def _free(vector: ArrowVector, system: ArrowSystem) -> ArrowVector:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import make_scene
-from vggtgeo.solvers.adjoint import solve_exactly
+from vggtgeo.solvers.adjoint import ExactModel
 from vggtgeo.solvers.arrow import ArrowVector, reduce
 from vggtgeo.solvers.kernels import Square
 
@@ -35,7 +35,7 @@ def _made(keyframes: int, points: int, lines: int) -> _Made:
 def _gauss_newton_step(problem: Problem, state: State) -> ArrowVector:
     system = linearise(problem, edge_observations(problem), state)
     gradient = ArrowVector(reduce(system).gradient, system.landmark_gradient)
-    return solve_exactly(system, jax.tree.map(jnp.negative, gradient))
+    return ExactModel(system).solve(jax.tree.map(jnp.negative, gradient))
 
 
 def _without(problem: Problem, dropped_edges, dropped_host: int | None) -> Problem:

@@ -295,19 +295,13 @@ def _edge_second_order(
     distance = line_residual(intrinsics, line, seen)
     point_pull, point_bend = _pull_and_bend(problem.kernel, seen.point_weight, squared)
     line_pull, line_bend = _pull_and_bend(problem.kernel, seen.line_weight, distance * distance)
-    forces = (
-        (point, (point_pull * horizontal, point_pull * vertical), point_bend),
-        (line, (line_pull * distance * seen.line_a, line_pull * distance * seen.line_b), line_bend),
+    force = (
+        jnp.concatenate([point_pull * horizontal, line_pull * distance * seen.line_a]),
+        jnp.concatenate([point_pull * vertical, line_pull * distance * seen.line_b]),
     )
-    parts = []
-    for at, force, bend in forces:
-        derivative = derivative_row(camera, at, *force, jnp.zeros_like(at.inverse_z))
-        geometry = [_row_of_point(camera, at, axis) for axis in range(3)]
-        whole, first, second, third = (jnp.stack([*row[:10], row[-1]]) for row in (derivative, *geometry))
-        rows = (whole, third * at.inverse_z * at.in_front, first, second)
-        parts.append(second_order(rows, bend, camera, at, force))
-    (point_gram, point_cross), (line_gram, line_cross) = parts
-    return point_gram + line_gram, jnp.concatenate([point_cross, line_cross], 1)
+    at = jax.tree.map(lambda *parts: jnp.concatenate(parts), point, line)
+    row = derivative_row(camera, at, *force, jnp.zeros_like(at.inverse_z))
+    return second_order(jnp.stack([*row[:10], row[-1]]), jnp.concatenate([point_bend, line_bend]), camera, at, force)
 
 
 def _pull_and_bend(kernel: AbstractKernel, weight: Array, squared: Array) -> tuple[Array, Array]:
@@ -316,17 +310,6 @@ def _pull_and_bend(kernel: AbstractKernel, weight: Array, squared: Array) -> tup
     pulled = first > 0
     bend = jnp.where(pulled & (weight > 0), 2 * second / jnp.where(pulled, first, 1.0) ** 2, 0.0)
     return weight * first, bend
-
-
-def _row_of_point(camera: Camera, at: Projection, axis: int) -> list[Array]:
-    """The derivatives of one entry of the scaled point `Y`, in the order of `derivative_row`."""
-    (fx, fy, _, _), rotation, translation = camera
-    y, zero, ones = at.point, jnp.zeros_like(at.depth), jnp.ones_like(at.depth)
-    translations = [at.depth if i == axis else zero for i in range(3)]
-    turns = ([zero, y[2], -y[1]], [-y[2], zero, y[0]], [y[1], -y[0], zero])[axis]
-    c0, c1 = rotation[axis, 0], rotation[axis, 1]
-    intrinsics = [-c0 * at.ray_x / fx, -c1 * at.ray_y / fy, -c0 / fx * ones, -c1 / fy * ones]
-    return [*translations, *turns, *intrinsics, zero, translation[axis] * ones]
 
 
 def derivative_row(camera: Camera, at: Projection, a: Array | None, b: Array | None, residual: Array) -> list[Array]:

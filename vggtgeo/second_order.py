@@ -5,8 +5,8 @@ the force on the projected pixel, and `D` the row of first derivatives of `a u' 
 
     H - H_GN = (2 rho'' / rho'^2) D D'  +  d2(a u' + b v').
 
-With `Y` the scaled point, `G = d(a u' + b v') / dY`, `P` the row of `Y_z / Y_z` (only the third entry of `Y` moves) and
-`y_0, y_1` the rows of the first two entries of `Y`, the second part is
+With `Y` the scaled point, `G = d(a u' + b v') / dY`, `P` the row of derivatives of `Y_z`, over `Y_z`, and `y_0, y_1`
+those of the first two entries of `Y`, the second part is
 
     -(P D~' + D~ P') + (a / Y_z) (y_0 e_fx' + e_fx y_0') + (b / Y_z) (y_1 e_fy' + e_fy y_1') + G . d2Y,
 
@@ -45,52 +45,92 @@ class Projection(NamedTuple):
 
 
 def second_order(
-    rows: tuple[Array, Array, Array, Array], bend: Array, camera: Camera, at: Projection, force: tuple[Array, Array]
+    derivative: Float[Array, "11 s"], bend: Array, camera: Camera, at: Projection, force: tuple[Array, Array]
 ) -> tuple[Float[Array, "10 10"], Float[Array, "11 s"]]:
     """Additions to the Gram matrix (summed over slots) and to the cross terms with inverse depth (the last row is the
     depth's own curvature).
 
     Args:
-        rows: `(D, P, y_0, y_1)`, `[11, s]` each, in the order 6 relative pose, 4 intrinsics, inverse depth.
+        derivative: `D`, in the order 6 relative pose, 4 intrinsics, inverse depth.
         bend: `2 rho'' / rho'^2`, `[s]`.
         camera: intrinsics, rotation and translation of the edge.
         at: projection of the slots.
         force: `(a, b)`.
     """
     (fx, fy, _, _), _, translation = camera
-    derivative, inverse, first, second = rows
     a, b = force
-    free_of_centre = derivative.at[8].add(-a).at[9].add(-b)
-    products = (bend * derivative) @ derivative.T - inverse @ free_of_centre.T - free_of_centre @ inverse.T
-    focal_x, focal_y = jnp.sum(a * at.inverse_z * first, 1), jnp.sum(b * at.inverse_z * second, 1)
-    products = products.at[6].add(focal_x).at[:, 6].add(focal_x).at[7].add(focal_y).at[:, 7].add(focal_y)
-    cross = bend * derivative * derivative[10] - inverse * free_of_centre[10] - free_of_centre * inverse[10]
-    cross = cross.at[6].add(a * at.inverse_z * first[10]).at[7].add(b * at.inverse_z * second[10])
+    centre = jnp.stack(force)
+    inverse = _row_of_third(camera, at)
+    half = (0.5 * bend * derivative - inverse) @ derivative.T
+    half = half.at[:, 8:10].add(inverse @ centre.T)
     g = (a * fx * at.inverse_z, b * fy * at.inverse_z, -(a * fx * at.x + b * fy * at.y) * at.inverse_z * at.in_front)
+    moments = _moments(g, at)
+    half = half.at[:10, 6:8].add(_focal_products(moments, camera))
+    cross = (bend * derivative[10] - inverse[10]) * derivative - inverse * derivative[10]
+    cross = cross.at[8:10].add(inverse[10] * centre)
+    # `y_0` and `y_1` move with inverse depth by the translation.
+    cross = cross.at[6].add(g[0] * translation[0] / fx).at[7].add(g[1] * translation[1] / fy)
     cross = cross.at[:3].add(jnp.stack(g)).at[3:6].add(jnp.stack(_cross_product(translation, g)))
-    return products[:10, :10] + _curvature_of_point(g, at, camera), cross
+    return (half + half.T)[:10, :10] + _curvature_of_point(moments, camera), cross
 
 
-def _curvature_of_point(g: Sequence[Array], at: Projection, camera: Camera) -> Float[Array, "10 10"]:
+def _row_of_third(camera: Camera, at: Projection) -> Float[Array, "11 s"]:
+    """`P`: the derivatives of `Y_z`, over `Y_z`."""
+    (fx, fy, _, _), rotation, translation = camera
+    zero, ones = jnp.zeros_like(at.depth), jnp.ones_like(at.depth)
+    c0, c1 = rotation[2, 0], rotation[2, 1]
+    entries = [zero, zero, at.depth, at.point[1], -at.point[0], zero]
+    entries += [-c0 / fx * at.ray_x, -c1 / fy * at.ray_y, -c0 / fx * ones, -c1 / fy * ones, translation[2] * ones]
+    return jnp.stack(entries) * (at.inverse_z * at.in_front)
+
+
+class _Moments(NamedTuple):
+    """Sums over slots of `G` times what it meets."""
+
+    point: Float[Array, "3 3"]
+    depth: Float[Array, "3"]
+    ray_x: Float[Array, "3"]
+    ray_y: Float[Array, "3"]
+    one: Float[Array, "3"]
+
+
+def _moments(g: Sequence[Array], at: Projection) -> _Moments:
+    others = jnp.stack([*at.point, at.depth, at.ray_x, at.ray_y, jnp.ones_like(at.depth)])
+    whole = jnp.stack(g) @ others.T
+    return _Moments(whole[:, :3], whole[:, 3], whole[:, 4], whole[:, 5], whole[:, 6])
+
+
+def _focal_products(moments: _Moments, camera: Camera) -> Float[Array, "10 2"]:
+    """`sum (a / Y_z) y_0` and `sum (b / Y_z) y_1` over relative pose and intrinsics."""
+    (fx, fy, _, _), rotation, _ = camera
+    columns = []
+    for axis, focal in enumerate((fx, fy)):
+        y0, y1, y2 = moments.point[axis]
+        translations = jnp.zeros_like(moments.depth).at[axis].set(moments.depth[axis])
+        zero = jnp.zeros_like(y0)
+        turns = ((zero, y2, -y1), (-y2, zero, y0))[axis]
+        c0, c1 = rotation[axis, 0] / fx, rotation[axis, 1] / fy
+        rays = (-c0 * moments.ray_x[axis], -c1 * moments.ray_y[axis], -c0 * moments.one[axis], -c1 * moments.one[axis])
+        columns.append(jnp.concatenate([translations, jnp.stack(turns), jnp.stack(rays)]) / focal)
+    return jnp.stack(columns, 1)
+
+
+def _curvature_of_point(moments: _Moments, camera: Camera) -> Float[Array, "10 10"]:
     """`G . d2Y` over relative pose and intrinsics, summed over slots."""
     (fx, fy, _, _), rotation, _ = camera
-    outer = jnp.stack(g) @ jnp.stack(at.point).T
+    outer = moments.point
     rotations = (outer + outer.T) / 2 - jnp.trace(outer) * jnp.eye(3, dtype=outer.dtype)
-    lever = -0.5 * _skew([jnp.sum(at.depth * component) for component in g])
-    c0 = sum(rotation[i, 0] * g[i] for i in range(3))
-    c1 = sum(rotation[i, 1] * g[i] for i in range(3))
-    total = [jnp.sum(component) for component in g]
-    total_x, total_y = ([jnp.sum(ray * component) for component in g] for ray in (at.ray_x, at.ray_y))
+    lever = -0.5 * _skew(moments.depth)
     x_axis, y_axis = rotation[:, 0], rotation[:, 1]
     turned = jnp.stack(
         [
-            *(-_cross(x_axis, total_x) / fx, -_cross(y_axis, total_y) / fy),
-            *(-_cross(x_axis, total) / fx, -_cross(y_axis, total) / fy),
+            *(-jnp.cross(x_axis, moments.ray_x) / fx, -jnp.cross(y_axis, moments.ray_y) / fy),
+            *(-jnp.cross(x_axis, moments.one) / fx, -jnp.cross(y_axis, moments.one) / fy),
         ],
         1,
     )
-    focal = jnp.diag(jnp.stack([2 * jnp.sum(c0 * at.ray_x) / fx**2, 2 * jnp.sum(c1 * at.ray_y) / fy**2]))
-    centre = jnp.diag(jnp.stack([jnp.sum(c0) / fx**2, jnp.sum(c1) / fy**2]))
+    focal = jnp.diag(jnp.stack([2 * x_axis @ moments.ray_x / fx**2, 2 * y_axis @ moments.ray_y / fy**2]))
+    centre = jnp.diag(jnp.stack([x_axis @ moments.one / fx**2, y_axis @ moments.one / fy**2]))
     zero2, zero3, zero34 = (jnp.zeros(shape, outer.dtype) for shape in ((2, 2), (3, 3), (3, 4)))
     intrinsics = jnp.block([[focal, centre], [centre, zero2]])
     return jnp.block([[zero3, lever.T, zero34], [lever, rotations, turned], [zero34.T, turned.T, intrinsics]])
@@ -111,10 +151,6 @@ def _skew(v: Sequence[Array] | Array) -> Float[Array, "3 3 *n"]:
     x, y, z = v
     zero = jnp.zeros_like(x)
     return jnp.stack([jnp.stack(row) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])])
-
-
-def _cross(u: Array, v: Sequence[Array]) -> Float[Array, "3"]:
-    return jnp.cross(u, jnp.stack(v))
 
 
 def _cross_product(u: Array, v: Sequence[Array]) -> tuple[Array, Array, Array]:
