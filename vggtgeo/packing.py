@@ -6,7 +6,7 @@ inverse depth, and no other file asks which entries are real.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import jax.numpy as jnp
@@ -71,6 +71,19 @@ class PaddedSize:
     """Largest number of edges of one host."""
     edges: int | None = None
     """Number of edges stored; None = `keyframes * ranks`, every host padded to `ranks` edges."""
+
+    @staticmethod
+    def of(observations: Observations, keyframes: int) -> PaddedSize:
+        """The smallest that fits, every host padded to the same number of edges."""
+        _, points, lines = _assign_slots(observations, keyframes)
+        _, _, ranks = _sort_edges(observations.edges, keyframes)
+        return PaddedSize(keyframes, points, lines, ranks)
+
+    @staticmethod
+    def largest(sizes: Sequence[PaddedSize]) -> PaddedSize:
+        """The smallest that fits all of `sizes`, every host padded to the same number of edges."""
+        most = lambda name: max(getattr(size, name) for size in sizes)
+        return PaddedSize(most("keyframes"), most("points"), most("lines"), most("ranks"))
 
 
 @dataclass(frozen=True)
