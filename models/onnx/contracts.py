@@ -1,0 +1,191 @@
+"""What the ONNX file of each network takes and gives; exporters write such files, adapters read them.
+
+| network | role | paper |
+|---|---|---|
+| `vggt` | geometry of a window | Wang et al., CVPR 2025 |
+| `dinov3` | descriptors and dense confidence | Siméoni et al., 2025 |
+| `moge2` | metric depth | Wang et al., 2025 |
+| `letr`, `mlsd` | line segments | Xu et al., CVPR 2021; Gu et al., AAAI 2022 |
+| `mast3r_encoder`, `mast3r_decoder` | point matches | Leroy et al., ECCV 2024 |
+
+Shapes are written as in a paper: a number is fixed, a letter is any size but the same wherever it stands, `Patches` is
+the number of tokens of an H x W image. A file may leave sizes open; those it fixes must agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+METADATA_NETWORK = "vggtgeo.network"
+"""Key of the file's metadata that names its network, one of `CONTRACTS`."""
+METADATA_WEIGHTS = "vggtgeo.weights"
+"""Key of the file's metadata that tells where the weights come from."""
+RANDOM_WEIGHTS = "random"
+"""The value of `METADATA_WEIGHTS` of a file whose results mean nothing."""
+PARITY_SUFFIX = ".parity.npz"
+"""`FILE.onnx.parity.npz` holds `input.NAME` and `output.NAME` arrays that PyTorch computed with the same weights."""
+
+_FLOATS = ("float32", "float16")
+
+
+@dataclass(frozen=True)
+class Patches:
+    """The length of a sequence of tokens: `extra` + (H / size) (W / size)."""
+
+    size: int
+    extra: int = 0
+
+    def count(self, height: int, width: int) -> int:
+        """Tokens of an image of `height` x `width` pixels."""
+        return self.extra + (height // self.size) * (width // self.size)
+
+    def __str__(self) -> str:
+        return f"{self.extra} + H/{self.size}*W/{self.size}" if self.extra else f"H/{self.size}*W/{self.size}"
+
+
+Dimension = int | str | Patches
+
+
+@dataclass(frozen=True)
+class Tensor:
+    """One input or output: its name, its shape, the element types it may have, and whether a file may lack it."""
+
+    name: str
+    shape: tuple[Dimension, ...]
+    dtypes: tuple[str, ...] = _FLOATS
+    optional: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.name} [{', '.join(map(str, self.shape))}] {' or '.join(self.dtypes)}"
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """What the network wants for an RGB image with values in [0, 1]: (image - mean) / std, channel by channel."""
+
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def apply(self, image: np.ndarray) -> np.ndarray:
+        """float32 [3, H, W] of `image` (uint8 [H, W, 3], RGB)."""
+        scaled = image.astype(np.float32) / np.float32(255.0)
+        normal = (scaled - np.array(self.mean, np.float32)) / np.array(self.std, np.float32)
+        return np.ascontiguousarray(normal.transpose(2, 0, 1))
+
+
+@dataclass(frozen=True)
+class Contract:
+    """What one network's file takes and gives, and how an image is prepared for it.
+
+    multiple: H and W are multiples of this. optional tensors may be missing; other tensors beside those named may be
+    outputs (they are not read) but not inputs.
+    """
+
+    network: str
+    role: str
+    inputs: tuple[Tensor, ...]
+    outputs: tuple[Tensor, ...]
+    multiple: int = 1
+    normalisation: Normalisation = field(default_factory=Normalisation)
+
+
+VGGT = Contract(
+    network="vggt",
+    role="geometry of a window",
+    inputs=(Tensor("images", ("views", 3, "H", "W")),),
+    outputs=(
+        Tensor("pose_enc", ("views", 9)),
+        Tensor("depth", ("views", "H", "W")),
+        Tensor("depth_conf", ("views", "H", "W")),
+    ),
+    multiple=14,
+)
+"""RGB in [0, 1], normalised inside; W = 518. `pose_enc` is translation, quaternion x y z w, vertical and horizontal
+field of view (radians), world -> camera, of views in the frame of the first. `depth_conf` is at least 1."""
+
+DINOV3 = Contract(
+    network="dinov3",
+    role="descriptors and dense confidence",
+    inputs=(Tensor("image", (1, 3, "H", "W")),),
+    outputs=(
+        Tensor("patch_descriptors", (1, Patches(16), "C")),
+        Tensor("attention", (1, "heads", 5, Patches(16, extra=5))),
+    ),
+    multiple=16,
+    normalisation=Normalisation((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
+)
+"""Descriptors of the patches, row by row, after the last norm. `attention` of the last block: how the class token and
+the four registers (the five queries) attend to class token, registers and patches; rows sum to 1."""
+
+MOGE2 = Contract(
+    network="moge2",
+    role="metric depth",
+    inputs=(Tensor("image", (1, 3, "H", "W")), Tensor("num_tokens", (), ("int64",), optional=True)),
+    outputs=(
+        Tensor("points", (1, "H", "W", 3)),
+        Tensor("normal", (1, "H", "W", 3), optional=True),
+        Tensor("mask", (1, "H", "W")),
+        Tensor("metric_scale", (1,)),
+    ),
+)
+"""RGB in [0, 1], normalised inside. `points` are those of the camera's frame but for a shift in z and the scale;
+`mask` is a probability."""
+
+LETR = Contract(
+    network="letr",
+    role="line segments",
+    inputs=(Tensor("image", (1, 3, "H", "W")),),
+    outputs=(Tensor("pred_logits", (1, "Q", 2)), Tensor("pred_lines", (1, "Q", 4))),
+    normalisation=Normalisation((0.538, 0.494, 0.453), (0.257, 0.263, 0.273)),
+)
+"""Logits of (line, no line); lines x0 y0 x1 y1 in [0, 1] of the image's width and height."""
+
+MLSD = Contract(
+    network="mlsd",
+    role="line segments",
+    inputs=(Tensor("image", (1, 4, 512, 512)),),
+    outputs=(Tensor("maps", (1, 9, 256, 256)),),
+    normalisation=Normalisation((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
+)
+"""The tiny network. The fourth channel is an image of ones in 0..255, normalised like the others: 1 / 127.5 - 1.
+Of the nine maps, 0 holds the logit of a segment's centre and 1..4 the displacements of its ends, x y x y, in pixels
+of the 256 x 256 map."""
+
+_MAST3R = Normalisation((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+
+MAST3R_ENCODER = Contract(
+    network="mast3r_encoder",
+    role="point matches",
+    inputs=(Tensor("image", (1, 3, "H", "W")),),
+    outputs=(Tensor("features", (1, Patches(16), "C")),),
+    multiple=16,
+    normalisation=_MAST3R,
+)
+"""Image in [-1, 1], long side 512."""
+
+
+def _view(number: int) -> tuple[Tensor, ...]:
+    return (
+        Tensor(f"points_{number}", (1, "H", "W", 3)),
+        Tensor(f"confidence_{number}", (1, "H", "W")),
+        Tensor(f"descriptors_{number}", (1, "H", "W", 24)),
+        Tensor(f"descriptor_confidence_{number}", (1, "H", "W")),
+    )
+
+
+MAST3R_DECODER = Contract(
+    network="mast3r_decoder",
+    role="point matches",
+    inputs=(Tensor("features_1", (1, Patches(16), "C")), Tensor("features_2", (1, Patches(16), "C"))),
+    outputs=(*_view(1), *_view(2)),
+    multiple=16,
+    normalisation=_MAST3R,
+)
+"""Both views' points in the frame of the first; descriptors of unit length; confidences above 0."""
+
+CONTRACTS = {
+    contract.network: contract for contract in (VGGT, DINOV3, MOGE2, LETR, MLSD, MAST3R_ENCODER, MAST3R_DECODER)
+}
+"""Every contract by its network's name."""
