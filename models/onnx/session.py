@@ -1,0 +1,235 @@
+"""One onnxruntime session for every network: opened and checked once, run on CUDA where there is CUDA, else the CPU."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import onnxruntime
+from onnxruntime.capi import onnxruntime_pybind11_state as raised
+from vggtgeo.models.onnx.contracts import METADATA_WEIGHTS, RANDOM_WEIGHTS, Contract
+from vggtgeo.models.onnx.file_checks import (
+    NetworkFileError,
+    Signature,
+    Signatures,
+    check_looks_like_onnx,
+    check_signature,
+)
+
+Provider = Literal["auto", "cuda", "cpu"]
+_log = logging.getLogger(__name__)
+_PROVIDERS = {"cuda": "CUDAExecutionProvider", "cpu": "CPUExecutionProvider"}
+_DTYPES = {
+    "tensor(float)": "float32",
+    "tensor(float16)": "float16",
+    "tensor(double)": "float64",
+    "tensor(int64)": "int64",
+    "tensor(int32)": "int32",
+    "tensor(uint8)": "uint8",
+    "tensor(bool)": "bool",
+}
+# What onnxruntime raises: all but the last derive from nothing narrower than Exception.
+_RUNTIME_ERRORS = (
+    raised.Fail,
+    raised.InvalidArgument,
+    raised.InvalidGraph,
+    raised.InvalidProtobuf,
+    raised.NoSuchFile,
+    raised.NotImplemented,
+    raised.RuntimeException,
+    RuntimeError,
+)
+
+
+class NetworkRunError(RuntimeError):
+    """A network failed while it ran, or gave values that are not finite."""
+
+
+@dataclass(frozen=True)
+class DeviceArray:
+    """An output that stays where it was computed; other libraries read it through DLPack without a copy."""
+
+    value: onnxruntime.OrtValue
+
+    def __dlpack__(self, **_: Any) -> Any:
+        return self.value._ortvalue.__dlpack__(None)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return self.value._ortvalue.__dlpack_device__()
+
+    def numpy(self) -> np.ndarray:
+        """A copy on the host, in the file's own element type."""
+        return self.value.numpy()
+
+
+Input = np.ndarray | DeviceArray
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """A network's file that keeps its contract, ready to run. Made by `open_session`."""
+
+    path: Path
+    contract: Contract
+    provider: str
+    inputs: Signatures
+    outputs: Signatures
+    metadata: Mapping[str, str]
+    session: onnxruntime.InferenceSession = field(repr=False)
+
+    @property
+    def random_weights(self) -> bool:
+        """Whether the file says that its weights are random, so that its results mean nothing."""
+        return self.metadata.get(METADATA_WEIGHTS) == RANDOM_WEIGHTS
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the file and of the external data beside it, hexadecimal."""
+        return digest_of(self.path)
+
+    def run(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """The outputs `wanted` (all, if None) as arrays on the host; half precision comes back as float32.
+
+        Raises `NetworkRunError` where onnxruntime fails and for values that are not finite.
+        """
+        found = {name: array.numpy() for name, array in self.run_on_device(inputs, wanted).items()}
+        for name, array in found.items():
+            bad = int(np.count_nonzero(~np.isfinite(array)))
+            if bad:
+                raise NetworkRunError(
+                    f"`{self.path}` gave {bad} of {array.size} values of `{name}` that are not finite; "
+                    "look at it with `vggtgeo models verify`"
+                )
+        return {name: _full_precision(array) for name, array in found.items()}
+
+    def run_on_device(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, DeviceArray]:
+        """The same, left on the device in the file's own element type; nothing is checked."""
+        names = list(self.outputs if wanted is None else wanted)
+        binding = self.session.io_binding()
+        for name, value in inputs.items():
+            binding.bind_ortvalue_input(name, self._on_device(name, value))
+        for name in names:
+            binding.bind_output(name, self.provider, 0)
+        try:
+            self.session.run_with_iobinding(binding)
+        except _RUNTIME_ERRORS as error:
+            raise NetworkRunError(f"`{self.path}` failed on {self.provider}: {error}") from None
+        return dict(zip(names, map(DeviceArray, binding.get_outputs()), strict=True))
+
+    def warm_up(self) -> None:
+        """Run once on zeros, where all input sizes are fixed: the first run allocates, and on CUDA tunes."""
+        shapes = {name: signature.shape for name, signature in self.inputs.items()}
+        if all(size is not None for shape in shapes.values() for size in shape):
+            self.run_on_device({name: np.zeros([size or 0 for size in shape]) for name, shape in shapes.items()})
+
+    def _on_device(self, name: str, value: Input) -> onnxruntime.OrtValue:
+        if isinstance(value, DeviceArray):
+            return value.value
+        array = np.ascontiguousarray(value, dtype=self.inputs[name].dtype)
+        # `ascontiguousarray` makes a scalar an array of one.
+        return onnxruntime.OrtValue.ortvalue_from_numpy(array.reshape(np.shape(value)), self.provider, 0)
+
+
+def open_session(
+    path: str | Path,
+    contract: Contract,
+    *,
+    provider: Provider = "auto",
+    memory_limit_gb: float | None = None,
+    threads: int | None = None,
+) -> Session:
+    """Open `path` and check it against `contract`; raises `NetworkFileError` for any file that is not that network.
+
+    provider: "auto" takes CUDA where onnxruntime offers it. memory_limit_gb: most memory the network may take on
+    CUDA. threads: of one operator on the CPU, None for onnxruntime's own choice.
+    """
+    path = Path(path)
+    check_looks_like_onnx(path)
+    opened = _open(path, choose_provider(provider), memory_limit_gb, threads)
+    used = "cuda" if _PROVIDERS["cuda"] in opened.get_providers() else "cpu"
+    _announce(used)
+    inputs, outputs = (_signatures(nodes) for nodes in (opened.get_inputs(), opened.get_outputs()))
+    check_signature(path, contract, inputs, outputs)
+    return Session(path, contract, used, inputs, outputs, opened.get_modelmeta().custom_metadata_map, opened)
+
+
+def read_signature(path: str | Path) -> tuple[Signatures, Signatures, Mapping[str, str]]:
+    """Inputs, outputs and metadata of any ONNX file; raises `NetworkFileError` for anything else."""
+    path = Path(path)
+    check_looks_like_onnx(path)
+    opened = _open(path, "cpu", None, None)
+    metadata = opened.get_modelmeta().custom_metadata_map
+    return _signatures(opened.get_inputs()), _signatures(opened.get_outputs()), metadata
+
+
+def choose_provider(provider: Provider) -> str:
+    """The device, "cuda" or "cpu"; raises `NetworkFileError` if CUDA is asked for and this onnxruntime has none."""
+    has_cuda = _PROVIDERS["cuda"] in onnxruntime.get_available_providers()
+    if provider == "cuda" and not has_cuda:
+        raise NetworkFileError(
+            "`provider` is cuda, but this onnxruntime runs on the CPU only; install the extra: pip install vggtgeo[gpu]"
+        )
+    return provider if provider != "auto" else "cuda" if has_cuda else "cpu"
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of an ONNX file and of the files of external data that share its name, hexadecimal."""
+    total = hashlib.sha256()
+    for part in (path, *sorted(path.parent.glob(f"{path.name}[._]data*"))):
+        with part.open("rb") as file:
+            total.update(hashlib.file_digest(file, "sha256").digest())
+    return total.hexdigest()
+
+
+def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int | None) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # What is wrong is said once, by the exception.
+    if threads is not None:
+        options.intra_op_num_threads = threads
+    providers: list[Any] = [_PROVIDERS["cpu"]]
+    if device == "cuda":
+        limit = {} if memory_limit_gb is None else {"gpu_mem_limit": int(memory_limit_gb * 2**30)}
+        # The arena otherwise doubles itself, and several networks share one device.
+        providers.insert(0, (_PROVIDERS["cuda"], {"arena_extend_strategy": "kSameAsRequested", **limit}))
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers)
+    except _RUNTIME_ERRORS as error:
+        raise NetworkFileError(_why_not_opened(path, str(error))) from None
+
+
+def _why_not_opened(path: Path, said: str) -> str:
+    reason = " ".join(said.split())
+    reason = f"onnxruntime: {reason if len(reason) < 200 else '... ' + reason[-200:]}"
+    if "xternal" in said and ("data" in said or "initializer" in said):
+        return (
+            f"`{path}` lacks its external data or has too little of it, expected the data file beside it as it was "
+            f"exported; copy both, or export it again ({reason})"
+        )
+    return (
+        f"`{path}` is not an ONNX file that can be read, expected a whole one; it is truncated or something else: "
+        f"export or fetch it again ({reason})"
+    )
+
+
+def _signatures(nodes: Iterable[Any]) -> Signatures:
+    return {
+        node.name: Signature(
+            tuple(size if isinstance(size, int) else None for size in node.shape), _DTYPES.get(node.type, node.type)
+        )
+        for node in nodes
+    }
+
+
+def _full_precision(array: np.ndarray) -> np.ndarray:
+    return array.astype(np.float32) if array.dtype == np.float16 else array
+
+
+@cache
+def _announce(provider: str) -> None:
+    _log.info("networks run on %s", provider)

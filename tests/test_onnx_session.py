@@ -1,0 +1,194 @@
+"""The session of all networks: what it refuses, what it computes, where it leaves results."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_networks as tiny
+from vggtgeo.models.onnx import contracts
+from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
+from vggtgeo.models.onnx.session import NetworkRunError, choose_provider, digest_of, open_session, read_signature
+
+MAKERS = {
+    "vggt": tiny.vggt,
+    "dinov3": tiny.dinov3,
+    "moge2": tiny.moge2,
+    "letr": tiny.letr,
+    "mlsd": tiny.mlsd,
+    "mast3r_encoder": tiny.mast3r_encoder,
+    "mast3r_decoder": tiny.mast3r_decoder,
+}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One tiny file of each network."""
+    folder = tmp_path_factory.mktemp("networks")
+    return {name: make(folder / f"{name}.onnx") for name, make in MAKERS.items()}
+
+
+@pytest.mark.parametrize("asked", contracts.CONTRACTS)
+@pytest.mark.parametrize("given", contracts.CONTRACTS)
+def test_a_file_is_taken_for_its_own_network_only(files: dict[str, Path], asked: str, given: str) -> None:
+    # Proves that of all pairs of file and contract the equal ones open and the others are refused, with the name of
+    # what the file looks like. Oracle: the names under which the files were made.
+    if asked == given:
+        session = open_session(files[given], contracts.CONTRACTS[asked])
+        session.warm_up()
+        assert session.random_weights
+        return
+    with pytest.raises(NetworkFileError, match=f"is not a file of `{asked}`.*expected .*found .*`{given}`$"):
+        open_session(files[given], contracts.CONTRACTS[asked])
+
+
+@pytest.mark.parametrize("name", contracts.CONTRACTS)
+def test_each_network_is_recognised_by_its_signature(files: dict[str, Path], name: str) -> None:
+    # Proves that no two contracts accept one file. Oracle: the name under which the file was made.
+    inputs, outputs, metadata = read_signature(files[name])
+    assert recognise(inputs, outputs) == [name]
+    assert metadata == {"vggtgeo.network": name, "vggtgeo.weights": "random"}
+
+
+def _truncated(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _without_data(path: Path) -> None:
+    tiny.vggt(path, external=True)
+    path.with_name("vggt.onnx.data").unlink()
+
+
+def _with_half_its_data(path: Path) -> None:
+    tiny.vggt(path, external=True)
+    _truncated(path.with_name("vggt.onnx.data"))
+
+
+def _folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (Path.unlink, "is not there, expected an ONNX file"),
+    "folder": (_folder, "is a folder, expected an ONNX file"),
+    "empty": (lambda path: path.write_bytes(b""), "is empty, expected an ONNX file"),
+    "truncated": (_truncated, "truncated or something else"),
+    "picture": (lambda path: path.write_bytes(b"\xff\xd8\xff\xe0" + bytes(100)), "truncated or something else"),
+    "checkpoint": (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)), "PyTorch checkpoint: export it first"),
+    "lfs": (lambda path: path.write_bytes(b"version https://git-lfs.github.com/spec/v1\n"), "git lfs pull"),
+    "page": (lambda path: path.write_bytes(b"<!DOCTYPE html><html>"), "a web page"),
+    "no external data": (_without_data, "lacks its external data"),
+    "half its external data": (_with_half_its_data, "lacks its external data or has too little of it"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_file_is_refused_by_what_is_wrong_with_it(tmp_path: Path, case: str) -> None:
+    # Proves that nothing but a whole ONNX file opens, and that the message says why. Oracle: how it was broken.
+    spoil, message = BROKEN[case]
+    path = tiny.vggt(tmp_path / "vggt.onnx")
+    spoil(path)
+    with pytest.raises(NetworkFileError, match=message) as caught:
+        open_session(path, contracts.VGGT)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+WRONG_SIZES = {
+    "H is 29, expected a multiple of 14": lambda path: tiny.vggt(path, size=(29, 42)),
+    "expected `image .1, 3, H, W. float32 or float16`, found .3, 28, 42. float32": lambda path: tiny.constant(
+        path, "letr", {"image": (3, 28, 42)}, {"pred_logits": np.zeros((1, 2, 2)), "pred_lines": np.zeros((1, 2, 4))}
+    ),
+    "Q is 2 in `pred_logits` and 3 in `pred_lines`": lambda path: tiny.constant(
+        path, "letr", {"image": (1, 3, 28, 42)}, {"pred_logits": np.zeros((1, 2, 2)), "pred_lines": np.zeros((1, 3, 4))}
+    ),
+    "`features` has 6 tokens, expected 12": lambda path: tiny.constant(
+        path, "mast3r_encoder", {"image": (1, 3, 48, 64)}, {"features": np.zeros((1, 6, 8))}
+    ),
+    "expected `features .1, H/16.W/16, C. float32 or float16`, found .1, 12, 8. float64": lambda path: tiny.constant(
+        path, "mast3r_encoder", {"image": (1, 3, 48, 64)}, {"features": np.zeros((1, 12, 8))}, dtype=np.float64
+    ),
+}
+
+
+@pytest.mark.parametrize("message", WRONG_SIZES)
+def test_wrong_shapes_and_types_are_named(tmp_path: Path, message: str) -> None:
+    # Proves each rule of a contract (multiples, ranks, equal letters, tokens, element types). Oracle: the one fault.
+    path = WRONG_SIZES[message](tmp_path / "wrong.onnx")
+    network = read_signature(path)[2]["vggtgeo.network"]
+    with pytest.raises(NetworkFileError, match=message):
+        open_session(path, contracts.CONTRACTS[network])
+
+
+def test_sizes_that_a_file_leaves_open_are_accepted(tmp_path: Path) -> None:
+    # Proves that a letter in the file constrains nothing, and that such a file still runs. Oracle: its constants.
+    outputs = {"pred_logits": np.zeros((1, 2, 2)), "pred_lines": np.ones((1, 2, 4))}
+    path = tiny.constant(tmp_path / "letr.onnx", "letr", {"image": (1, 3, "height", "width")}, outputs)
+    session = open_session(path, contracts.LETR)
+    session.warm_up()
+    found = session.run({"image": np.zeros((1, 3, 20, 30), np.float32)})
+    np.testing.assert_array_equal(found["pred_lines"], outputs["pred_lines"])
+
+
+def test_half_precision_goes_in_and_comes_back(tmp_path: Path) -> None:
+    # Proves that a float16 file takes float32 arrays and gives them back. Oracle: values that float16 holds exactly.
+    session = open_session(tiny.vggt(tmp_path / "half.onnx", dtype=np.float16), contracts.VGGT)
+    assert session.inputs["images"].dtype == "float16"
+    found = session.run({"images": np.full((2, 3, 28, 42), 0.5, np.float32)}, ("depth", "depth_conf"))
+    assert {name: array.dtype.name for name, array in found.items()} == {"depth": "float32", "depth_conf": "float32"}
+    np.testing.assert_array_equal(found["depth_conf"], 3.0)
+
+
+def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    # Proves that NaN does not leave a network silently. Oracle: the constant that was put in.
+    outputs = {"pred_logits": np.array([[[np.nan, 0.0]]]), "pred_lines": np.zeros((1, 1, 4))}
+    path = tiny.constant(tmp_path / "letr.onnx", "letr", {"image": (1, 3, 28, 42)}, outputs)
+    session = open_session(path, contracts.LETR)
+    with pytest.raises(NetworkRunError, match="1 of 2 values of `pred_logits` that are not finite"):
+        session.run({"image": np.zeros((1, 3, 28, 42))})
+
+
+def test_a_wrong_input_is_an_error_of_the_network(files: dict[str, Path]) -> None:
+    # Proves that what onnxruntime raises at run time names the file. Oracle: an image of a wrong size.
+    session = open_session(files["letr"], contracts.LETR)
+    with pytest.raises(NetworkRunError, match=r"letr\.onnx` failed on cpu"):
+        session.run({"image": np.zeros((1, 3, 28, 43))})
+
+
+def test_outputs_stay_where_they_are(files: dict[str, Path]) -> None:
+    # Proves that an output goes to JAX without a copy, and into another network. Oracle: the address of its buffer,
+    # and the host's route for the second.
+    encoder = open_session(files["mast3r_encoder"], contracts.MAST3R_ENCODER)
+    decoder = open_session(files["mast3r_decoder"], contracts.MAST3R_DECODER)
+    image = np.random.default_rng(0).uniform(-1, 1, (1, 3, 48, 64)).astype(np.float32)
+    features = encoder.run_on_device({"image": image})["features"]
+    shared = jnp.from_dlpack(features)
+    assert shared.unsafe_buffer_pointer() == features.value.data_ptr()
+    direct = decoder.run({"features_1": features, "features_2": features}, ("descriptors_1",))
+    host = features.numpy()
+    again = decoder.run({"features_1": host, "features_2": host}, ("descriptors_1",))
+    np.testing.assert_array_equal(direct["descriptors_1"], again["descriptors_1"])
+
+
+def test_the_digest_covers_the_external_data(tmp_path: Path) -> None:
+    # Proves that weights beside the file count. Oracle: the same graph with one bit of the data changed.
+    path = tiny.vggt(tmp_path / "vggt.onnx", external=True)
+    before, data = digest_of(path), path.with_name("vggt.onnx.data")
+    raw = bytearray(data.read_bytes())
+    raw[0] ^= 1
+    data.write_bytes(raw)
+    assert digest_of(path) != before
+
+
+def test_cuda_is_refused_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves the choice of the provider. Oracle: the list that onnxruntime would give.
+    available = "vggtgeo.models.onnx.session.onnxruntime.get_available_providers"
+    monkeypatch.setattr(available, lambda: ["CPUExecutionProvider"])
+    assert choose_provider("auto") == "cpu"
+    with pytest.raises(NetworkFileError, match=r"pip install vggtgeo\[gpu\]"):
+        choose_provider("cuda")
+    monkeypatch.setattr(available, lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
+    assert choose_provider("auto") == "cuda"
+    assert choose_provider("cpu") == "cpu"
