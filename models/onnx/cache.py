@@ -1,0 +1,114 @@
+"""What networks answered before, found again by what they were asked: the files, the settings, and the images."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from vggtgeo.models.onnx.session import Session
+
+Outputs = dict[str, np.ndarray]
+
+
+@runtime_checkable
+class OutputCache(Protocol):
+    """Remembers arrays that networks computed."""
+
+    def get(
+        self,
+        sessions: Sequence[Session],
+        settings: tuple[object, ...],
+        images: Sequence[np.ndarray],
+        compute: Callable[[], Outputs],
+    ) -> Outputs:
+        """What `compute` gave for these networks, settings and images (uint8 [H, W, 3]); computed if never before."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class MemoryCache:
+    """The last `size` answers, for as long as the object lives."""
+
+    size: int = 2
+    _kept: OrderedDict[str, Outputs] = field(default_factory=OrderedDict, init=False, repr=False)
+
+    def get(
+        self,
+        sessions: Sequence[Session],
+        settings: tuple[object, ...],
+        images: Sequence[np.ndarray],
+        compute: Callable[[], Outputs],
+    ) -> Outputs:
+        """See `OutputCache.get`."""
+        key = key_of([str(id(session)) for session in sessions], settings, images)
+        if key not in self._kept:
+            self._kept[key] = compute()
+        self._kept.move_to_end(key)
+        while len(self._kept) > self.size:
+            self._kept.popitem(last=False)
+        return self._kept[key]
+
+
+@dataclass(frozen=True, eq=False)
+class FolderCache:
+    """Answers in a folder, one `.npz` file each, written atomically: an interrupted run leaves whole files only.
+
+    A file that cannot be read is computed and written again.
+    """
+
+    folder: Path
+
+    def get(
+        self,
+        sessions: Sequence[Session],
+        settings: tuple[object, ...],
+        images: Sequence[np.ndarray],
+        compute: Callable[[], Outputs],
+    ) -> Outputs:
+        """See `OutputCache.get`. The networks are named by the SHA-256 of their files."""
+        key = key_of([session.digest for session in sessions], settings, images)
+        path = self.folder / key[:2] / f"{key}.npz"
+        found = _read(path)
+        if found is None:
+            found = compute()
+            _write(path, found)
+        return found
+
+
+def key_of(networks: Sequence[str], settings: tuple[object, ...], images: Sequence[np.ndarray]) -> str:
+    """The SHA-256, hexadecimal, of names, settings and the images' shapes and bytes."""
+    total = hashlib.sha256(repr((list(networks), settings)).encode())
+    for image in images:
+        total.update(repr((image.shape, image.dtype.str)).encode())
+        total.update(np.ascontiguousarray(image).data)
+    return total.hexdigest()
+
+
+def _read(path: Path) -> Outputs | None:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (FileNotFoundError, EOFError, ValueError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, outputs: Outputs) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays: dict[str, Any] = dict(outputs)  # Else mypy takes a value for the option `allow_pickle`.
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.npz")
+    try:
+        with temporary.open("wb") as file:
+            np.savez(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

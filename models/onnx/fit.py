@@ -1,0 +1,84 @@
+"""How an image fits a network's input: resized, with a border where the shapes differ, and the way back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+_MOST_STRETCH = 1.05
+_BORDER = (127, 127, 127)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """image pixel p -> network pixel scale (p + 1/2) - 1/2 + offset: sizes are stretched, not distances of centres.
+
+    image_size, network_size, content_size: (height, width); the image fills `content_size` of the network's input,
+    from `offset` (x, y) on, and the rest is grey.
+    """
+
+    image_size: tuple[int, int]
+    network_size: tuple[int, int]
+    content_size: tuple[int, int]
+
+    @classmethod
+    def of(cls, image_size: tuple[int, int], network_size: tuple[int, int]) -> Fit:
+        """Stretched to the whole input where that changes the aspect by less than 5 %, else with a border."""
+        (height, width), (rows, columns) = image_size, network_size
+        across, down = columns / width, rows / height
+        if max(across, down) <= _MOST_STRETCH * min(across, down):
+            return cls(image_size, network_size, network_size)
+        factor = min(across, down)
+        content = max(1, min(rows, round(factor * height))), max(1, min(columns, round(factor * width)))
+        return cls(image_size, network_size, content)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """float64 [2] (x, y): network pixels an image pixel."""
+        return np.array(self.content_size[::-1]) / np.array(self.image_size[::-1])
+
+    @property
+    def offset(self) -> np.ndarray:
+        """int64 [2] (x, y): where the image begins in the network's input."""
+        return (np.array(self.network_size[::-1]) - np.array(self.content_size[::-1])) // 2
+
+    def resize(self, image: np.ndarray) -> np.ndarray:
+        """uint8 [*network_size, 3] of `image` (uint8 [*image_size, 3])."""
+        shrinks = self.content_size[0] <= self.image_size[0]
+        way = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+        content = cv2.resize(image, self.content_size[::-1], interpolation=way)
+        if self.content_size == self.network_size:
+            return content
+        left, top = (int(value) for value in self.offset)
+        bottom = self.network_size[0] - self.content_size[0] - top
+        right = self.network_size[1] - self.content_size[1] - left
+        return cv2.copyMakeBorder(content, top, bottom, left, right, cv2.BORDER_CONSTANT, value=_BORDER)
+
+    def to_network(self, pixels: np.ndarray) -> np.ndarray:
+        """Where image pixels float [..., 2] lie in the network's input."""
+        return self.scale * (pixels + 0.5) - 0.5 + self.offset
+
+    def to_image(self, pixels: np.ndarray) -> np.ndarray:
+        """Where pixels float [..., 2] of the network's input lie in the image."""
+        return (pixels - self.offset + 0.5) / self.scale - 0.5
+
+    def map_to_image(self, values: np.ndarray, nearest: bool = False) -> np.ndarray:
+        """float32 [*image_size, ...] of a map float [*network_size, ...], interpolated; the border is left out."""
+        left, top = (int(value) for value in self.offset)
+        content = values[top : top + self.content_size[0], left : left + self.content_size[1]]
+        way = cv2.INTER_NEAREST_EXACT if nearest else cv2.INTER_LINEAR
+        return cv2.resize(np.asarray(content, np.float32), self.image_size[::-1], interpolation=way)
+
+    def intrinsics_to_image(self, intrinsics: np.ndarray) -> np.ndarray:
+        """(fx, fy, cx, cy) of the image, float64 [4], from those of the network's input."""
+        focal = np.asarray(intrinsics[:2], np.float64) / self.scale
+        return np.concatenate([focal, self.to_image(np.asarray(intrinsics[2:], np.float64))])
+
+
+def at_multiples(size: tuple[int, int], multiple: int, width: int | None = None) -> tuple[int, int]:
+    """(height, width) close to `size`, or of its shape with the given `width`, in multiples of `multiple`."""
+    factor = 1.0 if width is None else width / size[1]
+    height, width = (max(1, round(factor * side / multiple)) * multiple for side in size)
+    return height, width

@@ -1,0 +1,167 @@
+"""MASt3R (Leroy et al., ECCV 2024) as a point matcher: an encoder once an image, a decoder once a pair."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from vggtgeo.models.checks import check_image
+from vggtgeo.models.classical.sub_pixel import PatchAlignment
+from vggtgeo.models.classical.verification import EpipolarVerifier
+from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs, key_of
+from vggtgeo.models.onnx.contracts import MAST3R_ENCODER
+from vggtgeo.models.onnx.file_checks import NetworkFileError
+from vggtgeo.models.onnx.fit import Fit
+from vggtgeo.models.onnx.reciprocal import reciprocal
+from vggtgeo.models.onnx.session import DeviceArray, Session
+from vggtgeo.models.roles import Features, PointMatches
+
+_WANTED = ("descriptors_1", "descriptors_2", "descriptor_confidence_1", "descriptor_confidence_2")
+
+
+@dataclass(frozen=True, eq=False)
+class Mast3rView:
+    """What the matcher keeps of an image: itself, its fit, and its key points in the network's pixels, int [M, 2]."""
+
+    image: np.ndarray
+    fit: Fit
+    starts: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Mast3rMatcher:
+    """A `PointMatcher`. Key points: the strongest corner of each cell of the network's image; a match's target is any
+    pixel, so `index_j` is -1.
+
+    spacing: side of a cell, network pixels. tolerance: how far from its start the way back may end, network pixels.
+    stride: of the coarse search for nearest neighbours. corner: least corner strength (the smaller eigenvalue of the
+    structure tensor of an image in [0, 1]), which leaves blank walls without key points. kept: images whose encoder
+    features stay on the device.
+    """
+
+    encoder: Session
+    decoder: Session
+    cache: OutputCache = field(default_factory=MemoryCache)
+    spacing: int = 8
+    tolerance: float = 2.0
+    stride: int = 2
+    corner: float = 1e-5
+    kept: int = 24
+    verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)
+    refinement: PatchAlignment | None = field(default_factory=PatchAlignment)
+    _encoded: OrderedDict[str, DeviceArray] = field(default_factory=OrderedDict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.spacing < 1 or self.stride < 1 or self.tolerance < 0 or self.kept < 2:
+            raise ValueError(
+                f"`spacing` is {self.spacing}, `stride` {self.stride}, `tolerance` {self.tolerance} and `kept` "
+                f"{self.kept}; expected at least 1, 1, 0 and 2"
+            )
+        self._check_pair()
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the network's images, as the decoder's outputs have it."""
+        height, width = self.decoder.outputs["descriptors_1"].shape[1:3]
+        if height is None or width is None:
+            raise NetworkFileError(
+                f"`{self.decoder.path}` leaves the size of its outputs open, expected fixed ones; export it with a "
+                "height and a width"
+            )
+        return height, width
+
+    def describe(self, image: np.ndarray) -> Features:
+        """Key points of `image` (uint8 [H, W, 3]); the network runs when they are matched."""
+        check_image("image", image)
+        fit = Fit.of(image.shape[:2], self.size)
+        starts, strength = corners(fit.resize(image), self.spacing, self.corner)
+        pixels = fit.to_image(starts.astype(np.float64))
+        inside = ((pixels >= 0) & (pixels <= np.array(image.shape[1::-1]) - 1)).all(axis=1)
+        return Features(pixels[inside], strength[inside], Mast3rView(image, fit, starts[inside]))
+
+    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
+        """Verified matches from view i to view j; see `PointMatcher.match`. `predicted` is not used."""
+        first: Mast3rView = features_i.descriptors
+        second: Mast3rView = features_j.descriptors
+        settings = ("matches", self.spacing, self.corner, self.stride)
+        images = (first.image, second.image)
+        found = self.cache.get((self.encoder, self.decoder), settings, images, lambda: self._run(first, second))
+        pixels_j = second.fit.to_image(found["targets"].astype(np.float64))
+        inside = ((pixels_j >= 0) & (pixels_j <= np.array(second.image.shape[1::-1]) - 1)).all(axis=1)
+        index = np.flatnonzero(inside & (found["gap"] <= self.tolerance))
+        matches = PointMatches(
+            index,
+            np.full(len(index), -1, np.int64),
+            features_i.pixels[index],
+            pixels_j[index],
+            confidence_of(found["certainty"][index]),
+        )
+        matches = matches.select(self.verifier.inliers(matches.pixels_i, matches.pixels_j))
+        return self._refined(first, second, matches)
+
+    def _run(self, first: Mast3rView, second: Mast3rView) -> Outputs:
+        if not len(first.starts):
+            return {"targets": np.zeros((0, 2), np.int32), "gap": np.zeros(0), "certainty": np.zeros(0)}
+        features = {"features_1": self._encode(first), "features_2": self._encode(second)}
+        found = self.decoder.run(features, _WANTED)
+        targets, gap = reciprocal(found["descriptors_1"][0], found["descriptors_2"][0], first.starts, self.stride)
+        (x, y), (u, v) = first.starts.T, targets.T
+        certainty = np.minimum(found["descriptor_confidence_1"][0][y, x], found["descriptor_confidence_2"][0][v, u])
+        return {"targets": targets.astype(np.int32), "gap": gap, "certainty": certainty}
+
+    def _encode(self, view: Mast3rView) -> DeviceArray:
+        """Encoder features of an image, which stay on the device for the next pairs."""
+        key = key_of((), (), (view.image,))
+        if key not in self._encoded:
+            image = MAST3R_ENCODER.normalisation.apply(view.fit.resize(view.image))[None]
+            self._encoded[key] = self.encoder.run_on_device({"image": image})["features"]
+        self._encoded.move_to_end(key)
+        while len(self._encoded) > self.kept:
+            self._encoded.popitem(last=False)
+        return self._encoded[key]
+
+    def _refined(self, first: Mast3rView, second: Mast3rView, matches: PointMatches) -> PointMatches:
+        if self.refinement is None or not len(matches):
+            return matches
+        grays = [cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY) for view in (first, second)]
+        refined, _ = self.refinement.refine(grays[0], grays[1], matches.pixels_i, matches.pixels_j)
+        return replace(matches, pixels_j=refined)
+
+    def _check_pair(self) -> None:
+        given = self.encoder.inputs["image"].shape[2:]
+        if any(have is not None and have != want for have, want in zip(given, self.size, strict=True)):
+            raise NetworkFileError(
+                f"`{self.encoder.path}` takes images of {list(given)} (height, width) and `{self.decoder.path}` gives "
+                f"{list(self.size)}, expected one size; export both with the same height and width"
+            )
+        widths = self.encoder.outputs["features"].shape[2], self.decoder.inputs["features_1"].shape[2]
+        if None not in widths and widths[0] != widths[1]:
+            raise NetworkFileError(
+                f"`{self.encoder.path}` gives {widths[0]} channels and `{self.decoder.path}` takes {widths[1]}, "
+                "expected one number; export both from one checkpoint"
+            )
+
+
+def corners(image: np.ndarray, spacing: int, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """The strongest corner, int64 [M, 2] (x, y), of each cell of `spacing` pixels, and its strength, float64 [M].
+
+    image: uint8 [H, W, 3]. Cells whose strongest corner is below `least` have none.
+    """
+    strength = cv2.cornerMinEigenVal(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), blockSize=5, ksize=3)
+    height, width = (side // spacing * spacing for side in strength.shape)
+    cells = strength[:height, :width].reshape(height // spacing, spacing, width // spacing, spacing)
+    flat = cells.transpose(0, 2, 1, 3).reshape(-1, spacing * spacing)
+    best = flat.argmax(axis=1)
+    cell_y, cell_x = np.divmod(np.arange(len(flat)), width // spacing)
+    y, x = np.divmod(best, spacing)
+    pixels = np.stack([cell_x * spacing + x, cell_y * spacing + y], axis=1)
+    value = flat[np.arange(len(flat)), best].astype(np.float64)
+    return pixels[value > least], value[value > least]
+
+
+def confidence_of(certainty: np.ndarray) -> np.ndarray:
+    """c / (1 + c) in [0, 1) of the network's certainty c > 0."""
+    positive = np.maximum(np.asarray(certainty, np.float64), 0.0)
+    return positive / (1.0 + positive)

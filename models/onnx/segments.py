@@ -1,0 +1,44 @@
+"""What every network of line segments needs after it has answered."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from vggtgeo.models.roles import Segments
+
+
+def tidy(image: np.ndarray, endpoints: np.ndarray, scores: np.ndarray, shortest: float, count: int) -> Segments:
+    """Segments clipped to `image` (uint8 [H, W, 3]), directed by their brighter side, best first.
+
+    endpoints: float [L, 2, 2], pixels. scores: float [L]. Those shorter than `shortest` pixels are dropped, and all
+    but the best `count`.
+    """
+    height, width = image.shape[:2]
+    ends = np.clip(np.asarray(endpoints, np.float64).reshape(-1, 2, 2), 0.0, [width - 1.0, height - 1.0])
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    order = np.argsort(-scores, kind="stable")
+    order = order[length[order] >= shortest][:count]
+    return Segments(directed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), ends[order]), scores[order].astype(np.float64))
+
+
+def directed(gray: np.ndarray, endpoints: np.ndarray, samples: int = 16, reach: float = 3.0) -> np.ndarray:
+    """`endpoints` [L, 2, 2] with ends swapped so that the brighter side lies where LSD has it: on the left.
+
+    gray: uint8 [H, W]. The sides are compared `reach` pixels from the segment; left is meant as the image shows it,
+    going from end 0 to end 1. Line descriptors and gates compare directions, which a network leaves to chance.
+    """
+    if not len(endpoints):
+        return endpoints
+    along = endpoints[:, 1] - endpoints[:, 0]
+    right = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    place = np.linspace(0.1, 0.9, samples)[:, None]
+    middle = endpoints[:, None, 0] + place * along[:, None]
+    smooth = cv2.GaussianBlur(gray, (0, 0), 1.0).astype(np.float32)
+    sides = [_read(smooth, middle + sign * reach * right[:, None]).mean(axis=1) for sign in (1.0, -1.0)]
+    swap = sides[0] > sides[1]
+    return np.where(swap[:, None, None], endpoints[:, ::-1], endpoints)
+
+
+def _read(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    x, y = pixels.astype(np.float32).transpose(2, 0, 1)
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
