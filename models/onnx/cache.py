@@ -49,12 +49,13 @@ class MemoryCache:
     ) -> Outputs:
         """See `OutputCache.get`."""
         key = key_of([str(id(session)) for session in sessions], settings, images)
-        if key not in self._kept:
-            self._kept[key] = compute()
-        self._kept.move_to_end(key)
+        found = self._kept.pop(key, None)
+        if found is None:
+            found = compute()
+        self._kept[key] = found
         while len(self._kept) > self.size:
             self._kept.popitem(last=False)
-        return self._kept[key]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +95,7 @@ def key_of(networks: Sequence[str], settings: tuple[object, ...], images: Sequen
 
 def _read(path: Path) -> Outputs | None:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except (FileNotFoundError, EOFError, ValueError, zipfile.BadZipFile):
         return None

@@ -1,0 +1,272 @@
+"""MASt3R and DINOv3 behind ONNX, and the cache of what networks answer."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import plane_views as views
+import pytest
+import tiny_networks as tiny
+from vggtgeo.models.onnx import contracts
+from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
+from vggtgeo.models.onnx.dinov3 import DescriptorGrid, DinoFeatures, saliency
+from vggtgeo.models.onnx.file_checks import NetworkFileError
+from vggtgeo.models.onnx.fit import Fit
+from vggtgeo.models.onnx.mast3r import Mast3rMatcher, confidence_of, corners
+from vggtgeo.models.onnx.reciprocal import nearest, reciprocal
+from vggtgeo.models.onnx.session import Session, open_session
+from vggtgeo.models.roles import DenseConfidence, PointMatcher
+
+MOTION = views.pose((1.0, -2.0, 3.0), (0.1, -0.05, 0.05))
+SIZE = (240, 320)
+
+
+def _matcher(folder: Path, **settings: object) -> Mast3rMatcher:
+    encoder = tiny.mast3r_encoder(folder / "encoder.onnx", SIZE)
+    decoder = tiny.mast3r_decoder(folder / "decoder.onnx", SIZE)
+    return Mast3rMatcher(
+        open_session(encoder, contracts.MAST3R_ENCODER), open_session(decoder, contracts.MAST3R_DECODER), **settings
+    )
+
+
+def test_matches_follow_the_known_motion(tmp_path: Path) -> None:
+    # Proves encoder, decoder, reciprocal search and refinement together: the tiny decoder's descriptors are filters
+    # of the image, so that matches can be judged. Oracle: the homography between two views of a plane.
+    first, second, homography = views.plane_pair(MOTION)
+    matcher = _matcher(tmp_path)
+    assert isinstance(matcher, PointMatcher)
+    matches = matcher.match(matcher.describe(first), matcher.describe(second))
+    errors = np.linalg.norm(views.move(homography, matches.pixels_i) - matches.pixels_j, axis=1)
+    measured = f"{len(matches)} matches, median error {np.median(errors):.3f} px, {np.mean(errors > 3):.1%} wrong"
+    assert len(matches) > 200, measured
+    assert np.median(errors) < 0.15, measured
+    assert np.mean(errors > 3) < 0.03, measured
+    assert (matches.index_j == -1).all()
+    assert len(np.unique(matches.index_i)) == len(matches)
+
+
+def test_blank_images_have_no_key_points(tmp_path: Path) -> None:
+    # Proves that a blank image costs nothing and matches nothing. Oracle: there is nothing to find.
+    matcher = _matcher(tmp_path)
+    blank = matcher.describe(np.full((*SIZE, 3), 90, np.uint8))
+    full = matcher.describe(views.plane_pair(MOTION)[0])
+    assert len(blank) == 0
+    assert len(matcher.match(blank, full)) == 0
+    assert len(matcher.match(full, blank)) == 0
+
+
+def test_an_image_is_encoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that the encoder runs once an image, not once a pair, until `kept` others came. Oracle: a count.
+    matcher = _matcher(tmp_path, cache=MemoryCache(0), kept=3)
+    real, runs = Session.run_on_device, []
+
+    def run(self: Session, inputs: dict, wanted: object = None) -> object:
+        runs.extend([self] if self is matcher.encoder else [])
+        return real(self, inputs, wanted)
+
+    monkeypatch.setattr(Session, "run_on_device", run)
+    pictures = [views.texture(seed, (320, 240)) for seed in range(4)]
+    described = [matcher.describe(picture) for picture in pictures]
+    assert runs == []
+    for first, second, expected in ((0, 1, 2), (1, 2, 3), (0, 2, 3), (0, 3, 4), (1, 0, 5)):
+        matcher.match(described[first], described[second])
+        assert len(runs) == expected, (first, second)
+
+
+def test_encoder_and_decoder_must_be_of_one_size(tmp_path: Path) -> None:
+    # Proves that halves of two different exports are refused before any image. Oracle: their sizes and channels.
+    decoder = open_session(tiny.mast3r_decoder(tmp_path / "decoder.onnx", SIZE), contracts.MAST3R_DECODER)
+    small = open_session(tiny.mast3r_encoder(tmp_path / "small.onnx", (48, 64)), contracts.MAST3R_ENCODER)
+    with pytest.raises(
+        NetworkFileError, match=r"small.onnx` takes images of \[48, 64\].*decoder.onnx` gives \[240, 320"
+    ):
+        Mast3rMatcher(small, decoder)
+    features = {"features": np.zeros((1, 300, 9))}
+    other = tiny.constant(tmp_path / "other.onnx", "mast3r_encoder", {"image": (1, 3, *SIZE)}, features)
+    with pytest.raises(NetworkFileError, match=r"gives 9 channels and .* takes 768"):
+        Mast3rMatcher(open_session(other, contracts.MAST3R_ENCODER), decoder)
+
+
+def test_the_strongest_corner_of_each_cell_is_taken() -> None:
+    # Proves that corners cover the image and blank cells have none. Oracle: an image with one known corner in a cell.
+    image = np.zeros((64, 96, 3), np.uint8)
+    image[20:40, 30:] = 200
+    pixels, strength = corners(image, 16, 1e-5)
+    assert len(np.unique(pixels // 16, axis=0)) == len(pixels)
+    best = pixels[strength.argmax()]
+    assert np.abs(best - [30, 20]).max() <= 2 or np.abs(best - [30, 39]).max() <= 2
+    assert (pixels[:, 0] > 20).all()
+
+
+def _smooth_grid(seed: int, shape: tuple[int, int] = (24, 30)) -> np.ndarray:
+    """Unit descriptors that vary smoothly, as a network's do."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    waves = rng.uniform(-0.5, 0.5, (12, 2))
+    phase = waves[:, :1, None] * x + waves[:, 1:, None] * y
+    grid = np.concatenate([np.sin(phase), np.cos(phase)]).transpose(1, 2, 0)
+    return (grid / np.linalg.norm(grid, axis=2, keepdims=True)).astype(np.float32)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_nearest_is_the_brute_force_answer(stride: int) -> None:
+    # Proves the search, coarse or not, on smooth descriptors with noisy queries. Oracle: all inner products.
+    grid = _smooth_grid(0)
+    rng = np.random.default_rng(1)
+    queries = grid.reshape(-1, 24)[rng.choice(720, 300)] + rng.normal(0, 0.02, (300, 24)).astype(np.float32)
+    brute = np.stack(np.divmod((queries @ grid.reshape(-1, 24).T).argmax(axis=1), 30)[::-1], axis=1)
+    np.testing.assert_array_equal(nearest(queries.astype(np.float32), grid, stride), brute)
+
+
+def test_the_way_back_ends_at_its_start_only_for_true_matches() -> None:
+    # Proves the reciprocal check: where the second map lacks the start's content, the way back ends elsewhere.
+    # Oracle: a shift by 4 pixels, for which the first columns have no counterpart.
+    grid = _smooth_grid(0, (24, 60))
+    first, second = grid[:, :40], grid[:, 4:44]
+    starts = np.stack(np.meshgrid(np.arange(0, 40, 4), np.arange(2, 24, 4)), axis=-1).reshape(-1, 2)
+    targets, gap = reciprocal(first, second, starts, stride=1)
+    seen = starts[:, 0] >= 4
+    np.testing.assert_array_equal(targets[seen], starts[seen] - [4, 0])
+    assert (gap[seen] == 0).all()
+    assert (gap[~seen] > 2).all()
+
+
+def test_certainty_becomes_a_confidence() -> None:
+    # Proves the range and the order. Oracle: c / (1 + c).
+    np.testing.assert_allclose(confidence_of(np.array([0.0, 1.0, 3.0, np.inf])[:3]), [0, 0.5, 0.75])
+
+
+# --- DINOv3 ------------------------------------------------------------------------------------------------------
+
+
+def test_saliency_is_attention_relative_to_the_mean() -> None:
+    # Proves Omega = s / (1 + s). Oracle: two heads by hand; the five prefix columns count nothing.
+    attention = np.array([[0.9, 0.9, 0.9, 0.9, 0.9, 0.1, 0.3], [0, 0, 0, 0, 0, 0.3, 0.5]])
+    s = np.array([0.2, 0.4]) / 0.3
+    np.testing.assert_allclose(saliency(attention), s / (1 + s), rtol=1e-6)
+
+
+def test_confidence_is_high_where_the_network_looks(tmp_path: Path) -> None:
+    # Proves that the patch grid comes back to the image the right way round. Oracle: the tiny network attends to the
+    # patches with most energy, and only one quarter of the image has any.
+    image = np.full((96, 128, 3), 120, np.uint8)
+    image[:48, 64:] = views.texture(0, (64, 48))
+    role = DinoFeatures(open_session(tiny.dinov3(tmp_path / "dinov3.onnx", (96, 128)), contracts.DINOV3))
+    assert isinstance(role, DenseConfidence)
+    omega = role.confidence(image)
+    assert omega.dtype == np.float32
+    assert omega.shape == (96, 128)
+    assert (omega >= 0).all()
+    assert (omega < 1).all()
+    means = [part.mean() for half in np.split(omega, 2, axis=0) for part in np.split(half, 2, axis=1)]
+    assert np.argmax(means) == 1, means
+    assert means[1] > 1.5 * max(means[0], means[2], means[3]), means
+
+
+def test_descriptors_are_interpolated_between_patch_centres() -> None:
+    # Proves where patches lie and how descriptors between them come about. Oracle: a grid that is linear in x and y.
+    fit = Fit.of((96, 128), (48, 64))
+    y, x = np.mgrid[:3, :4]
+    grid = np.stack([x, y, np.full(x.shape, 5.0)], axis=-1).astype(np.float32)
+    pixels = np.random.default_rng(0).uniform((16, 16), (111, 79), (50, 2))
+    place = ((pixels + 0.5) / 2) / 16 - 0.5
+    expected = np.column_stack([place, np.full(50, 5.0)])
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(DescriptorGrid(grid, fit, 16).at(pixels), expected, atol=1e-5)
+
+
+def test_pixels_beyond_the_outermost_centres_take_those(tmp_path: Path) -> None:
+    # Proves that no pixel of the image is out of reach, even on one patch. Oracle: the corner patches.
+    fit = Fit.of((32, 48), (32, 48))
+    grid = np.eye(6, dtype=np.float32).reshape(2, 3, 6)
+    corner = DescriptorGrid(grid, fit, 16).at(np.array([[0.0, 0], [47, 0], [0, 31], [47, 31]]))
+    np.testing.assert_allclose(corner, np.eye(6)[[0, 2, 3, 5]])
+    lonely = DescriptorGrid(grid[:1, :1], Fit.of((16, 16), (16, 16)), 16).at(np.array([[3.0, 9.0]]))
+    np.testing.assert_allclose(lonely, np.eye(6)[:1])
+
+
+# --- the cache ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    return open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
+
+
+def _counted(values: Outputs) -> tuple[Callable[[], Outputs], list[int]]:
+    calls: list[int] = []
+
+    def compute() -> Outputs:
+        calls.append(1)
+        return values
+
+    return compute, calls
+
+
+@pytest.mark.parametrize("kind", ["memory", "folder"])
+def test_what_was_asked_before_is_not_computed_again(tmp_path: Path, session: Session, kind: str) -> None:
+    # Proves that equal questions are answered from the cache and any change asks again. Oracle: a count.
+    cache: OutputCache = MemoryCache(9) if kind == "memory" else FolderCache(tmp_path / "cache")
+    image = views.texture(0, (64, 48))
+    other = image.copy()
+    other[0, 0, 0] ^= 1
+    compute, calls = _counted({"a": np.arange(6.0).reshape(2, 3), "b": np.array(3, np.float16)})
+    questions = [(("x", 1), (image,)), (("x", 2), (image,)), (("x", 1), (other,)), (("x", 1), (image, other))]
+    for count, (settings, images) in enumerate(questions, start=1):
+        for _ in range(2):
+            found = cache.get((session,), settings, images, compute)
+            assert len(calls) == count, (settings, len(images))
+            np.testing.assert_array_equal(found["a"], np.arange(6.0).reshape(2, 3))
+            assert found["b"] == 3
+
+
+def test_another_file_is_another_network(tmp_path: Path, session: Session) -> None:
+    # Proves that the cache of a folder is bound to the file's content, not to its name. Oracle: two contents.
+    cache = FolderCache(tmp_path / "cache")
+    other = open_session(tiny.letr(tmp_path / "other.onnx", lines=[(0.1, 0.1, 0.9, 0.9)]), contracts.LETR)
+    again = open_session(tiny.letr(tmp_path / "again.onnx"), contracts.LETR)
+    compute, calls = _counted({"a": np.zeros(1)})
+    for network, count in ((session, 1), (other, 2), (again, 2)):
+        cache.get((network,), (), (), compute)
+        assert len(calls) == count
+
+
+def test_a_broken_file_of_the_cache_is_computed_again(tmp_path: Path, session: Session) -> None:
+    # Proves that damage costs a computation, never the run, and that nothing temporary stays. Oracle: cut files.
+    cache = FolderCache(tmp_path / "cache")
+    compute, calls = _counted({"a": np.arange(5.0)})
+    cache.get((session,), (), (), compute)
+    (path,) = (tmp_path / "cache").rglob("*.npz")
+    whole = path.read_bytes()
+    for count, content in enumerate((b"", whole[: len(whole) // 2], b"PK" + bytes(30)), start=2):
+        path.write_bytes(content)
+        np.testing.assert_array_equal(cache.get((session,), (), (), compute)["a"], np.arange(5.0))
+        assert len(calls) == count
+        assert path.read_bytes() == whole
+    assert [file.name for file in (tmp_path / "cache").rglob("*") if file.is_file()] == [path.name]
+
+
+def test_a_failed_computation_leaves_nothing(tmp_path: Path, session: Session) -> None:
+    # Proves that an interrupted run leaves no half answer. Oracle: the folder after an interruption.
+    def interrupted() -> Outputs:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        FolderCache(tmp_path / "cache").get((session,), (), (), interrupted)
+    assert not (tmp_path / "cache").exists()
+
+
+def test_the_key_separates_shape_from_content() -> None:
+    # Proves that two images with the same bytes differ by their shape. Oracle: a reshaped array.
+    image = np.zeros((4, 6, 3), np.uint8)
+    assert key_of(("n",), (), (image,)) != key_of(("n",), (), (image.reshape(6, 4, 3),))
+    assert key_of(("n",), (), (image,)) == key_of(("n",), (), (np.asfortranarray(image),))
+
+
+def test_the_memory_forgets_the_oldest(session: Session) -> None:
+    # Proves the bound on memory. Oracle: a count, and what is still known.
+    cache = MemoryCache(2)
+    compute, calls = _counted({"a": np.zeros(1)})
+    for settings in ((1,), (2,), (1,), (3,), (1,), (2,)):
+        cache.get((session,), settings, (), compute)
+    assert len(calls) == 4
