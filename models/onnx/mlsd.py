@@ -42,10 +42,14 @@ class MlsdDetector:
         return tidy(image, (2.0 * ends + 0.5) * stretch - 0.5, scores, self.shortest, self.count)
 
     def _run(self, image: np.ndarray) -> Outputs:
-        colours = MLSD.normalisation.apply(cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA))
-        ones = np.full((1, _SIDE, _SIDE), 1.0 / 127.5 - 1.0, np.float32)
-        maps = self.session.run({"image": np.concatenate([colours, ones])[None]})["maps"]
+        maps = self.session.run({"image": prepare(image)[None]})["maps"]
         return {"maps": maps[0, :5]}
+
+
+def prepare(image: np.ndarray) -> np.ndarray:
+    """The network's input, float32 [4, 512, 512], of `image` (uint8 [H, W, 3])."""
+    colours = MLSD.normalisation.apply(cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA))
+    return np.concatenate([colours, np.full((1, _SIDE, _SIDE), 1.0 / 127.5 - 1.0, np.float32)])
 
 
 def decode_maps(maps: np.ndarray, score: float, least_length: float, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -40,6 +40,7 @@ COMMANDS = (
         "vggtgeo.cli.simulate",
         "Render a hand-held walk through SCENE as a TUM RGB-D folder with exact truth.",
     ),
+    CommandEntry("models", "vggtgeo.cli.models", "List, check, fetch and export the networks of the roles."),
 )
 
 
@@ -63,8 +64,11 @@ class _LazyGroup(TyperGroup):
 
 
 def load_command(entry: CommandEntry) -> Any:
-    """The command itself, made of the annotated function that implements it."""
+    """The command itself, made of the annotated function, or the group, that implements it."""
     function = getattr(importlib.import_module(entry.module), entry.name.replace("-", "_"))
+    if isinstance(function, typer.Typer):  # a group of commands
+        function.info.name = entry.name
+        return typer.main.get_command(function)
     single = typer.Typer(add_completion=False)
     single.command(entry.name)(function)
     return typer.main.get_command(single)

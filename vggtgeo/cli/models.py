@@ -1,0 +1,123 @@
+"""`vggtgeo models`: the networks of the perception roles, as files.
+
+What is heavy is imported when a command begins, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from vggtgeo.errors import InputError
+
+if TYPE_CHECKING:
+    from vggtgeo.models.onnx.registry import Network
+
+Folder = Annotated[
+    Path | None,
+    typer.Option("--models", metavar="DIR", help="Folder of the files; else VGGTGEO_MODELS, else the user's data."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Provider = Literal["auto", "cuda", "cpu"]
+
+models = typer.Typer(no_args_is_help=True, help="List, check, fetch and export the networks of the roles.")
+
+
+@models.callback()
+def group() -> None:
+    """List, check, fetch and export the networks of the roles."""
+
+
+@models.command("list")
+def list_networks(folder: Folder = None, as_json: AsJson = False) -> None:
+    """List the networks: role, licence, size, how to get each, and whether it is there."""
+    from vggtgeo.models.onnx.registry import NETWORKS
+    from vggtgeo.network_files import networks_folder
+
+    place = networks_folder(folder)
+    rows = [_row(network, place) for network in NETWORKS.values()]
+    if as_json:
+        typer.echo(json.dumps({"folder": str(place), "networks": rows}, ensure_ascii=False))
+        return
+    for row in rows:
+        typer.echo(f"{row['name']}  {'present' if row['present'] else 'absent'}  {row['megabytes']} MB  {row['role']}")
+        typer.echo(f"    {row['paper']}")
+        typer.echo(f"    {row['licence']}: {row['allows']}")
+        typer.echo(f"    {row['get']}")
+    typer.echo(f"folder: {place}")
+
+
+@models.command()
+def path(
+    name: Annotated[str | None, typer.Argument(help="A network; without it, the folder.", show_default=False)] = None,
+    folder: Folder = None,
+) -> None:
+    """Print the folder of the networks, or where the file of NAME lies or would lie."""
+    from vggtgeo.network_files import network_named, networks_folder
+
+    place = networks_folder(folder)
+    typer.echo(str(place if name is None else place / network_named(name).file))
+
+
+@models.command()
+def fetch(
+    name: Annotated[str, typer.Argument(help="A network that is published as an ONNX file.")],
+    folder: Folder = None,
+    endpoint: Annotated[str | None, typer.Option(help="Address of the hub, for a mirror.")] = None,
+) -> None:
+    """Download the published file of NAME and check its hash."""
+    from vggtgeo.network_files import fetch_network, network_named, networks_folder
+
+    network = network_named(name)
+    typer.echo(f"{network.name}: {network.licence}; allows {network.allows}", err=True)
+    typer.echo(str(fetch_network(network, networks_folder(folder), endpoint)))
+
+
+@models.command()
+def verify(
+    file: Annotated[Path, typer.Argument(help="An ONNX file.", show_default=False)],
+    network: Annotated[
+        str | None, typer.Option(help="The network it should be; else what it says, or looks like.", show_default=False)
+    ] = None,
+    image: Annotated[Path | None, typer.Option(help="A photograph; else a rendered room is shown.")] = None,
+    against: Annotated[
+        Path | None, typer.Option(metavar="FILE.npz", help="Record of PyTorch's outputs; else FILE.parity.npz, if any.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, help="Timed runs.")] = 3,
+    provider: Annotated[Provider, typer.Option(help="Where it runs.")] = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Check FILE: contract, finite outputs on an image, latency, and parity with PyTorch where it is recorded."""
+    from vggtgeo.cli.verify_network import faults, print_report, verify_file
+
+    report = verify_file(file, network, image, against, runs, provider)
+    if as_json:
+        typer.echo(json.dumps(asdict(report)))
+    else:
+        print_report(report)
+    wrong = faults(report)
+    if wrong:
+        raise InputError(f"`{file}` is not fit for use: {'; '.join(wrong)}")
+
+
+def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
+    get = (
+        f"vggtgeo models fetch {network.name}"
+        if network.hub
+        else f"vggtgeo models export {network.contract_name}, from {network.code} with {network.weights}"
+    )
+    return {
+        "name": network.name,
+        "role": network.role,
+        "present": (place / network.file).is_file(),
+        "file": str(place / network.file),
+        "megabytes": network.megabytes,
+        "paper": network.paper,
+        "licence": network.licence,
+        "allows": network.allows,
+        "get": get,
+    }

@@ -1,0 +1,122 @@
+"""What `vggtgeo models verify` does: open a file as a network, run it on an image, time it, compare it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import typer
+
+from vggtgeo.cli.network_errors import as_input_errors
+from vggtgeo.errors import InputError
+from vggtgeo.models.onnx import verification
+from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, PARITY_SUFFIX
+from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
+from vggtgeo.models.onnx.registry import NETWORKS
+from vggtgeo.models.onnx.session import Provider, open_session, read_signature
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was found. inputs: shapes that were shown. parity: largest relative difference from PyTorch an output,
+    empty where nothing is recorded; limit: what of it is only rounding. latency: seconds.
+    """
+
+    file: str
+    network: str
+    provider: str
+    random_weights: bool
+    sha256: str
+    inputs: dict[str, tuple[int, ...]]
+    outputs: dict[str, verification.Output]
+    latency: float
+    parity: dict[str, float]
+    limit: float
+
+
+def verify_file(
+    file: Path, network: str | None, image: Path | None, against: Path | None, runs: int, provider: Provider
+) -> Report:
+    """Check one file; raises `InputError` where it cannot be opened, is another network, or fails while it runs."""
+    beside = file.with_name(file.name + PARITY_SUFFIX)
+    record = against or (beside if beside.is_file() else None)
+    with as_input_errors():
+        session = open_session(file, CONTRACTS[_contract_name(file, network)], provider=provider)
+        inputs = verification.example_inputs(session, shown_image(image))
+        return Report(
+            file=str(file),
+            network=session.contract.network,
+            provider=session.provider,
+            random_weights=session.random_weights,
+            sha256=session.digest,
+            inputs={name: array.shape for name, array in inputs.items()},
+            outputs=verification.check_outputs(session, inputs),
+            latency=verification.latency(session, inputs, runs),
+            parity=verification.parity(session, record) if record else {},
+            limit=verification.tolerance(session),
+        )
+
+
+def faults(report: Report) -> list[str]:
+    """What makes the file unfit for use; empty for a good one."""
+    wrong = [
+        f"`{name}` holds {output.not_finite} values that are not finite"
+        for name, output in report.outputs.items()
+        if output.not_finite
+    ]
+    return wrong + [
+        f"`{name}` differs from PyTorch by {gap:.2g}, expected at most {report.limit:g}"
+        for name, gap in report.parity.items()
+        if not gap <= report.limit
+    ]
+
+
+def print_report(report: Report) -> None:
+    """The report as lines of text."""
+    typer.echo(f"{report.file}: keeps the contract of {report.network}")
+    if report.random_weights:
+        typer.echo("its weights are random: what it answers means nothing")
+    typer.echo(f"sha256 {report.sha256}")
+    for name, shape in report.inputs.items():
+        typer.echo(f"input {name} {list(shape)}")
+    for name, output in report.outputs.items():
+        state = f"{output.not_finite} values not finite" if output.not_finite else "all finite"
+        typer.echo(f"output {name} {list(output.shape)}: {output.lowest:.4g} to {output.highest:.4g}, {state}")
+    typer.echo(f"latency {1e3 * report.latency:.1f} ms on {report.provider}")
+    if report.parity:
+        typer.echo(f"differs from PyTorch by {max(report.parity.values()):.1e} (at most {report.limit:g} expected)")
+    else:
+        typer.echo("no record of PyTorch's outputs to compare with")
+
+
+def shown_image(path: Path | None) -> np.ndarray:
+    """A photograph, or a view of the simulated room: uint8 [H, W, 3]."""
+    if path is None:
+        from vggtgeo.simulation.sequence import simulate
+
+        return simulate("room", 1, 0, (640, 480)).frame(0).image
+    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+    if pixels is None:
+        raise InputError(f"`{path}` cannot be read as an image; give a PNG or JPEG file")
+    return pixels
+
+
+def _contract_name(file: Path, asked: str | None) -> str:
+    """The contract asked for, else the one the file names in its metadata, else the one it keeps."""
+    if asked is not None:
+        if asked not in NETWORKS:
+            raise InputError(f"`--network` is {asked!r}; it must be one of {', '.join(NETWORKS)}")
+        return NETWORKS[asked].contract_name
+    inputs, outputs, metadata = read_signature(file)
+    named = metadata.get(METADATA_NETWORK)
+    if named in CONTRACTS:
+        return named
+    like = recognise(inputs, outputs)
+    if not like:
+        listing = ", ".join(f"`{name}` {signature}" for name, signature in {**inputs, **outputs}.items())
+        raise NetworkFileError(
+            f"`{file}` keeps the contract of no network that is known ({', '.join(CONTRACTS)}); it has {listing}"
+        )
+    return like[0]
