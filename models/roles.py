@@ -6,7 +6,7 @@ that checks its shapes when it is made, so that a wrong implementation is caught
 
 | role | protocol | a network that fits |
 |---|---|---|
-| point matches | `PointMatcher` | MASt3R (encoder in `describe`, decoder in `match`, `index_j = -1`) |
+| point matches | `PointMatcher` | MASt3R (encoder once an image, decoder once a pair, `index_j = -1`) |
 | line segments | `LineDetector`, `LineMatcher` | LETR, M-LSD |
 | metric depth | `MetricDepth` | MoGe-2 |
 | dense confidence | `DenseConfidence` | DINOv3 |
@@ -298,7 +298,8 @@ class PoseQuery:
     image: uint8 [H, W, 3] of the frame. intrinsics: float [4].
     points: float [n, 3], world points (metres) that are matched in the frame; pixels: float [n, 2], where.
     confidence: float [n] in [0, 1]. predicted: float [4, 4], the pose a motion model expects, or None.
-    window_images, window_poses: recent keyframes, for an implementation that looks at images; may be empty.
+    window_images, window_poses: recent keyframes, newest first, for an implementation that looks at images; may be
+    empty.
     window_depths: their metric depth, float [H, W] each, NaN = none, for one that finds no scale itself; may be empty.
     """
 

@@ -16,10 +16,17 @@ class WindowLocator:
     The model places the query's keyframes and its frame together; the window is then aligned to the keyframes' known
     poses, and the frame's pose in it becomes the prediction that the judge accepts, improves or replaces by its own.
     Where the window does not determine it, the judge works with the query's prediction.
+
+    views: most views the model takes, the frame included, None for any number; the query's first keyframes are taken.
     """
 
     model: WindowGeometry
     judge: InitialGeometry
+    views: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.views is not None and self.views < 2:
+            raise ValueError(f"`views` is {self.views}, expected at least 2: a keyframe and the frame")
 
     def locate(self, query: PoseQuery) -> PoseGuess:
         """The pose of the query's frame; see `InitialGeometry.locate`."""
@@ -39,8 +46,10 @@ class WindowLocator:
     def _predict(self, query: PoseQuery) -> np.ndarray | None:
         if not query.window_images:
             return None
-        guess = self.model.window([*query.window_images, query.image], np.asarray(query.intrinsics))
+        most = None if self.views is None else self.views - 1
+        images, poses, depths = query.window_images[:most], query.window_poses[:most], query.window_depths[:most]
+        guess = self.model.window([*images, query.image], np.asarray(query.intrinsics))
         if not guess.found[-1]:
             return None
-        aligned = align_window(guess, np.stack(query.window_poses), query.window_depths)
+        aligned = align_window(guess, np.stack(poses), depths)
         return None if aligned is None else aligned.poses[-1]

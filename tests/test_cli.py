@@ -1,6 +1,5 @@
 """The program: quick to help, one line for an error, and `solve` from file to file."""
 
-import importlib
 import json
 import os
 import subprocess

@@ -24,7 +24,9 @@ Folder = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Provider = Literal["auto", "cuda", "cpu"]
 
-models = typer.Typer(no_args_is_help=True, help="List, check, fetch and export the networks of the roles.")
+models = typer.Typer(
+    no_args_is_help=True, add_completion=False, help="List, check, fetch and export the networks of the roles."
+)
 
 
 @models.callback()

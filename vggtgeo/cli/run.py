@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import cv2
 import typer
@@ -27,8 +29,12 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window import warm_up
 from vggtgeo.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from vggtgeo.cli.presets import Perception
+
 Init = Literal["pnp", "constant-velocity"]
 Features = Literal["sift", "orb"]
+Preset = Literal["classical", "light", "paper"]
 
 
 def run(
@@ -48,6 +54,11 @@ def run(
     no_global: Annotated[bool, typer.Option("--no-global", help="Ablation: the sliding window alone.")] = False,
     init: Annotated[Init, typer.Option(help="How a new frame's pose starts.")] = "pnp",
     features: Annotated[Features, typer.Option(help="Key points.")] = "sift",
+    preset: Annotated[
+        Preset, typer.Option(help="Who perceives: classical code, or networks (see `vggtgeo models list`).")
+    ] = "classical",
+    models: Annotated[Path | None, typer.Option("--models", help="Folder of the networks' files.")] = None,
+    cache: Annotated[Path | None, typer.Option("--cache", help="Folder to keep what the networks answer.")] = None,
     save_depth: Annotated[bool, typer.Option("--save-depth", help="Write each keyframe's dense depth.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no report.")] = False,
@@ -66,18 +77,37 @@ def run(
         depth_weight=0.0 if no_depth_prior else SlamSettings.depth_weight,
         global_adjustment=not no_global,
     )
-    roles = make_roles(sequence, init, features)
+    perceived = make_perception(preset, make_roles(sequence, init, features), models, cache)
     flags = {
         "path": str(path),
         **{"start": start, "end": end, "stride": stride, "intrinsics": intrinsics, "rgb_only": rgb_only},
         **{"no_lines": no_lines, "no_depth_prior": no_depth_prior, "no_confidence": no_confidence},
         **{"no_global": no_global, "init": init, "features": features, "seed": seed},
+        **{"preset": preset, "models": models and str(models), "cache": cache and str(cache)},
     }
     run_and_write(
-        sequence, roles, settings, output, flags, (start, end, stride), save_depth=save_depth, quiet=quiet or as_json
+        sequence,
+        perceived.roles,
+        settings,
+        output,
+        flags,
+        (start, end, stride),
+        save_depth=save_depth,
+        quiet=quiet or as_json,
+        facts=perceived.facts(),
     )
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
+
+
+def make_perception(preset: str, classical: Roles, models: Path | None, cache: Path | None) -> Perception:
+    """The roles of a preset; warns of networks whose weights are random."""
+    from vggtgeo.cli.presets import perception
+
+    perceived = perception(preset, classical, models, cache)
+    if perceived.random:
+        warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
+    return perceived
 
 
 def make_roles(sequence: Sequence, init: str, features: str) -> Roles:
@@ -101,6 +131,7 @@ def run_and_write(
     save_depth: bool = False,
     quiet: bool = False,
     label: str = "",
+    facts: Mapping[str, Any] = MappingProxyType({}),
 ) -> Slam:
     """Run a sequence with a progress bar, write every output into `folder`, and print the report."""
     console = Console(stderr=False, quiet=quiet)
@@ -131,6 +162,7 @@ def run_and_write(
         flags,
         seconds,
         report,
+        **facts,
         **{"map_points": points, "frames_per_second": round(frames_per_second, 2), "interrupted": interrupted},
     )
     _print_report(console, slam, report, folder, frames_per_second, points)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,21 +33,35 @@ def track(
     predicted: np.ndarray | None,
     intrinsics: np.ndarray,
     roles: Roles,
+    window: Sequence[Keyframe] = (),
 ) -> Track:
-    """The pose of a frame from its matches to `keyframe`; a failure is in the result code of the guess."""
+    """The pose of a frame from its matches to `keyframe`; a failure is in the result code of the guess.
+
+    window: keyframes that a model which looks at images may place the frame among.
+    """
     matches = roles.points.match(keyframe.features, features)
     inverse_depth = keyframe.points.inverse_depth[matches.index_i]
     known = np.isfinite(inverse_depth)
     matches = matches.select(known)
     points = rigid.unproject(matches.pixels_i, inverse_depth[known], keyframe.pose, intrinsics)
-    query = PoseQuery(image, intrinsics, points, matches.pixels_j, matches.confidence, predicted)
+    query = PoseQuery(
+        image,
+        intrinsics,
+        points,
+        matches.pixels_j,
+        matches.confidence,
+        predicted,
+        window_images=tuple(member.image for member in window),
+        window_poses=tuple(member.pose for member in window),
+        window_depths=tuple(member.depth for member in window) if roles.metric else (),
+    )
     return Track(keyframe, matches, roles.geometry.locate(query))
 
 
 def track_any(
     image: np.ndarray,
     features: Features,
-    keyframes: Iterable[Keyframe],
+    keyframes: Sequence[Keyframe],
     predicted: np.ndarray | None,
     intrinsics: np.ndarray,
     roles: Roles,
@@ -56,7 +70,7 @@ def track_any(
     """The first track with `enough` inliers among `keyframes`, else the best of them."""
     best: Track | None = None
     for keyframe in keyframes:
-        found = track(image, features, keyframe, predicted, intrinsics, roles)
+        found = track(image, features, keyframe, predicted, intrinsics, roles, keyframes)
         if best is None or (found.found, found.guess.inlier_count) > (best.found, best.guess.inlier_count):
             best = found
         if best.found and best.guess.inlier_count >= enough:

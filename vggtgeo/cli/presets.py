@@ -1,0 +1,141 @@
+"""`--preset`: which implementation plays each perception role. The one place where networks become role objects.
+
+| role | classical | light | paper |
+|---|---|---|---|
+| point matches | SIFT | SIFT | MASt3R |
+| line segments | LSD | M-LSD tiny | LETR |
+| line matches | bands of gradients | DINOv3 S along the segments | DINOv3 L along the segments |
+| metric depth | the sensor's | MoGe-2 S | MoGe-2 L |
+| dense confidence | structure tensor | DINOv3 S | DINOv3 L |
+| initial geometry | PnP, two views | PnP, two views | VGGT, judged by PnP |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.cli.network_errors import as_input_errors
+from vggtgeo.errors import InputError
+from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
+from vggtgeo.models.onnx.dinov3 import DinoFeatures
+from vggtgeo.models.onnx.letr import LetrDetector
+from vggtgeo.models.onnx.line_matcher import DenseLineMatcher
+from vggtgeo.models.onnx.mast3r import Mast3rMatcher
+from vggtgeo.models.onnx.mlsd import MlsdDetector
+from vggtgeo.models.onnx.moge2 import MogeDepth
+from vggtgeo.models.onnx.registry import NETWORKS
+from vggtgeo.models.onnx.session import Provider, Session, open_session
+from vggtgeo.models.onnx.vggt import VggtWindow
+from vggtgeo.models.window_locator import WindowLocator
+from vggtgeo.network_files import networks_folder
+from vggtgeo.slam.settings import Roles
+
+NEEDED = {
+    "classical": (),
+    "light": ("dinov3-small", "moge2-small", "mlsd"),
+    "paper": ("vggt", "dinov3", "moge2", "letr", "mast3r_encoder", "mast3r_decoder"),
+}
+"""The networks of each preset, by their names in the registry."""
+
+
+@dataclass(frozen=True, eq=False)
+class Perception:
+    """Role objects and the networks behind them, by their names in the registry."""
+
+    roles: Roles
+    networks: Mapping[str, Session]
+
+    @property
+    def random(self) -> list[str]:
+        """Names of the networks whose weights are random."""
+        return [name for name, session in self.networks.items() if session.random_weights]
+
+    def facts(self) -> dict[str, Any]:
+        """For the summary: each network's file, its hash, its weights and where it runs; and a warning, if any."""
+        if not self.networks:
+            return {}
+        described = {
+            name: {
+                "file": session.path.name,
+                "sha256": session.digest,
+                "weights": session.metadata.get("vggtgeo.weights", "as published"),
+                "runs_on": session.provider,
+            }
+            for name, session in self.networks.items()
+        }
+        warning = {"meaningless": self.warning()} if self.random else {}
+        return {"networks": described, **warning}
+
+    def warning(self) -> str:
+        """What a user must know before reading any result of random weights."""
+        return f"the weights of {', '.join(self.random)} are random: this result means nothing"
+
+
+def perception(
+    preset: str,
+    classical: Roles,
+    folder: Path | None = None,
+    cache: Path | None = None,
+    provider: Provider = "auto",
+) -> Perception:
+    """The role objects of a preset; those it has no network for are taken from `classical`.
+
+    folder: of the networks' files, see `networks_folder`. cache: folder for what they answer, or None. Every file is
+    opened, checked and warmed up here. Raises `InputError` for an unknown preset, a missing file, or a wrong one.
+    """
+    if preset not in NEEDED:
+        raise InputError(f"`--preset` is {preset!r}; it must be one of {', '.join(NEEDED)}")
+    if not NEEDED[preset]:
+        return Perception(classical, {})
+    place = networks_folder(folder)
+    _check_present(preset, place)
+    with as_input_errors():
+        networks = {
+            name: open_session(place / NETWORKS[name].file, NETWORKS[name].contract, provider=provider)
+            for name in NEEDED[preset]
+        }
+        build = _paper if preset == "paper" else _light
+        roles = build(classical, networks, cache)
+        for session in networks.values():
+            session.warm_up()
+    return Perception(roles, networks)
+
+
+def _light(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Roles:
+    features = DinoFeatures(networks["dinov3-small"], _cache(cache))
+    return replace(
+        classical,
+        lines=MlsdDetector(networks["mlsd"], _cache(cache)),
+        line_matches=DenseLineMatcher(features),
+        depth=MogeDepth(networks["moge2-small"], _cache(cache)),
+        confidence=features,
+    )
+
+
+def _paper(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Roles:
+    features = DinoFeatures(networks["dinov3"], _cache(cache))
+    window = VggtWindow(networks["vggt"], _cache(cache))
+    return Roles(
+        points=Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache)),
+        lines=LetrDetector(networks["letr"], _cache(cache)),
+        line_matches=DenseLineMatcher(features),
+        depth=MogeDepth(networks["moge2"], _cache(cache)),
+        confidence=features,
+        geometry=WindowLocator(window, classical.geometry, views=window.views),
+    )
+
+
+def _cache(folder: Path | None) -> OutputCache:
+    return MemoryCache() if folder is None else FolderCache(folder)
+
+
+def _check_present(preset: str, place: Path) -> None:
+    missing = [NETWORKS[name].file for name in NEEDED[preset] if not (place / NETWORKS[name].file).is_file()]
+    if missing:
+        raise InputError(
+            f"`--preset {preset}` needs {', '.join(missing)} in `{place}`, which are not there; "
+            "`vggtgeo models list` tells how to get each"
+        )
