@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ def network_named(name: str) -> Network:
 
 
 def fetch_network(network: Network, folder: Path, endpoint: str | None = None) -> Path:
-    """Download a published ONNX file into `folder`; a broken download goes on where it stopped.
+    """Download a published ONNX file into `folder`; a download that was cut off goes on where it stopped.
 
     The file takes its name only when its SHA-256 is that of the registry. endpoint: address of the hub, None for the
     hub's own. Raises `InputError` where there is nothing to download, the server fails, or the content is another.
@@ -40,42 +41,53 @@ def fetch_network(network: Network, folder: Path, endpoint: str | None = None) -
     target = folder / network.file
     if source is None:
         raise InputError(
-            f"`{network.name}` is not published as an ONNX file; export it: vggtgeo models export "
-            f"{network.contract_name} --source CHECKOUT of {network.code} --checkpoint FILE -o {target}"
+            f"`{network.name}` is not published as an ONNX file; make it from a checkout of "
+            f"{network.publication.code} and its weights ({network.weights}): {network.export_command}, in `{folder}`"
         )
     if target.exists() and _sha256(target) == source.sha256:
         return target
     folder.mkdir(parents=True, exist_ok=True)
-    arrived = _download(source, folder / ".fetch" / network.name, endpoint)
-    found = _sha256(arrived)
+    part = folder / f".{network.file}.{source.sha256[:16]}.part"
+    _download(source, part, endpoint)
+    found = _sha256(part)
     if found != source.sha256:
-        arrived.unlink()
-        raise InputError(
-            f"`{source.repository}/{source.path}` has the SHA-256 {found}, expected {source.sha256}: the download was "
-            "damaged or the file was changed; nothing was kept, try again"
-        )
-    os.replace(arrived, target)
+        part.unlink()
+        raise InputError(f"{_another(source, found)}: the download was damaged; nothing was kept, try again")
+    os.replace(part, target)
     return target
 
 
-def _download(source: HubFile, folder: Path, endpoint: str | None) -> Path:
-    hub = _hub_client()
+def _download(source: HubFile, part: Path, endpoint: str | None) -> None:
+    """Append to `part` what it lacks. The client's `hf_hub_download` keeps nothing of a download that is cut off."""
+    hub, http_get, broken = _hub_client()
     try:
-        path = hub.hf_hub_download(
-            source.repository, source.path, revision=source.revision, local_dir=folder, endpoint=endpoint
-        )
-    except (OSError, hub.errors.HfHubHTTPError, hub.errors.HFValidationError) as error:
+        url = hub.hf_hub_url(source.repository, source.path, revision=source.revision, endpoint=endpoint)
+        remote = hub.get_hf_file_metadata(url, token=False, endpoint=endpoint)
+        if len(remote.etag or "") == 64 and remote.etag != source.sha256:
+            raise InputError(f"{_another(source, remote.etag)}: it was replaced by its authors; nothing was downloaded")
+        with part.open("ab") as file:
+            http_get(remote.location, file, resume_size=file.tell(), expected_size=remote.size)
+    except (OSError, hub.errors.HfHubHTTPError, hub.errors.HFValidationError, broken) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"`{source.repository}/{source.path}` could not be downloaded: {reason}; try again") from error
-    return Path(path)
+        raise InputError(
+            f"`{source.repository}/{source.path}` could not be downloaded: {reason}; call again, it goes on from there"
+        ) from error
 
 
-def _hub_client() -> Any:
+def _another(source: HubFile, found: str | None) -> str:
+    return f"`{source.repository}/{source.path}` has the SHA-256 {found}, expected {source.sha256}"
+
+
+def _hub_client() -> tuple[Any, Any, type[Exception]]:
+    """The hub's client, its download of one address into an open file, and what a broken connection raises there."""
     try:
         import huggingface_hub
+        from huggingface_hub.file_download import http_get
     except ImportError:
         raise InputError("fetching needs the package huggingface-hub; install it: pip install vggtgeo[fetch]") from None
-    return huggingface_hub
+    # The client lets the errors of its HTTP library through, and which library that is depends on its version.
+    library = type(huggingface_hub.get_session()).__module__.split(".")[0]
+    return huggingface_hub, http_get, sys.modules[library].HTTPError
 
 
 def _sha256(path: Path) -> str:

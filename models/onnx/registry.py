@@ -18,22 +18,29 @@ class HubFile:
 
 
 @dataclass(frozen=True)
-class Network:
-    """One file of a folder of networks.
+class Publication:
+    """paper: where it is described. licence, allows: of the published weights. code: the repository an export reads."""
 
-    contract: key of `CONTRACTS`. file: its name in the folder. licence, allows: of the published weights. code: the
-    repository an export is made from. weights: where they are published. megabytes: of the float32 file. hub: a
-    published ONNX file; None where the file must be exported.
-    """
-
-    name: str
-    contract_name: str
     paper: str
     licence: str
     allows: str
     code: str
+
+
+@dataclass(frozen=True)
+class Network:
+    """One file of a folder of networks.
+
+    contract_name: key of `CONTRACTS`. weights: where they are published. megabytes: of the float32 file. variant: of
+    the export, where it is not the default one. hub: a published ONNX file; None where the file must be exported.
+    """
+
+    name: str
+    contract_name: str
+    publication: Publication
     weights: str
     megabytes: int
+    variant: str = ""
     hub: HubFile | None = None
 
     @property
@@ -48,86 +55,69 @@ class Network:
     def role(self) -> str:
         return self.contract.role
 
+    @property
+    def export_command(self) -> str:
+        """How to make the file from the published code and weights."""
+        variant = f" --variant {self.variant}" if self.variant else ""
+        return f"vggtgeo models export {self.contract_name}{variant} --source CHECKOUT --checkpoint FILE -o {self.file}"
 
-_DINOV3 = {
-    "contract_name": "dinov3",
-    "paper": "Siméoni et al., DINOv3, 2025, arXiv:2508.10104",
-    "licence": "DINOv3 License",
-    "allows": "research and commercial use on its conditions (no military use)",
-    "code": "facebookresearch/dinov3",
-}
-_MOGE2 = {
-    "contract_name": "moge2",
-    "paper": "Wang et al., MoGe-2, 2025, arXiv:2507.02546",
-    "licence": "MIT",
-    "allows": "any use",
-    "code": "microsoft/MoGe",
-}
-_MAST3R = {
-    "paper": "Leroy et al., MASt3R, ECCV 2024, arXiv:2406.09756",
-    "licence": "CC BY-NC-SA 4.0",
-    "allows": "non-commercial use only; see also the terms of its training data",
-    "code": "naver/mast3r",
-    "weights": "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth",
-}
+
+_VGGT = Publication(
+    "Wang et al., VGGT, CVPR 2025, arXiv:2503.11651",
+    "VGGT License",
+    "VGGT-1B: non-commercial use; VGGT-1B-Commercial: commercial use too, no military use",
+    "facebookresearch/vggt",
+)
+_DINOV3 = Publication(
+    "Siméoni et al., DINOv3, 2025, arXiv:2508.10104",
+    "DINOv3 License",
+    "research and commercial use on its conditions, no military use",
+    "facebookresearch/dinov3",
+)
+_MOGE2 = Publication("Wang et al., MoGe-2, 2025, arXiv:2507.02546", "MIT", "any use", "microsoft/MoGe")
+_LETR = Publication("Xu et al., LETR, CVPR 2021, arXiv:2101.01909", "Apache-2.0", "any use", "mlpc-ucsd/LETR")
+_MLSD = Publication("Gu et al., M-LSD, AAAI 2022, arXiv:2106.00186", "Apache-2.0", "any use", "lhwcv/mlsd_pytorch")
+_MAST3R = Publication(
+    "Leroy et al., MASt3R, ECCV 2024, arXiv:2406.09756",
+    "CC BY-NC-SA 4.0",
+    "non-commercial use only; see also the terms of its training data",
+    "naver/mast3r",
+)
+_MAST3R_WEIGHTS = "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth, linked in the repository"
 
 _ALL = (
+    Network("vggt", "vggt", _VGGT, "facebook/VGGT-1B on the hub", 4851),
+    Network("dinov3", "dinov3", _DINOV3, "ViT-L/16 distilled, on request from the authors", 1214),
+    Network("dinov3-small", "dinov3", _DINOV3, "ViT-S/16 distilled, on request from the authors", 87, "vits16"),
     Network(
-        name="vggt",
-        contract_name="vggt",
-        paper="Wang et al., VGGT, CVPR 2025, arXiv:2503.11651",
-        licence="VGGT License",
-        allows="VGGT-1B: non-commercial; VGGT-1B-Commercial: commercial use too (no military use)",
-        code="facebookresearch/vggt",
-        weights="hub: facebook/VGGT-1B",
-        megabytes=4851,
-    ),
-    Network(name="dinov3", weights="hub: facebook/dinov3-vitl16 (on request)", megabytes=1214, **_DINOV3),
-    Network(name="dinov3-small", weights="hub: facebook/dinov3-vits16 (on request)", megabytes=87, **_DINOV3),
-    Network(
-        name="moge2",
-        weights="hub: Ruicheng/moge-2-vitl-normal",
-        megabytes=1324,
+        "moge2",
+        "moge2",
+        _MOGE2,
+        "Ruicheng/moge-2-vitl-normal on the hub",
+        1324,
         hub=HubFile(
             "Ruicheng/moge-2-vitl-normal-onnx",
             "model.onnx",
             "afbc4ccc3450298f3afb35b90f015f4c4f552dea21dc6470d5f7b78b77e2d751",
         ),
-        **_MOGE2,
     ),
     Network(
-        name="moge2-small",
-        weights="hub: Ruicheng/moge-2-vits-normal",
-        megabytes=141,
-        hub=HubFile(
+        "moge2-small",
+        "moge2",
+        _MOGE2,
+        "Ruicheng/moge-2-vits-normal on the hub",
+        141,
+        "vits",
+        HubFile(
             "Ruicheng/moge-2-vits-normal-onnx",
             "model.onnx",
             "24eacb5dc7a2c54c7bc98f7de085ffbed79ad006ea5b664c2c2cdc02ff3a52f0",
         ),
-        **_MOGE2,
     ),
-    Network(
-        name="letr",
-        contract_name="letr",
-        paper="Xu et al., LETR, CVPR 2021, arXiv:2101.01909",
-        licence="Apache-2.0",
-        allows="any use",
-        code="mlpc-ucsd/LETR",
-        weights="res50_stage2_focal.zip of the repository",
-        megabytes=244,
-    ),
-    Network(
-        name="mlsd",
-        contract_name="mlsd",
-        paper="Gu et al., M-LSD, AAAI 2022, arXiv:2106.00186",
-        licence="Apache-2.0",
-        allows="any use",
-        code="lhwcv/mlsd_pytorch",
-        weights="models/mlsd_tiny_512_fp32.pth of the repository",
-        megabytes=3,
-    ),
-    Network(name="mast3r_encoder", contract_name="mast3r_encoder", megabytes=1214, **_MAST3R),
-    Network(name="mast3r_decoder", contract_name="mast3r_decoder", megabytes=1536, **_MAST3R),
+    Network("letr", "letr", _LETR, "stage 2 with ResNet-50, linked in the repository", 244),
+    Network("mlsd", "mlsd", _MLSD, "models/mlsd_tiny_512_fp32.pth in the repository", 3),
+    Network("mast3r_encoder", "mast3r_encoder", _MAST3R, _MAST3R_WEIGHTS, 1214),
+    Network("mast3r_decoder", "mast3r_decoder", _MAST3R, _MAST3R_WEIGHTS, 1536),
 )
 NETWORKS = {network.name: network for network in _ALL}
 """Every network by its name."""

@@ -75,7 +75,7 @@ def fetch(
     from vggtgeo.network_files import fetch_network, network_named, networks_folder
 
     network = network_named(name)
-    typer.echo(f"{network.name}: {network.licence}; allows {network.allows}", err=True)
+    typer.echo(f"{network.name}: {network.publication.licence}; allows {network.publication.allows}", err=True)
     typer.echo(str(fetch_network(network, networks_folder(folder), endpoint)))
 
 
@@ -107,19 +107,15 @@ def verify(
 
 
 def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
-    get = (
-        f"vggtgeo models fetch {network.name}"
-        if network.hub
-        else f"vggtgeo models export {network.contract_name}, from {network.code} with {network.weights}"
-    )
+    made = f"{network.export_command}  # {network.publication.code}; weights: {network.weights}"
     return {
         "name": network.name,
         "role": network.role,
         "present": (place / network.file).is_file(),
         "file": str(place / network.file),
         "megabytes": network.megabytes,
-        "paper": network.paper,
-        "licence": network.licence,
-        "allows": network.allows,
-        "get": get,
+        "paper": network.publication.paper,
+        "licence": network.publication.licence,
+        "allows": network.publication.allows,
+        "get": f"vggtgeo models fetch {network.name}" if network.hub else made,
     }

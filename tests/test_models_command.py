@@ -1,0 +1,240 @@
+"""`vggtgeo models`: what is listed, where files lie, what a check finds, what a download does."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import plane_views as views
+import pytest
+import tiny_networks as tiny
+from hub_server import Hub, serve
+from huggingface_hub.utils import disable_progress_bars
+from typer.testing import CliRunner
+from vggtgeo.models.onnx import contracts, verification
+from vggtgeo.models.onnx.registry import NETWORKS, HubFile, Network
+from vggtgeo.models.onnx.session import open_session
+
+from vggtgeo.cli.main import make_app
+from vggtgeo.errors import InputError
+from vggtgeo.network_files import fetch_network, networks_folder
+
+SMALL = NETWORKS["moge2-small"]
+
+
+def invoke(*arguments: object):
+    return CliRunner().invoke(make_app(), [str(argument) for argument in arguments])
+
+
+def test_every_network_is_listed_with_its_terms(tmp_path: Path) -> None:
+    # Proves that the list names role, paper, licence, what it allows, size, how to get it, and what is there. Oracle:
+    # the registry, and one file that was put there.
+    tiny.letr(tmp_path / "letr.onnx")
+    found = json.loads(invoke("models", "list", "--models", tmp_path, "--json").output)
+    assert [row["name"] for row in found["networks"]] == list(NETWORKS)
+    assert [row["name"] for row in found["networks"] if row["present"]] == ["letr"]
+    assert all(row["licence"] and row["allows"] and row["paper"] and row["megabytes"] > 0 for row in found["networks"])
+    text = invoke("models", "list", "--models", tmp_path).output
+    for row in found["networks"]:
+        assert f"{row['paper']}\n    {row['licence']}: {row['allows']}\n    {row['get']}" in text
+    assert "vggtgeo models fetch moge2\n" in text
+    assert "letr  present" in text
+
+
+def test_the_registry_is_sound() -> None:
+    # Proves that each entry has a contract and each contract an entry, and that hashes are SHA-256.
+    assert {network.contract_name for network in NETWORKS.values()} == set(contracts.CONTRACTS)
+    published = [network.hub for network in NETWORKS.values() if network.hub]
+    assert published
+    assert all(len(bytes.fromhex(hub.sha256)) == 32 for hub in published)
+
+
+def test_paths_follow_option_variable_and_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves the order of precedence of the folder. Oracle: each of the three ways in turn.
+    monkeypatch.setenv("VGGTGEO_MODELS", str(tmp_path / "named"))
+    assert invoke("models", "path", "--models", tmp_path).output.strip() == str(tmp_path)
+    assert invoke("models", "path", "vggt").output.strip() == str(tmp_path / "named" / "vggt.onnx")
+    monkeypatch.delenv("VGGTGEO_MODELS")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert networks_folder() == tmp_path / "data" / "vggtgeo" / "models"
+
+
+def test_an_unknown_name_lists_the_known_ones() -> None:
+    # Proves that a typing error costs one line.
+    result = invoke("models", "path", "vgtt")
+    assert result.exit_code == 2
+    assert "`vgtt` is no network; it must be one of vggt, dinov3" in result.output
+
+
+# --- verify ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def check(tmp_path: Path) -> Callable[..., object]:
+    """`vggtgeo models verify` with a small image of the test's own, timed once."""
+    image = tmp_path / "image.png"
+    cv2.imwrite(str(image), views.texture(0, (64, 48)))
+    return lambda *arguments: invoke("models", "verify", *arguments[:1], "--image", image, "--runs", 1, *arguments[1:])
+
+
+@pytest.mark.parametrize("name", contracts.CONTRACTS)
+def test_a_good_file_of_each_network_is_fit(check: Callable, tmp_path: Path, name: str) -> None:
+    # Proves that each contract can be checked on an image, by the name the file carries. Oracle: tiny files.
+    path = getattr(tiny, name)(tmp_path / f"{name}.onnx")
+    result = check(path, "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.output)
+    assert report["network"] == name
+    assert report["random_weights"]
+    assert report["sha256"] == hashlib.sha256(hashlib.sha256(path.read_bytes()).digest()).hexdigest()
+    assert {n for n, output in report["outputs"].items() if output["not_finite"] == 0} == set(report["outputs"])
+
+
+def test_a_report_can_be_read(check: Callable, tmp_path: Path) -> None:
+    # Proves what a user sees: contract, random weights, ranges, latency. Oracle: the constants.
+    text = check(tiny.vggt(tmp_path / "vggt.onnx")).output
+    for line in (
+        "keeps the contract of vggt",
+        "its weights are random",
+        "output depth_conf [2, 28, 42]: 3 to 3, all finite",
+    ):
+        assert line in text
+    assert "ms on cpu" in text
+    assert "no record of PyTorch's outputs" in text
+
+
+def test_a_file_without_metadata_is_recognised(check: Callable, tmp_path: Path) -> None:
+    # Proves that published files, which know nothing of this program, are named by their signature.
+    import onnx
+
+    path = tiny.moge2(tmp_path / "model.onnx", tokens=True)
+    model = onnx.load(path)
+    del model.metadata_props[:]
+    onnx.save(model, path)
+    report = json.loads(check(path, "--json").output)
+    assert report["network"] == "moge2"
+    assert not report["random_weights"]
+
+
+def test_what_is_not_fit_ends_with_a_reason(check: Callable, tmp_path: Path) -> None:
+    # Proves that NaN, a foreign network and an unknown one end with status 2 and say what is wrong.
+    outputs = {"pred_logits": np.full((1, 2, 2), np.nan), "pred_lines": np.zeros((1, 2, 4))}
+    bad = tiny.constant(tmp_path / "bad.onnx", "letr", {"image": (1, 3, 28, 42)}, outputs)
+    other = tiny.constant(tmp_path / "other.onnx", "other", {"image": (1, 3, 28, 42)}, {"y": np.zeros(3)})
+    for arguments, message in (
+        ((bad,), "is not fit for use: `pred_logits` holds 4 values that are not finite"),
+        ((bad, "--network", "vggt"), "is not a file of `vggt`"),
+        ((other,), "keeps the contract of no network that is known"),
+        ((tmp_path / "none.onnx",), "is not there"),
+        ((bad, "--image", bad), "cannot be read as an image"),
+    ):
+        result = check(*arguments)
+        assert result.exit_code == 2, result.output
+        assert message in result.output
+
+
+def test_parity_is_shown_again_from_the_record(check: Callable, tmp_path: Path) -> None:
+    # Proves that the record beside a file is compared, and that a difference makes it unfit. Oracle: outputs of the
+    # same file, and the same with one value moved by 1 % of the largest.
+    path = tiny.dinov3(tmp_path / "dinov3.onnx")
+    session = open_session(path, contracts.DINOV3)
+    inputs = verification.example_inputs(session, views.texture(0, (64, 48)))
+    outputs = session.run(inputs)
+    record = {f"input.{name}": value for name, value in inputs.items()}
+    record |= {f"output.{name}": value for name, value in outputs.items()}
+    beside = tmp_path / "dinov3.onnx.parity.npz"
+    np.savez(beside, **record)
+    report = json.loads(check(path, "--json").output)
+    assert report["parity"] == {"patch_descriptors": 0.0, "attention": 0.0}
+    moved = outputs["attention"].copy()
+    moved.flat[3] += 0.01 * moved.max()
+    np.savez(beside, **{**record, "output.attention": moved})
+    result = check(path)
+    assert result.exit_code == 2
+    assert "`attention` differs from PyTorch by 0.01, expected at most 0.001" in result.output
+
+
+def test_a_record_of_another_file_is_refused(check: Callable, tmp_path: Path) -> None:
+    # Proves that names that do not fit, and files that are no record, are told apart from a difference.
+    path = tiny.letr(tmp_path / "letr.onnx")
+    np.savez(tmp_path / "wrong.npz", **{"input.images": np.zeros(3), "output.depth": np.zeros(3)})
+    (tmp_path / "none.npz").write_bytes(b"PK nothing")
+    for name, message in (("wrong", "expected those of"), ("none", "cannot be read as a parity record")):
+        result = check(path, "--against", tmp_path / f"{name}.npz")
+        assert result.exit_code == 2
+        assert message in result.output
+
+
+# --- fetch -------------------------------------------------------------------------------------------------------
+
+CONTENT = np.random.default_rng(0).bytes(400_000)
+
+
+@pytest.fixture
+def entry() -> Network:
+    """A network whose published file is `CONTENT`."""
+    return replace(SMALL, hub=HubFile("someone/something", "model.onnx", hashlib.sha256(CONTENT).hexdigest()))
+
+
+@pytest.fixture(autouse=True)
+def _quiet_hub() -> None:
+    disable_progress_bars()
+
+
+def test_a_file_arrives_whole_and_only_once(tmp_path: Path, entry: Network) -> None:
+    # Proves that the file lands under its name with the right content, and that a second call downloads nothing.
+    # Oracle: the server's content and its list of requests.
+    with serve(Hub(CONTENT)) as hub:
+        path = fetch_network(entry, tmp_path, hub.address)
+        assert path == tmp_path / "moge2-small.onnx"
+        assert path.read_bytes() == CONTENT
+        asked = len(hub.requests)
+        assert fetch_network(entry, tmp_path, hub.address) == path
+        assert len(hub.requests) == asked
+
+
+def test_a_broken_download_goes_on_where_it_stopped(
+    tmp_path: Path, entry: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Proves that bytes that arrived are not asked for again, within a call and by the next one. Oracle: the ranges
+    # that the server saw; it cuts off six times, and the client gives up after five without progress.
+    monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 50_000)
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    with serve(Hub(CONTENT, breaks=[160_000, 0, 0, 0, 0, 0])) as hub:
+        with pytest.raises(InputError, match=r"could not be downloaded: .* call again, it goes on from there"):
+            fetch_network(entry, tmp_path, hub.address)
+        assert not (tmp_path / "moge2-small.onnx").exists()
+        first = [asked for method, asked in hub.requests if method == "GET"]
+        assert first[0] is None
+        assert set(first[1:]) == {"bytes=150000-"}
+        hub.requests.clear()
+        path = fetch_network(entry, tmp_path, hub.address)
+        assert path.read_bytes() == CONTENT
+        assert [asked for method, asked in hub.requests if method == "GET"] == ["bytes=150000-"]
+    assert [file.name for file in tmp_path.iterdir() if file.is_file()] == ["moge2-small.onnx"]
+
+
+def test_another_content_is_not_kept(tmp_path: Path, entry: Network) -> None:
+    # Proves that the registry's hash decides: a server that says so of itself is not even asked for the file, and one
+    # that lies is found out. Oracle: a server with other bytes.
+    other = CONTENT[:-1] + b"x"
+    with serve(Hub(other)) as hub:
+        with pytest.raises(InputError, match="it was replaced by its authors; nothing was downloaded"):
+            fetch_network(entry, tmp_path, hub.address)
+        assert {method for method, _ in hub.requests} == {"HEAD"}
+    with serve(Hub(other, etag=entry.hub.sha256)) as hub, pytest.raises(InputError, match="the download was damaged"):
+        fetch_network(entry, tmp_path, hub.address)
+    assert [path for path in tmp_path.iterdir() if path.is_file()] == []
+
+
+def test_what_cannot_be_fetched_says_why(tmp_path: Path, entry: Network) -> None:
+    # Proves that a missing file, and a network that nobody publishes as ONNX, end in one line.
+    absent = replace(entry, hub=HubFile("someone/absent", "model.onnx", "00" * 32))
+    with serve(Hub(CONTENT)) as hub, pytest.raises(InputError, match=r"`someone/absent/model.onnx` could not be downl"):
+        fetch_network(absent, tmp_path, hub.address)
+    result = invoke("models", "fetch", "vggt", "--models", tmp_path)
+    assert result.exit_code == 2
+    assert "`vggt` is not published as an ONNX file; make it from a checkout of facebookresearch/vggt" in result.output

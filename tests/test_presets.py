@@ -1,0 +1,239 @@
+"""`--preset`: networks behind every role of a whole run, from tiny files; and real exports where there are any."""
+
+import importlib
+import json
+import os
+import shutil
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tiny_networks as tiny
+from tiny_sequences import seven_scenes
+from typer.testing import CliRunner
+from vggtgeo.models.onnx.mast3r import Mast3rMatcher
+from vggtgeo.models.onnx.registry import NETWORKS
+from vggtgeo.models.onnx.session import Session
+from vggtgeo.models.window_locator import WindowLocator
+
+from vggtgeo.cli.main import make_app
+from vggtgeo.cli.presets import NEEDED, perception
+from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.simulation.sequence import SyntheticSequence, simulate
+from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.slam.run import frame_trajectory, run
+from vggtgeo.slam.settings import Roles, SlamSettings
+
+RUN_AND_WRITE = "vggtgeo.cli.run"
+"""The module from which the command takes `run_and_write`."""
+EXPORTS = "VGGTGEO_EXPORTS"
+SIZE = (192, 256)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a tiny file of every network."""
+    folder = tmp_path_factory.mktemp("networks")
+    tiny.vggt(folder / "vggt.onnx", views=3, size=(84, 112))
+    for name in ("dinov3", "dinov3-small"):
+        tiny.dinov3(folder / f"{name}.onnx", SIZE)
+    for name in ("moge2", "moge2-small"):
+        tiny.moge2(folder / f"{name}.onnx", SIZE)
+    tiny.letr(folder / "letr.onnx", SIZE)
+    tiny.mlsd(folder / "mlsd.onnx")
+    tiny.mast3r_encoder(folder / "mast3r_encoder.onnx", SIZE)
+    tiny.mast3r_decoder(folder / "mast3r_decoder.onnx", SIZE, reach=4)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def walk() -> SyntheticSequence:
+    """Eight simulated frames that move enough for three keyframes."""
+    return simulate("room", 8, 0, SIZE[::-1], rate=5.0)
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """How often each file ran, by its name, once it was warm."""
+    runs: dict[str, int] = {}
+    real = Session.run_on_device
+
+    def run(self: Session, inputs: object, wanted: object = None) -> object:
+        runs[self.path.stem] = runs.get(self.path.stem, 0) + 1
+        return real(self, inputs, wanted)
+
+    monkeypatch.setattr(Session, "run_on_device", run)
+    monkeypatch.setattr(Session, "warm_up", lambda self: None)
+    return runs
+
+
+@pytest.mark.parametrize("preset", ["paper", "light"])
+def test_a_run_asks_every_network_and_from_a_cache_none(
+    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int], preset: str
+) -> None:
+    # Proves that a whole run goes through every network of the preset and no other, that its result is finite, and
+    # that a second run with the same cache asks none and gives the same. Oracle: a count, and the first trajectory.
+    settings = SlamSettings(global_adjustment=False)
+    poses = []
+    for expected in (set(NEEDED[preset]), set()):
+        roles = perception(preset, Roles(), files, tmp_path / "cache").roles
+        counted.clear()
+        *_, slam = run(walk, roles, settings)
+        assert set(counted) == expected
+        assert len(slam.frames) == 8
+        assert len(slam.keyframes) >= 2
+        poses.append(frame_trajectory(slam).poses)
+    assert np.isfinite(poses[0]).all()
+    np.testing.assert_array_equal(poses[0], poses[1])
+
+
+def test_an_interrupted_run_goes_on(
+    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
+) -> None:
+    # Proves that the answers of an interrupted run serve the next one. Oracle: the number of answers of a whole run.
+    def decoded(cache: Path, frames: int) -> int:
+        counted.clear()
+        roles = perception("paper", Roles(), files, cache).roles
+        for _ in run(walk, roles, SlamSettings(global_adjustment=False), end=frames):
+            pass
+        return counted.get("mast3r_decoder", 0)
+
+    whole = decoded(tmp_path / "one", 5)
+    first = decoded(tmp_path / "two", 3)
+    assert first > 0
+    assert first + decoded(tmp_path / "two", 5) == whole
+
+
+@pytest.fixture
+def called(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    """What `vggtgeo run` would do: the run itself is left out."""
+    given: dict[str, object] = {}
+
+    def stand_in(sequence: object, roles: Roles, *_: object, facts: object, **__: object) -> SimpleNamespace:
+        given.update(roles=roles, facts=facts)
+        return SimpleNamespace(interrupted=False)
+
+    module = importlib.import_module(RUN_AND_WRITE)
+    monkeypatch.setattr(module, "run_and_write", stand_in)
+    return given
+
+
+def _run(tmp_path: Path, *options: object):
+    """The program on a tiny sequence."""
+    folder = tmp_path / "sequence"
+    if not folder.exists():
+        seven_scenes(folder)
+    arguments = ["run", folder, "-o", tmp_path / "run", "--quiet", *options]
+    return CliRunner().invoke(make_app(), [str(argument) for argument in arguments])
+
+
+def test_the_program_says_what_random_weights_are_worth(files: Path, tmp_path: Path, called: dict[str, object]) -> None:
+    # Proves that the user is warned and that the summary names each network, its hash and its weights. Oracle: the
+    # files' own metadata.
+    with pytest.warns(InputWarning, match=r"the weights of vggt, dinov3.* are random: this result means nothing"):
+        result = _run(tmp_path, "--preset", "paper", "--models", files)
+    assert result.exit_code == 0, result.output
+    assert isinstance(called["roles"].points, Mast3rMatcher)
+    networks = called["facts"]["networks"]
+    assert set(networks) == set(NEEDED["paper"])
+    assert {network["weights"] for network in networks.values()} == {"random"}
+    assert {len(network["sha256"]) for network in networks.values()} == {64}
+    assert "this result means nothing" in called["facts"]["meaningless"]
+    json.dumps(called["facts"])
+
+
+def test_the_preset_builds_the_roles_it_documents(files: Path) -> None:
+    # Proves the table of the presets. Oracle: the types of the objects.
+    classical = Roles()
+    found = perception("classical", classical)
+    assert found.roles is classical
+    assert found.facts() == {}
+    light = perception("light", classical, files).roles
+    assert light.points is classical.points
+    assert light.geometry is classical.geometry
+    assert light.metric
+    paper = perception("paper", classical, files).roles
+    assert isinstance(paper.points, Mast3rMatcher)
+    assert isinstance(paper.geometry, WindowLocator)
+    assert paper.geometry.views == 3
+    assert paper.geometry.judge is classical.geometry
+
+
+def test_trained_weights_are_not_called_random(files: Path) -> None:
+    # Proves that the warning is about random weights only. Oracle: sessions
+    # whose metadata say another thing.
+    found = perception("light", Roles(), files)
+    trained = {
+        name: replace(session, metadata={"vggtgeo.weights": "checkpoint"}) for name, session in found.networks.items()
+    }
+    assert replace(found, networks=trained).random == []
+    assert "meaningless" not in replace(found, networks=trained).facts()
+
+
+def test_missing_and_wrong_files_end_the_run_before_any_frame(
+    files: Path, tmp_path: Path, called: dict[str, object]
+) -> None:
+    # Proves that every file is checked before a run begins and before its folder is made. Oracle: the stand-in of the
+    # run, which must not be called.
+    folder = tmp_path / "models"
+    shutil.copytree(files, folder)
+    shutil.copy(folder / "dinov3.onnx", folder / "letr.onnx")
+    for name in ("vggt", "moge2"):
+        (folder / f"{name}.onnx").rename(tmp_path / f"{name}.onnx")
+    result = _run(tmp_path, "--preset", "paper", "--models", folder)
+    assert result.exit_code == 2
+    assert "`--preset paper` needs vggt.onnx, moge2.onnx in" in result.output
+    for name in ("vggt", "moge2"):
+        (tmp_path / f"{name}.onnx").rename(folder / f"{name}.onnx")
+    result = _run(tmp_path, "--preset", "paper", "--models", folder)
+    assert result.exit_code == 2
+    assert "letr.onnx` is not a file of `letr`: expected outputs `pred_logits" in result.output
+    assert "it looks like a file of `dinov3`" in result.output
+    assert called == {}
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_unknown_preset_is_refused() -> None:
+    # Proves that the name is checked where it is used.
+    with pytest.raises(InputError, match="`--preset` is 'large'; it must be one of classical, light, paper"):
+        perception("large", Roles())
+
+
+def _whole_run(folder: Path, models: Path, size: tuple[int, int]) -> dict:
+    """The program on ten simulated frames with the paper's preset; its summary."""
+    walk, output = folder / "walk", folder / "run"
+    for _ in write_tum_folder(simulate("room", 10, 0, size, rate=10.0), walk):
+        pass
+    arguments = ["run", walk, "-o", output, "--quiet", "--preset", "paper", "--models", models]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        result = CliRunner().invoke(make_app(), [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+    assert np.isfinite(np.loadtxt(output / "trajectory.txt")).all()
+    return json.loads((output / "summary.json").read_text())
+
+
+@pytest.mark.slow
+def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
+    # Proves that `vggtgeo run --preset paper` writes every output, and the warning into its summary.
+    summary = _whole_run(tmp_path, files, SIZE[::-1])
+    assert summary["frames"] == 10
+    assert "this result means nothing" in summary["meaningless"]
+
+
+@pytest.mark.slow
+def test_real_exports_keep_their_contracts_and_run(tmp_path: Path) -> None:
+    # Proves that the files of `vggtgeo models export`, random weights or not, open, agree with PyTorch where that is
+    # recorded, give finite outputs on a rendered room, and carry a whole run. Oracle: the records of the exports.
+    folder = os.environ.get(EXPORTS)
+    if folder is None:
+        pytest.skip(f"needs the exported files of the paper preset in a folder that {EXPORTS} names")
+    for name in NEEDED["paper"]:
+        file = Path(folder) / NETWORKS[name].file
+        result = CliRunner().invoke(make_app(), ["models", "verify", str(file), "--runs", "1", "--json"])
+        assert result.exit_code == 0, result.output
+        assert json.loads(result.output)["network"] == NETWORKS[name].contract_name
+    assert _whole_run(tmp_path, Path(folder), (640, 480))["frames"] == 10
