@@ -7,7 +7,7 @@ of `vggtgeo`.
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -20,7 +20,7 @@ class _SourceTreeFinder:
     """A `sys.meta_path` entry, asked after the usual ones."""
 
     @staticmethod
-    def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(name: str, path: Iterable[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
         return PathFinder.find_spec(name, [str(_PACKAGE.parent)]) if name in _BESIDE else None
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from vggtgeo.cli.models_export import export
 from vggtgeo.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,6 +33,9 @@ models = typer.Typer(
 @models.callback()
 def group() -> None:
     """List, check, fetch and export the networks of the roles."""
+
+
+models.command("export")(export)
 
 
 @models.command("list")

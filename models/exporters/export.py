@@ -1,0 +1,283 @@
+"""From a network to a checked ONNX file.
+
+In this order, each step an oracle of the next: the changed module gives what the published code gave (both in
+PyTorch); the file passes onnx's full checker; onnxruntime loads it; and gives what PyTorch gave for the same random
+input. The file appears under its name only after that, with `FILE.onnx.data` (its weights) and `FILE.onnx.parity.npz`
+(that input, and what PyTorch gave) beside it.
+
+Difference = max |a - b| / max |b|, the largest over the outputs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import io
+import logging
+import os
+import resource
+import shutil
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from vggtgeo.models.exporters.packages import check_all, load
+from vggtgeo.models.exporters.recipes import Recipe
+from vggtgeo.models.exporters.request import ExportError, Graph, Request
+from vggtgeo.models.exporters.weights import identity, read_checkpoint
+from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, METADATA_WEIGHTS, PARITY_SUFFIX
+
+OPSET = 20
+TOLERANCE = 1e-3
+"""Largest difference of a file in float32."""
+HALF_TOLERANCE = 3e-2
+"""Largest difference of a file in half precision: some three digits, through tens of blocks."""
+_REWRITE_TOLERANCE = 1e-4
+"""Largest difference that a change of the module may make, by another order of sums."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was written.
+
+    rewrite, parity: differences of the changed module from the published one, and of onnxruntime from PyTorch; both
+    include half precision where it was asked for. megabytes: of graph and weights. seconds: of building, exporting
+    and checking. latency: seconds of one call after the first, on the CPU. gigabytes: largest memory of the process.
+    """
+
+    path: Path
+    network: str
+    weights: str
+    parameters: int
+    rewrite: float
+    parity: float
+    megabytes: float
+    seconds: float
+    latency: float
+    gigabytes: float
+
+
+def export(recipe: Recipe, request: Request, output: Path, say: Callable[[str], None] = lambda _: None) -> Report:
+    """Write the network as `output` (.onnx); `say` is told what is going on.
+
+    Raises `ExportError` if something given does not fit, or if the file does not give what PyTorch gives: then
+    nothing is written.
+    """
+    started = time.perf_counter()
+    _check_output(output)
+    recipe.checkout.root(request.source)
+    check_all()
+    if request.checkpoint is not None:
+        read_checkpoint(request.checkpoint)  # before a network of gigabytes is built
+    weights = identity(request.checkpoint)
+    tolerance = HALF_TOLERANCE if request.half else TOLERANCE
+    with _folder_beside(output) as folder:
+        written = folder / output.name
+        properties = _properties(recipe, request, weights)
+        with _quiet():
+            expected, parameters, rewrite = _write(recipe, request, written, properties, say)
+        say("checking the file")
+        load("onnx").checker.check_model(str(written), full_check=True)
+        say("running it in onnxruntime")
+        found, latency = _run(written, expected)
+        parity = _compare("onnxruntime", found, expected.outputs, tolerance)
+        _save_parity(folder / (output.name + PARITY_SUFFIX), expected)
+        megabytes = sum(file.stat().st_size for file in folder.glob(f"{output.name}*") if file.suffix != ".npz") / 1e6
+        _move(folder, output)
+    seconds = time.perf_counter() - started
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return Report(output, recipe.network, weights, parameters, rewrite, parity, megabytes, seconds, latency, memory)
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """Input and PyTorch's outputs, by name."""
+
+    inputs: Mapping[str, np.ndarray]
+    outputs: Mapping[str, np.ndarray]
+
+
+def _write(
+    recipe: Recipe, request: Request, path: Path, properties: Mapping[str, str], say: Callable[[str], None]
+) -> tuple[_Expected, int, float]:
+    """Build, compare with the published code, and write. On return the torch module is gone from memory."""
+    say(f"building {recipe.network} ({request.variant}) from {request.source}")
+    graph = recipe.build(request)
+    names = _output_names(recipe.network, graph)
+    say("comparing with the published code in PyTorch")
+    values = _evaluate(graph, names)
+    rewrite = _compare(
+        "the changed module", values, graph.published, HALF_TOLERANCE if request.half else _REWRITE_TOLERANCE
+    )
+    say("exporting")
+    parameters = _save(graph, names, path, properties)
+    del graph.module.network
+    gc.collect()
+    _return_memory()
+    return _Expected(graph.inputs, values), parameters, rewrite
+
+
+def _output_names(network: str, graph: Graph) -> tuple[str, ...]:
+    """The outputs in the order of `published`; they must be those of the contract."""
+    contract = CONTRACTS[network]
+    needed = {tensor.name for tensor in contract.outputs if not tensor.optional}
+    known = {tensor.name for tensor in contract.outputs}
+    names = tuple(graph.published)
+    if not needed <= set(names) <= known:
+        raise ExportError(
+            f"{network} gives {', '.join(names)}, expected {', '.join(sorted(needed))}; is this checkpoint of the "
+            "version with all of these heads?"
+        )
+    return names
+
+
+def _evaluate(graph: Graph, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    torch = load("torch")
+    with torch.inference_mode():
+        outputs = graph.module(*(torch.from_numpy(array) for array in graph.inputs.values()))
+    outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+    return {name: output.numpy() for name, output in zip(names, outputs, strict=True)}
+
+
+def _save(graph: Graph, names: tuple[str, ...], path: Path, properties: Mapping[str, str]) -> int:
+    """Write the file; returns the number of its weights."""
+    torch = load("torch")
+    inputs = tuple(torch.from_numpy(array) for array in graph.inputs.values())
+    with torch.no_grad():
+        program = torch.onnx.export(
+            graph.module,
+            inputs,
+            input_names=list(graph.inputs),
+            output_names=list(names),
+            opset_version=OPSET,
+            dynamo=True,
+            external_data=True,
+            verbose=False,
+        )
+    _strip(program.model)
+    program.model.metadata_props.update(properties)
+    program.save(str(path), external_data=True)
+    return sum(int(np.prod(value.shape.numpy())) for value in program.model.graph.initializers.values())
+
+
+def _strip(model: Any) -> None:
+    """Remove what the exporter notes about the machine: paths of source files, call stacks."""
+    model.metadata_props.clear()
+    model.doc_string = None
+    graphs = [model.graph, *model.functions.values()]
+    for graph in graphs:
+        graph.metadata_props.clear()
+        graph.doc_string = None
+        for node in graph.all_nodes():
+            node.metadata_props.clear()
+            node.doc_string = None
+            for value in node.outputs:
+                value.metadata_props.clear()
+        for value in graph.inputs:
+            value.metadata_props.clear()
+    for value in model.graph.initializers.values():
+        value.metadata_props.clear()
+
+
+def _run(path: Path, expected: _Expected) -> tuple[dict[str, np.ndarray], float]:
+    """Outputs by name, and the seconds of the second call."""
+    runtime = load("onnxruntime")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = load("torch").get_num_threads()
+    session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    names = list(expected.outputs)
+    outputs = session.run(names, dict(expected.inputs))
+    started = time.perf_counter()
+    session.run(names, dict(expected.inputs))
+    return dict(zip(names, outputs, strict=True)), time.perf_counter() - started
+
+
+def _compare(who: str, found: Mapping[str, np.ndarray], wanted: Mapping[str, np.ndarray], tolerance: float) -> float:
+    """The largest difference; `ExportError` if it is above `tolerance` or not a number, or if a shape differs."""
+    largest = 0.0
+    for name, reference in wanted.items():
+        if found[name].shape != reference.shape:
+            raise ExportError(f"`{name}` of {who} is {found[name].shape}, PyTorch's is {reference.shape}; not written")
+        gap = difference(found[name], reference)
+        if not gap <= tolerance:
+            raise ExportError(
+                f"`{name}` of {who} differs from PyTorch by {gap:.2g}, expected at most {tolerance:g}; nothing was "
+                "written; please report this with the versions of torch, onnx and onnxruntime"
+            )
+        largest = max(largest, gap)
+    return largest
+
+
+def difference(found: np.ndarray, reference: np.ndarray) -> float:
+    """max |found - reference| / max |reference|; NaN if any value is."""
+    return float(np.abs(found - reference).max() / np.abs(reference).max())
+
+
+def _properties(recipe: Recipe, request: Request, weights: str) -> dict[str, str]:
+    properties = {
+        METADATA_NETWORK: recipe.network,
+        METADATA_WEIGHTS: weights,
+        "vggtgeo.source": recipe.checkout.revision(request.source),
+        "vggtgeo.variant": request.variant,
+        "vggtgeo.precision": "float16 blocks" if request.half else "float32",
+    }
+    if request.tokens:
+        properties["vggtgeo.tokens"] = str(request.tokens)
+    return properties
+
+
+def _save_parity(path: Path, expected: _Expected) -> None:
+    arrays: dict[str, Any] = {f"input.{name}": array for name, array in expected.inputs.items()}
+    arrays |= {f"output.{name}": array for name, array in expected.outputs.items()}
+    np.savez(path, **arrays)
+
+
+def _check_output(output: Path) -> None:
+    if output.suffix != ".onnx":
+        raise ExportError(f"`--output` is {output}, expected a name that ends in .onnx")
+    if output.is_dir():
+        raise ExportError(f"`--output` {output} is a folder; give the name of a file in it")
+
+
+@contextlib.contextmanager
+def _folder_beside(output: Path) -> Iterator[Path]:
+    """A temporary folder on the same file system, so that moving its files out is one step each."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=f".{output.stem}.", dir=output.parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _move(folder: Path, output: Path) -> None:
+    """Put the files in their place, the graph last: whoever finds it finds its weights."""
+    output.unlink(missing_ok=True)
+    files = sorted(folder.iterdir(), key=lambda file: file.name == output.name)
+    for file in files:
+        os.replace(file, output.parent / file.name)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's and the published code's warnings: the comparisons that follow decide."""
+    previous = logging.root.manager.disable
+    logging.disable(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(previous)
+
+
+def _return_memory() -> None:
+    """Hand freed memory back to the system before onnxruntime takes as much again (glibc keeps it otherwise)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)

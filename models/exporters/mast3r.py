@@ -1,0 +1,139 @@
+"""MASt3R (Leroy et al., ECCV 2024) in two files: encoder features once an image, then the decoder for each pair.
+
+Changes to the loaded module:
+
+- Rotary embedding looks `positions.max()` up in the data: angles become constants of the grid (`rotary`).
+- Image shapes travel through the published code as tensors: encoder, decoder and heads are called one by one, with
+  the size as plain numbers.
+- The checkpoint's configuration is a line of Python that upstream evaluates; here the published configuration is
+  written out, and the weights must fit it.
+- Importing the code switches TF32 on for the whole process; that is undone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from vggtgeo.models.exporters.checkout import Checkout, import_from
+from vggtgeo.models.exporters.half import halve_blocks
+from vggtgeo.models.exporters.module import as_module
+from vggtgeo.models.exporters.packages import load
+from vggtgeo.models.exporters.request import Graph, Request
+from vggtgeo.models.exporters.rotary import fix_positions, grid
+from vggtgeo.models.exporters.weights import fill, require_random, seed
+
+CHECKOUT = Checkout(
+    "naver/mast3r", "mast3r/model.py", ("mast3r", "dust3r", "models", "utils"), (".", "thirdparty/mast3r")
+)
+PATCH = 16
+_BASE = 100.0
+_UNBOUNDED = float("inf")
+_METRIC: dict[str, Any] = {
+    "pos_embed": f"RoPE{_BASE:.0f}",
+    "patch_embed_cls": "PatchEmbedDust3R",
+    "landscape_only": False,
+    "img_size": (512, 512),
+    "head_type": "catmlp+dpt",
+    "output_mode": "pts3d+desc24",
+    "depth_mode": ("exp", -_UNBOUNDED, _UNBOUNDED),
+    "conf_mode": ("exp", 1, _UNBOUNDED),
+    "desc_conf_mode": ("exp", 0, _UNBOUNDED),
+    "two_confs": True,
+    "enc_embed_dim": 1024,
+    "enc_depth": 24,
+    "enc_num_heads": 16,
+    "dec_embed_dim": 768,
+    "dec_depth": 12,
+    "dec_num_heads": 12,
+}
+"""`MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric`, for images that are not turned to landscape."""
+_SMALL = {"enc_embed_dim": 192, "enc_depth": 2, "enc_num_heads": 3, "dec_embed_dim": 192, "dec_num_heads": 3}
+_HEAD_OUTPUTS = {
+    "points": "pts3d",
+    "confidence": "conf",
+    "descriptors": "desc",
+    "descriptor_confidence": "desc_conf",
+}
+
+
+def build_encoder(request: Request) -> Graph:
+    """Image to features."""
+    torch = load("torch")
+    network = _network(request)
+    image = request.random_images(-1.0, 1.0)
+    shape = torch.tensor([[request.height, request.width]])
+    with torch.inference_mode():
+        features = network._encode_image(torch.from_numpy(image), shape)[0]
+    _prepare(network, request)
+    network.dec_blocks = network.dec_blocks2 = network.downstream_head1 = network.downstream_head2 = None
+    return Graph(as_module(network, _encode), {"image": image}, {"features": features.numpy()})
+
+
+def build_decoder(request: Request) -> Graph:
+    """Features of two images to points, descriptors and confidences of both; the example's are of random images."""
+    torch = load("torch")
+    network = _network(request)
+    images = torch.from_numpy(request.random_images(-1.0, 1.0, 2)).split(1)
+    shape = torch.tensor([[request.height, request.width]])
+    views = [{"img": image, "true_shape": shape, "instance": [str(index)]} for index, image in enumerate(images)]
+    with torch.inference_mode():
+        features = [network._encode_image(image, shape)[0].numpy() for image in images]
+        first, second = network(*views)
+    second["pts3d"] = second.pop("pts3d_in_other_view")
+    _prepare(network, request)
+    inputs = {f"features_{view + 1}": features[view] for view in range(2)}
+    return Graph(as_module(network, _decode(request)), inputs, _named((first, second)))
+
+
+def _network(request: Request) -> Any:
+    torch = load("torch")
+    require_random(request, ("test",))
+    allowed = torch.backends.cuda.matmul.allow_tf32
+    with CHECKOUT.importable(request.source):
+        seed(request)
+        code = import_from(request.source, "mast3r.model", "install einops and huggingface-hub, fetch the submodules")
+        small = _SMALL if request.variant == "test" else {}
+        network = code.AsymmetricMASt3R(**_METRIC | small)
+    torch.backends.cuda.matmul.allow_tf32 = allowed
+    fill(network, request, "MASt3R ViT-L metric")
+    return network
+
+
+def _prepare(network: Any, request: Request) -> None:
+    positions = grid(request.height // PATCH, request.width // PATCH)
+    head_size = network.enc_embed_dim // network.enc_blocks[0].attn.num_heads  # the decoder's is the same
+    kind = type(network.rope)
+    for rope in [module for module in network.modules() if isinstance(module, kind)]:  # the second decoder has its own
+        fix_positions(rope, positions, head_size, _BASE)
+    if request.half:
+        halve_blocks([*network.enc_blocks, *network.dec_blocks, *network.dec_blocks2])
+
+
+def _encode(network: Any, image: Any) -> Any:
+    features = network.patch_embed.proj(image).flatten(2).transpose(1, 2)
+    features = network.patch_embed.norm(features)
+    for block in network.enc_blocks:
+        features = block(features, None)
+    return network.enc_norm(features)
+
+
+def _decode(request: Request) -> Callable[..., tuple[Any, ...]]:
+    size = (request.height, request.width)
+
+    def forward(network: Any, features_1: Any, features_2: Any) -> tuple[Any, ...]:
+        decoded = network._decoder(features_1, None, features_2, None)
+        heads = (network.downstream_head1, network.downstream_head2)
+        views = [head(list(tokens), size) for head, tokens in zip(heads, decoded, strict=True)]
+        return tuple(view[key] for view in views for key in _HEAD_OUTPUTS.values())
+
+    return forward
+
+
+def _named(views: tuple[dict[str, Any], dict[str, Any]]) -> dict[str, np.ndarray]:
+    return {
+        f"{name}_{number + 1}": view[key].numpy()
+        for number, view in enumerate(views)
+        for name, key in _HEAD_OUTPUTS.items()
+    }

@@ -1,0 +1,23 @@
+"""A network and a plain function as one torch module, the form in which torch exports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from vggtgeo.models.exporters.packages import load
+
+
+def as_module(network: Any, forward: Callable[..., Any]) -> Any:
+    """A torch module that owns `network` and computes `forward(network, *inputs)`."""
+    base: Any = load("torch").nn.Module
+
+    class Wrapped(base):
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = network
+
+        def forward(self, *inputs: Any) -> Any:
+            return forward(self.network, *inputs)
+
+    return Wrapped().eval()

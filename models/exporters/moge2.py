@@ -1,0 +1,98 @@
+"""MoGe-2 (Wang et al., 2025): points up to a shift in z, mask, metric scale and, where the network has it, normals.
+
+The network is exported as published, with the number of patches fixed. Not changed, but needed around it:
+
+- Its module imports `utils3d`, which the forward pass does not use: an empty module stands in.
+- xFormers, where installed, is switched off before the import: its attention cannot be exported.
+- The published "ONNX-compatible mode" is for an older exporter and drops the anti-aliasing of the resize, which
+  changes results by up to 6 %: it stays off.
+
+Focal length and shift are recovered outside, by the adapter.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from vggtgeo.models.exporters.checkout import Checkout, import_from, stand_in
+from vggtgeo.models.exporters.half import halve_blocks
+from vggtgeo.models.exporters.module import as_module
+from vggtgeo.models.exporters.packages import load
+from vggtgeo.models.exporters.request import ExportError, Graph, Request
+from vggtgeo.models.exporters.weights import fill, read_checkpoint, seed
+
+CHECKOUT = Checkout("microsoft/MoGe", "moge/model/v2.py", ("moge",))
+_BLOCKS = {"vits": 12, "vitb": 12, "vitl": 24}
+_CHANNELS = {"vits": 384, "vitb": 768, "vitl": 1024}
+_CONFIGURATION = "configs/train/v2.json"
+"""The published configuration of the ViT-L; the smaller networks differ in backbone and channels."""
+
+
+def build(request: Request) -> Graph:
+    """The network for one image of the request's size, seen as about `request.tokens` patches."""
+    torch = load("torch")
+    configuration = _configuration(request)
+    with CHECKOUT.importable(request.source), stand_in("utils3d"), _without_xformers():
+        seed(request)
+        published_code = import_from(request.source, "moge.model.v2", "install huggingface-hub")
+        network = published_code.MoGeModel(**configuration)
+    fill(network, request, f"MoGe-2 {configuration['encoder']['backbone']}")
+    image = request.random_images(0.0, 1.0)
+    with torch.inference_mode():
+        outputs = network(torch.from_numpy(image), request.tokens)
+    names = tuple(name for name in ("points", "normal", "mask", "metric_scale") if name in outputs)
+    published = {name: outputs[name].numpy() for name in names}
+    if request.half:
+        halve_blocks(network.encoder.backbone.blocks)
+
+    def forward(network: Any, image: Any) -> tuple[Any, ...]:
+        outputs = network(image, request.tokens)
+        return tuple(outputs[name] for name in names)
+
+    return Graph(as_module(network, forward), {"image": image}, published)
+
+
+def _configuration(request: Request) -> dict[str, Any]:
+    """The network's options: those in the checkpoint, else the published ones, fitted to the variant."""
+    if request.checkpoint is not None:
+        configuration = read_checkpoint(request.checkpoint).get("model_config")
+        if not isinstance(configuration, dict):
+            raise ExportError(
+                f"`--checkpoint` {request.checkpoint} holds no `model_config`, expected the published MoGe-2 file "
+                "(model.pt), which has its options and its weights"
+            )
+        return configuration
+    path = CHECKOUT.root(request.source) / _CONFIGURATION
+    if not path.is_file():
+        raise ExportError(
+            f"`--source` {request.source}: no `{_CONFIGURATION}` in it, from which random weights are "
+            "made; update the checkout"
+        )
+    configuration = json.loads(path.read_text())["model"]
+    return _fitted(configuration, request.variant)
+
+
+def _fitted(configuration: dict[str, Any], variant: str) -> dict[str, Any]:
+    """The configuration of the ViT-L for another backbone: its blocks, and its width where the class token goes."""
+    blocks = _BLOCKS[variant]
+    levels = [blocks * (quarter + 1) // 4 - 1 for quarter in range(4)]
+    encoder = configuration["encoder"] | {"backbone": f"dinov2_{variant}14", "intermediate_layers": levels}
+    scale_head = {"dims": [_CHANNELS[variant], *configuration["scale_head"]["dims"][1:]]}
+    return configuration | {"encoder": encoder, "scale_head": scale_head}
+
+
+@contextmanager
+def _without_xformers() -> Iterator[None]:
+    previous = os.environ.get("XFORMERS_DISABLED")
+    os.environ["XFORMERS_DISABLED"] = "1"
+    try:
+        yield
+    finally:
+        if previous is None:
+            del os.environ["XFORMERS_DISABLED"]
+        else:
+            os.environ["XFORMERS_DISABLED"] = previous

@@ -1,0 +1,25 @@
+"""The optional packages of exporting, and what is said when one is missing."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from vggtgeo.models.exporters.request import ExportError
+
+
+def load(name: str) -> Any:
+    """The package `name`; an `ExportError` that names the extra when it, or one that it needs, is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise ExportError(
+            f"exporting needs the package `{error.name}`, which is not installed; "
+            "install the extra: pip install 'vggtgeo[export]'"
+        ) from None
+
+
+def check_all() -> None:
+    """Raise `ExportError` unless everything that an export needs is installed; before any work begins."""
+    for name in ("torch", "onnx", "onnxscript", "onnxruntime"):
+        load(name)

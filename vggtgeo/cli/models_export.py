@@ -1,0 +1,54 @@
+"""`vggtgeo models export`: a published network as the ONNX file that the pipeline reads."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vggtgeo.errors import InputError
+
+
+def export(
+    name: Annotated[
+        str,
+        typer.Argument(metavar="NAME", help="vggt, dinov3, moge2, letr, mast3r_encoder, mast3r_decoder or mlsd."),
+    ],
+    source: Annotated[Path, typer.Option(help="Checkout of the network's published code.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.onnx", help="File to write.")],
+    checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None,
+    random_weights: Annotated[
+        bool, typer.Option("--random-weights", help="For tests and timing: weights drawn at random.")
+    ] = False,
+    height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None,
+    width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None,
+    views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None,
+    tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None,
+    variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None,
+    half: Annotated[bool, typer.Option("--half", help="Attention and perceptrons in float16.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Write the network NAME as an ONNX file and compare it with PyTorch."""
+    from vggtgeo.models.exporters.recipes import recipe_of
+    from vggtgeo.models.exporters.request import ExportError
+
+    if (checkpoint is None) != random_weights:
+        found = "neither was given" if checkpoint is None else "both were given"
+        raise InputError(f"one of `--checkpoint` FILE and `--random-weights` is needed; {found}")
+    try:
+        recipe = recipe_of(name)
+        request = recipe.request(source, checkpoint, height, width, views, tokens, variant, half)
+        from vggtgeo.models.exporters.export import export as write
+
+        report = write(recipe, request, output, lambda stage: typer.echo(f"{stage} ...", err=True))
+    except ExportError as error:
+        raise InputError(str(error)) from error
+    if as_json:
+        typer.echo(json.dumps(asdict(report) | {"path": str(report.path)}, allow_nan=False))
+        return
+    typer.echo(
+        f"{report.path}: {report.network}, {report.parameters / 1e6:.1f} M weights ({report.weights}), "
+        f"{report.megabytes:.0f} MB, differs from PyTorch by {report.parity:.1e}, "
+        f"{report.latency:.2f} s a call on the CPU"
+    )
