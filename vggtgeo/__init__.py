@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from vggtgeo.packing import Observations as Observations
     from vggtgeo.packing import PaddedSize as PaddedSize
     from vggtgeo.packing import pack as pack
+    from vggtgeo.paper_bench.runner import BenchReport as BenchReport
+    from vggtgeo.paper_bench.runner import bench as bench
     from vggtgeo.problem import Problem as Problem
     from vggtgeo.problem import State as State
     from vggtgeo.problem_file import load_problem as load_problem
@@ -52,6 +54,7 @@ _HOME = {
     "marginalisation": ("marginalise", "no_prior"),
     "degeneracy": ("Observability", "observability"),
     "packing": ("Observations", "PaddedSize", "pack"),
+    "paper_bench.runner": ("BenchReport", "bench"),
     "problem": ("Problem", "State"),
     "problem_file": ("load_problem",),
     "simulation": ("simulate",),

@@ -41,6 +41,11 @@ COMMANDS = (
         "Render a hand-held walk through SCENE as a TUM RGB-D folder with exact truth.",
     ),
     CommandEntry("models", "vggtgeo.cli.models", "List, check, fetch and export the networks of the roles."),
+    CommandEntry(
+        "bench",
+        "vggtgeo.cli.bench",
+        "Run the comparisons of the paper with simulated roles in rendered worlds, and print their tables.",
+    ),
 )
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vggtgeo.camera import Camera
-from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.errors import InputError
 from vggtgeo.simulation.raster import View, view_from
 from vggtgeo.simulation.render import Picture
@@ -30,7 +30,7 @@ from vggtgeo.simulation.truth import (
 )
 from vggtgeo.trajectory import Trajectory
 
-_KEPT_FRAMES = 14  # about 10 MB each at 640 x 480
+_KEPT_FRAMES = 14  # about 10 MB each at 640 x 480, 3 MB at 320 x 240
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +43,13 @@ class _Known:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedOracle:
-    """A `Sequence` that knows the truth about each image it has given."""
+    """A `Sequence` that knows the truth about each image it has given.
+
+    kept: frames whose truth is kept in memory; that of others is rendered again when it is asked for.
+    """
 
     sequence: SyntheticSequence
+    kept: int = _KEPT_FRAMES
     _given: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
     _cache: OrderedDict[int, _Known] = field(default_factory=OrderedDict, repr=False)
 
@@ -71,8 +75,10 @@ class SimulatedOracle:
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
         """The sequence's frames; each is known to `index_of` from then on."""
-        for frame in self.sequence.frames(start, end, stride):
-            self._given[_fingerprint(frame.image)] = frame.index
+        check_selection(self.name, len(self), start, end, stride)
+        for index in range(start, min(len(self), end or len(self)), stride):
+            frame = self.sequence.frame(index, self._known(index).picture)
+            self._given[_fingerprint(frame.image)] = index
             yield frame
 
     def ground_truth(self) -> Trajectory:
@@ -122,7 +128,7 @@ class SimulatedOracle:
     def _known(self, index: int) -> _Known:
         known = self._cache.pop(index, None) or self._learn(index)
         self._cache[index] = known
-        if len(self._cache) > _KEPT_FRAMES:
+        if len(self._cache) > self.kept:
             self._cache.popitem(last=False)
         return known
 

@@ -63,10 +63,10 @@ class SyntheticSequence:
         """True pose of a frame, world -> camera, float64 [4, 4]."""
         return self._pose_at(self.timestamp(index))
 
-    def frame(self, index: int) -> Frame:
-        """One frame as the sensor sees it."""
+    def frame(self, index: int, picture: Picture | None = None) -> Frame:
+        """One frame as the sensor sees it. picture: what `picture(index)` gives, where it is at hand."""
         rng = np.random.default_rng([self.seed, 19, index])
-        picture = self.picture(index)
+        picture = self.picture(index) if picture is None else picture
         light = self._exposed(index, picture) * np.float32(self.sensor.gain(self.timestamp(index)))
         image = self.sensor.image(light, rng)
         depth = self.sensor.depth(picture.depth, rng) if self.has_depth else None

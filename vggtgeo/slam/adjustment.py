@@ -13,6 +13,7 @@ from vggtgeo.problem import MarginalPrior, Problem, State
 from vggtgeo.slam import rigid
 from vggtgeo.slam.covisibility import Directed
 from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.line_support import supported
 from vggtgeo.slam.settings import SlamSettings
 
 LEAST_INVERSE_DEPTH = 1e-3
@@ -61,9 +62,9 @@ def build(
     prior, sigma = read("prior"), read("sigma")
     has_prior = np.isfinite(prior) & np.isfinite(sigma)
     depths = np.concatenate([depths, np.where(np.isfinite(prior[len(points.host) :]), prior[len(points.host) :], 0.5)])
-    weight = np.where(has_prior, read("prior_confidence") if settings.use_confidence else 1.0, 0.0)
+    weight = np.where(has_prior, _prior_trust(read("prior_confidence"), read("confidence"), settings), 0.0)
     point_rows = _point_rows(keyframes, edges, local, points, settings)
-    line_rows = _line_rows(keyframes, edges, local, lines, settings, len(points.host))
+    line_rows = _line_rows(keyframes, edges, local, lines, settings, len(points.host), intrinsics)
     observations = Observations(
         edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),
         host=host,
@@ -203,6 +204,7 @@ def _line_rows(
     lines: _Selection,
     settings: SlamSettings,
     offset: int,
+    intrinsics: np.ndarray,
 ) -> dict[str, np.ndarray]:
     edge_ids, landmarks, coefficients, weights = (
         [np.zeros(0, int)],
@@ -215,21 +217,35 @@ def _line_rows(
         matched = np.full(len(keyframes[host].lines), -1)
         matched[edge.line_slots] = np.arange(len(edge.line_slots))
         of_sample = matched[keyframes[host].sample_segment]
-        chosen = (of_sample >= 0) & (lines.table[host] >= 0)
-        if not np.any(chosen):
+        chosen = np.nonzero((of_sample >= 0) & (lines.table[host] >= 0))[0]
+        if not len(chosen):
             continue
-        of_line = line_coefficients(target.lines.segments.endpoints)
-        edge_ids.append(np.full(np.count_nonzero(chosen), number))
+        samples = keyframes[host].samples
+        ends = target.lines.segments.endpoints
+        own_ends = ends[edge.line_targets[of_sample[chosen]]]
+        places = rigid.unproject(
+            samples.pixels[chosen], samples.inverse_depth[chosen], keyframes[host].pose, intrinsics
+        )
+        near = supported(
+            places, target.pose, own_ends, intrinsics, reach=settings.line_spacing, gate=settings.line_gate
+        )
+        edge_ids.append(np.full(len(chosen), number))
         landmarks.append(offset + lines.table[host][chosen])
-        coefficients.append(of_line[edge.line_targets[of_sample[chosen]]])
-        omega = keyframes[host].samples.confidence[chosen]
-        weights.append(_weight(edge.line_confidence[of_sample[chosen]] * omega, settings) * settings.line_weight)
+        coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
+        weight = _weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen], settings)
+        weights.append(np.where(near, weight * settings.line_weight, 0.0))
     return {
         "line_edge": np.concatenate(edge_ids),
         "line_landmark": np.concatenate(landmarks),
         "line_coefficients": np.concatenate(coefficients),
         "line_weight": np.concatenate(weights),
     }
+
+
+def _prior_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
+    if not settings.use_confidence:
+        return np.ones_like(own)
+    return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth_trust]
 
 
 def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import jax.numpy as jnp
 
@@ -54,6 +55,8 @@ class SlamSettings:
     """Largest reprojection error of a match between keyframes by the tracked poses, pixels."""
     epipolar_gate: float = 4.0
     """The same for the epipolar distance, where depth is not known, pixels."""
+    line_gate: float = 12.0
+    """Largest distance of a line sample from its matched segment, before each adjustment, pixels."""
     least_overlap: float = 0.25
     """Share of a keyframe's points that must fall into another's image before the two are matched at all."""
     kernel: AbstractKernel = field(default_factory=lambda: Cauchy(jnp.asarray(2.0)))
@@ -70,6 +73,9 @@ class SlamSettings:
     """Weight of a match: `gain * confidence + floor`."""
     depth_weight: float = 2.0
     """The paper's alpha; 0 switches the depth prior off."""
+    depth_trust: Literal["own", "saliency", "complement"] = "own"
+    """What scales the depth prior of a pixel: the confidence of the depth itself; the saliency Omega that weights the
+    matches, as in the paper's formula; or 1 - Omega, as the paper's text describes it."""
     known_intrinsics_sigma: float = 0.01
     """Standard deviation of the prior on known intrinsics, relative to the focal length."""
     guessed_intrinsics_sigma: float = 0.3
@@ -91,6 +97,8 @@ class SlamSettings:
         for name in ("keyframe_distance", "keyframe_angle", "line_spacing", "known_intrinsics_sigma"):
             if not getattr(self, name) > 0:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
+        if self.depth_trust not in ("own", "saliency", "complement"):
+            raise InputError(f"`depth_trust` is {self.depth_trust!r}; it must be own, saliency or complement")
         if self.window < 3:
             raise InputError(f"`window` is {self.window}; it must hold at least 3 keyframes")
         if self.depth_weight < 0 or self.confidence_floor < 0:

@@ -1,0 +1,71 @@
+"""The full system and what is switched off or exchanged in it, by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+
+from vggtgeo.models.classical import ConstantVelocity, PnpGeometry
+from vggtgeo.models.roles import InitialGeometry
+from vggtgeo.models.stubs import SimulatedVggt
+from vggtgeo.models.window_locator import WindowLocator
+from vggtgeo.paper_bench.courses import Course
+from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.solvers.kernels import Huber, Square
+
+_Change = Callable[[SlamSettings], SlamSettings]
+_Start = Callable[[SimulatedVggt], InitialGeometry]
+
+
+def _same(settings: SlamSettings) -> SlamSettings:
+    return settings
+
+
+def _window_start(vggt: SimulatedVggt) -> InitialGeometry:
+    return WindowLocator(vggt, PnpGeometry())
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of a table. change: of the settings. start: how a new frame's pose starts, given the simulated VGGT."""
+
+    key: str
+    title: str
+    change: _Change = _same
+    start: _Start = _window_start
+
+    def settings(self, course: Course) -> SlamSettings:
+        """The settings of a run on `course`: the paper's sliding window, nothing adjusted after the end."""
+        base = SlamSettings(
+            keyframe_distance=course.keyframe_distance,
+            keyframe_angle=math.radians(course.keyframe_angle),
+            global_adjustment=False,
+        )
+        return self.change(base)
+
+
+FULL = "full"
+"""Key of the full system."""
+
+VARIANTS: dict[str, Variant] = {
+    variant.key: variant
+    for variant in (
+        Variant(FULL, "full system"),
+        Variant("A", "A: without depth prior", lambda s: replace(s, depth_weight=0.0)),
+        Variant("B", "B: without confidence", lambda s: replace(s, use_confidence=False)),
+        Variant("C", "C: without lines", lambda s: replace(s, use_lines=False)),
+        Variant("D", "D: constant-velocity start", start=lambda vggt: ConstantVelocity()),
+        Variant("pnp", "start from PnP alone", start=lambda vggt: PnpGeometry()),
+        Variant("window-5", "window of 5 keyframes", lambda s: replace(s, window=5)),
+        Variant("window-15", "window of 15 keyframes", lambda s: replace(s, window=15)),
+        Variant("huber", "Huber kernel, 1.5 px (the paper)", lambda s: replace(s, kernel=Huber(jnp.asarray(1.5)))),
+        Variant("square", "no robust kernel", lambda s: replace(s, kernel=Square())),
+        Variant("formula", "depth prior x Omega (the paper's formula)", lambda s: replace(s, depth_trust="saliency")),
+        Variant("text", "depth prior x (1 - Omega) (its text)", lambda s: replace(s, depth_trust="complement")),
+        Variant("global", "one adjustment of the whole map at the end", lambda s: replace(s, global_adjustment=True)),
+        # A line carried by two inverse depths instead of one for each sample belongs here once `SlamSettings` has it.
+    )
+}

@@ -1,0 +1,30 @@
+"""Which samples of a segment its match in another view says something about."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vggtgeo.slam import rigid
+
+
+def supported(
+    points: np.ndarray, pose: np.ndarray, endpoints: np.ndarray, intrinsics: np.ndarray, *, reach: float, gate: float
+) -> np.ndarray:
+    """Whether each world point falls beside the segment it is matched to, bool [m].
+
+    A segment speaks for its own length: beyond its ends the error of its direction grows with the distance, and what
+    lies behind the camera (the near end of a long edge, in a turn) projects anywhere at all.
+
+    points: float64 [m, 3], metres, by the current estimate. pose: world -> camera of the view. endpoints: float64
+    [m, 2, 2], the segment of each point, pixels. reach: how far beyond an end still counts, gate: farthest from the
+    line, pixels.
+    """
+    pixels = rigid.project(points, pose, intrinsics)
+    along = endpoints[:, 1] - endpoints[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    direction = along / np.maximum(length, 1e-9)[:, None]
+    offset = pixels - endpoints[:, 0]
+    place = (offset * direction).sum(1)
+    distance = np.abs(offset[:, 0] * direction[:, 1] - offset[:, 1] * direction[:, 0])
+    # A comparison with NaN (behind the camera) is false.
+    return (place > -reach) & (place < length + reach) & (distance < gate)
