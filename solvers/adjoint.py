@@ -37,6 +37,7 @@ from vggtgeo.solvers.arrow import (
 )
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced import MIN_DIAGONAL, gauge_stiffness
+from vggtgeo.solvers.segments import expand, restrict
 
 
 class ArrowAdjoint(optx.AbstractAdjoint):
@@ -76,7 +77,7 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
 
     def stationarity(moving: Any) -> ArrowVector:
         shifted, start = eqx.combine(moving, fixed)
-        return _free(shifted.gradient(shifted.hold(point, start)), system)
+        return _free(_restricted(system, shifted.gradient(shifted.hold(point, start))), system)
 
     _, right_hand_side = jax.jvp(stationarity, (moving,), (input_tangents,))
     step = jax.lax.custom_linear_solve(
@@ -88,9 +89,9 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
 
     def optimum(moving: Any, step: ArrowVector) -> Any:
         shifted, start = eqx.combine(moving, fixed)
-        return shifted.retract(shifted.hold(point, start), step)
+        return shifted.retract(shifted.hold(point, start), _expanded(system, step))
 
-    zero = problem.zero_step(point)
+    zero = jax.tree.map(jnp.zeros_like, step)
     return jax.jvp(optimum, (moving, zero), (input_tangents, step))
 
 
@@ -144,20 +145,30 @@ def _chord_steps(problem: AbstractArrowProblem, model: ExactModel, point: Point,
     """Move by `-H^-1 g`, the Hessian kept, as long as the gradient shrinks."""
 
     def body(carry: Any) -> Any:
-        point, gradient, size, step, _ = carry
-        moved = problem.retract(point, jax.tree.map(jnp.negative, model.solve(gradient)))
-        new = _free(problem.gradient(moved), model.system)
+        point, gradient, size, number, _ = carry
+        step = _expanded(model.system, model.solve(gradient))
+        moved = problem.retract(point, jax.tree.map(jnp.negative, step))
+        new = _free(_restricted(model.system, problem.gradient(moved)), model.system)
         new_size = model.size(new)
         better = new_size < size
         kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), (moved, new, new_size), (point, gradient, size))
-        return *kept, step + 1, new_size < 0.1 * size
+        return *kept, number + 1, new_size < 0.1 * size
 
     # The Hessian's system holds the gradient as well.
     gradient = ArrowVector(dense_gradient(model.system)[0], model.system.landmark_gradient)
     gradient = _free(gradient, model.system)
     first = (point, gradient, model.size(gradient), jnp.asarray(0), jnp.asarray(True))
-    last: tuple[Point, Any] = jax.lax.while_loop(lambda carry: carry[-1] & (carry[-2] < steps), body, first)
-    return last[0]
+    last: Any = jax.lax.while_loop(lambda carry: carry[-1] & (carry[-2] < steps), body, first)
+    polished: Point = last[0]
+    return polished
+
+
+def _expanded(system: ArrowSystem, step: ArrowVector) -> ArrowVector:
+    return ArrowVector(step.dense, expand(system, step.landmarks))
+
+
+def _restricted(system: ArrowSystem, gradient: ArrowVector) -> ArrowVector:
+    return ArrowVector(gradient.dense, restrict(system, gradient.landmarks))
 
 
 def _free(vector: ArrowVector, system: ArrowSystem) -> ArrowVector:

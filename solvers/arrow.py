@@ -70,6 +70,8 @@ class ArrowSystem(eqx.Module):
     """False for coordinates that are held."""
     gauge: Float[Array, "c g"]
     """Directions along which the energy may be flat for a known reason (a free scale): unit columns, or zero."""
+    segments: Float[Array, "n g q 2"] | None = None
+    """Where the last `2 g` landmarks are coordinates of segments of `q` samples: see `segments.py`."""
 
     @property
     def landmark_gradient(self) -> Float[Array, "n s"]:

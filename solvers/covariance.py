@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, Reduced, inverse_landmark_hessian, padded_transports, reduce
 from vggtgeo.solvers.reduced import MIN_DIAGONAL, gauge_stiffness
+from vggtgeo.solvers.segments import expand, expand_variance
 
 
 class ArrowCovariance(eqx.Module):
@@ -52,11 +53,13 @@ def covariance(system: ArrowSystem) -> ArrowCovariance:
     reduced = reduce(system)
     inverse = _invert(system, reduced)
     hessian_inverse, cross = inverse_landmark_hessian(system), system.cross[:, :-2]
-    spread = lambda matrix: jnp.einsum("nrs,nrt,nts->ns", cross, to_relative_matrix(system, matrix), cross)
     # In this order: the square of a large inverse overflows, its product with the coupling does not.
-    variance = hessian_inverse + (hessian_inverse * spread(inverse.covariance)) * hessian_inverse
-    lost = hessian_inverse * spread(inverse.null) > _visible(cross.dtype)
-    known = (system.landmark_hessian != 0) & ~lost & jnp.isfinite(variance)
+    pulled = expand(system, hessian_inverse[:, None] * cross)
+    spread = lambda matrix, rows: jnp.einsum("nrs,nrt,nts->ns", rows, to_relative_matrix(system, matrix), rows)
+    variance = expand_variance(system, hessian_inverse) + spread(inverse.covariance, pulled)
+    lost = hessian_inverse * spread(inverse.null, cross) > _visible(cross.dtype)
+    unknown = (system.landmark_hessian == 0) | lost
+    known = (expand_variance(system, unknown.astype(cross.dtype)) == 0) & jnp.isfinite(variance)
     undetermined = inverse.undetermined
     either = undetermined[:, None] | undetermined[None, :]
     dense = jnp.where(either, 0.0, inverse.covariance)

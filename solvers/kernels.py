@@ -7,6 +7,7 @@ References: Huber 1964; Black & Anandan 1996; Barron, "A General and Adaptive Ro
 from __future__ import annotations
 
 import abc
+from typing import Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,6 +30,12 @@ class AbstractKernel(eqx.Module):
     @abc.abstractmethod
     def curvature(self, s: Values) -> Values:
         """The second derivative `rho''(s)`, never positive for the kernels of this file."""
+
+    def widened(self, factor: Float[Array, ""]) -> Self:
+        """The kernel whose width `delta` is `factor` times as large; a kernel without a width stays as it is."""
+        if not hasattr(self, "delta"):
+            return self
+        return eqx.tree_at(lambda kernel: kernel.delta, self, self.delta * factor)
 
 
 class Square(AbstractKernel):

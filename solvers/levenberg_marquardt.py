@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_gradient
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.segments import expand
 
 
 class Termination(eqx.Enumeration):
@@ -147,7 +148,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
         def attempt(trial: _Try) -> _Try:
             step, predicted = self.reduced_solver.step(system, prepared, trial.damping)
-            return self._judge(args, y, state, trial, step, predicted)
+            return self._judge(args, y, state, system, trial, step, predicted)
 
         first = _Try(
             point=y,
@@ -202,13 +203,14 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         problem: AbstractArrowProblem[Point],
         point: Point,
         state: LevenbergMarquardtState,
+        system: ArrowSystem,
         trial: _Try,
         step: ArrowVector,
         predicted: Float[Array, ""],
     ) -> _Try:
         """Take the step if it keeps its promise, else shrink the trust region."""
         energy = state.energy
-        candidate = problem.retract(point, step)
+        candidate = problem.retract(point, ArrowVector(step.dense, expand(system, step.landmarks)))
         new_energy = problem.energy(candidate)
         gain = (energy - new_energy) / jnp.where(predicted > 0, predicted, 1.0)
         accepted = jnp.isfinite(new_energy) & (predicted > 0) & (gain > 1e-3)

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from vggtgeo import _source_tree as _source_tree  # first: in a source tree it finds `solvers` and `models`
 
 if TYPE_CHECKING:
+    from vggtgeo.batches import pack_batch as pack_batch
+    from vggtgeo.batches import solve_batch as solve_batch
     from vggtgeo.camera import Camera as Camera
     from vggtgeo.datasets import Frame as Frame
     from vggtgeo.datasets import open_sequence as open_sequence
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from vggtgeo.degeneracy import observability as observability
     from vggtgeo.errors import InputError as InputError
     from vggtgeo.evaluation import evaluate_trajectory as evaluate_trajectory
+    from vggtgeo.graduation import Graduation as Graduation
     from vggtgeo.marginalisation import marginalise as marginalise
     from vggtgeo.marginalisation import no_prior as no_prior
     from vggtgeo.objective import energy as energy
@@ -39,18 +42,26 @@ if TYPE_CHECKING:
     from vggtgeo.slam.settings import SlamSettings as SlamSettings
     from vggtgeo.solution import Solution as Solution
     from vggtgeo.solution import solve as solve
+    from vggtgeo.solver_choice import choose_reduced_solver as choose_reduced_solver
     from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
+    from vggtgeo.solvers.kernels import Barron as Barron
+    from vggtgeo.solvers.kernels import Cauchy as Cauchy
+    from vggtgeo.solvers.kernels import GemanMcClure as GemanMcClure
+    from vggtgeo.solvers.kernels import Huber as Huber
+    from vggtgeo.solvers.kernels import Square as Square
     from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt as SchurLevenbergMarquardt
     from vggtgeo.trajectory import Trajectory as Trajectory
     from vggtgeo.uncertainty import Covariances as Covariances
     from vggtgeo.uncertainty import covariances as covariances
 
 _HOME = {
+    "batches": ("pack_batch", "solve_batch"),
     "camera": ("Camera",),
     "datasets": ("Frame", "open_sequence"),
     "objective": ("energy", "energy_terms"),
     "errors": ("InputError",),
     "evaluation": ("evaluate_trajectory",),
+    "graduation": ("Graduation",),
     "marginalisation": ("marginalise", "no_prior"),
     "degeneracy": ("Observability", "observability"),
     "packing": ("Observations", "PaddedSize", "pack"),
@@ -61,7 +72,9 @@ _HOME = {
     "slam.run": ("finish", "frame_trajectory", "run"),
     "slam.settings": ("Roles", "SlamSettings"),
     "solution": ("Solution", "solve"),
+    "solver_choice": ("choose_reduced_solver",),
     "solvers.adjoint": ("ArrowAdjoint",),
+    "solvers.kernels": ("Barron", "Cauchy", "GemanMcClure", "Huber", "Square"),
     "solvers.levenberg_marquardt": ("SchurLevenbergMarquardt",),
     "trajectory": ("Trajectory",),
     "uncertainty": ("Covariances", "covariances"),

@@ -47,8 +47,15 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         return State(
             poses=lie.move(point.poses, step.dense[:-4].reshape(-1, 6)),
             intrinsics=point.intrinsics + step.dense[-4:],
-            inverse_depth=_positive(point.inverse_depth, moved) if self.problem.positive_depth else moved,
+            inverse_depth=self._bounded(point.inverse_depth, moved) if self.problem.positive_depth else moved,
         )
+
+    def _bounded(self, depth: Float[Array, "n s"], moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
+        if self.problem.fraction is None:
+            return _positive(depth, moved)
+        points = self.problem.num_points
+        lines = _shortened(depth[:, points:], moved[:, points:], self.problem.fraction.shape[1])
+        return jnp.concatenate([_positive(depth[:, :points], moved[:, :points]), lines], 1)
 
     def hold(self, point: State, initial: State) -> State:
         fixed_pose = self.problem.fixed_pose[:, None]
@@ -63,7 +70,21 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         )
 
 
+def _shortened(depth: Float[Array, "n l"], moved: Float[Array, "n l"], segments: int) -> Float[Array, "n l"]:
+    """The step of each segment as a whole, as far as all its samples stay positive: a line stays a line."""
+    change, room = moved - depth, depth - _least(depth)
+    too_far = -change > room
+    share = jnp.where(too_far, room / jnp.where(too_far, -change, 1.0), 1.0)
+    share = jnp.min(share.reshape(len(depth), segments, -1), 2, keepdims=True)
+    share = jnp.broadcast_to(share, (*share.shape[:2], depth.shape[1] // segments)).reshape(depth.shape)
+    return jnp.where(share < 1, depth + share * change, moved)
+
+
+def _least(depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
+    return jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
+
+
 def _positive(depth: Float[Array, "n s"], moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
-    least = jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
+    least = _least(depth)
     # Not `maximum`, whose derivative is one half where a zero step meets the bound.
     return jnp.where(moved < least, least, moved)

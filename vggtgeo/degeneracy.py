@@ -17,6 +17,8 @@ linearisations, nine Schur complements and symmetric eigenvalue problems of size
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,7 @@ from vggtgeo.linearise import edge_observations, linearise
 from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.arrow import ArrowSystem, reduce
 from vggtgeo.solvers.covariance import balance, rank_tolerance
+from vggtgeo.solvers.segments import join_segments
 
 KINDS = ("points", "lines", "depth", "priors")
 """Factor kinds; `priors` are those on the intrinsics and the one that marginalisation left."""
@@ -82,14 +85,14 @@ def observability(problem: Problem, state: State) -> Observability:
         state: where to linearise, best a solution.
     """
     kinds = _linearise_each(problem, state)
-    everything = _combine(kinds, jnp.ones(len(KINDS), state.inverse_depth.dtype))
+    everything = _combine(kinds, jnp.ones(len(KINDS), state.inverse_depth.dtype), problem.fraction)
     scale = balance(everything, reduce(everything))
     free = everything.free
     directions = jnp.where(free, named_directions(problem, state), 0.0)
     selections = jnp.concatenate([jnp.ones((1, 4)), jnp.eye(4), 1 - jnp.eye(4)]).astype(scale.dtype)
 
     def spectrum(keep: Float[Array, " kinds"]) -> Spectra:
-        reduced = reduce(_combine(kinds, keep))
+        reduced = reduce(_combine(kinds, keep, problem.fraction))
         return _spectrum(reduced.hessian - reduced.schur, free, scale, directions)
 
     spectra = jax.lax.map(spectrum, selections)
@@ -102,7 +105,7 @@ def observability(problem: Problem, state: State) -> Observability:
         without=part(slice(5, 9)),
         named=balanced / jnp.where(size > 0, size, 1.0),
         free=free,
-        landmark_information=everything.landmark_hessian * state.inverse_depth**2,
+        landmark_information=jnp.sum(kinds.cross[:, :, -1], 0) * state.inverse_depth**2,
         landmark_used=_used(problem),
     )
 
@@ -118,20 +121,23 @@ def _linearise_each(problem: Problem, state: State) -> ArrowSystem:
         weights = (observations.point_weight * keep[0], observations.line_weight * keep[1])
         chosen = eqx.tree_at(lambda o: (o.point_weight, o.line_weight), observations, weights)
         slots = eqx.tree_at(lambda p: p.depth.weight, problem, problem.depth.weight * keep[2])
+        # The systems of the samples add up, those of their segments do not.
+        slots = replace(slots, fraction=None)
         return linearise(slots, chosen, state)
 
     return jax.lax.map(one, jnp.eye(3, dtype=state.inverse_depth.dtype))
 
 
-def _combine(kinds: ArrowSystem, keep: Float[Array, " kinds"]) -> ArrowSystem:
+def _combine(kinds: ArrowSystem, keep: Float[Array, " kinds"], fraction: Float[Array, "n g q"] | None) -> ArrowSystem:
     """The system of the kinds that `keep` holds a 1 for."""
     first = jax.tree.map(lambda leaf: leaf[0], kinds)
     add = lambda stacked: jnp.tensordot(keep[:3], stacked, 1)
-    return eqx.tree_at(
+    system = eqx.tree_at(
         lambda system: (system.gram, system.cross, system.prior_hessian),
         first,
         (add(kinds.gram), add(kinds.cross), first.prior_hessian * keep[3]),
     )
+    return system if fraction is None else join_segments(system, fraction)
 
 
 def undetermined_below(size: int, dtype: np.dtype) -> float:

@@ -30,6 +30,7 @@ from vggtgeo.residuals import MIN_RELATIVE_DEPTH
 from vggtgeo.second_order import Camera, Projection, second_order, twist
 from vggtgeo.solvers.arrow import ArrowSystem, EdgeGraph
 from vggtgeo.solvers.kernels import AbstractKernel
+from vggtgeo.solvers.segments import join_segments
 
 SHARED = 4
 """Number of shared coordinates: the intrinsics."""
@@ -132,7 +133,7 @@ def linearise(
     )
     cross, gram = jax.lax.scan(body, _depth_terms(problem, state, wide, correction, exact), edges)
     of_priors = _dense_priors(problem, state, exact)
-    return ArrowSystem(
+    system = ArrowSystem(
         graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
         transport=lie.adjoint(relative),
         gram=gram[:, :-1, :-1],
@@ -143,6 +144,7 @@ def linearise(
         free=free_coordinates(problem),
         gauge=scale_direction(problem, state),
     )
+    return system if problem.fraction is None else join_segments(system, jax.lax.stop_gradient(problem.fraction))
 
 
 def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
@@ -247,7 +249,7 @@ def _edge_columns(
     distance = line_residual(intrinsics, line, seen)
     line_root = _root_weight(problem.kernel, seen.line_weight, distance * distance)
     if correction is None:
-        rows = ((root, None, root * horizontal), (None, root, root * vertical))
+        rows: Any = ((root, None, root * horizontal), (None, root, root * vertical))
         line_pull = line_root * distance
     else:
         soft = _softened(problem.kernel, seen.point_weight * squared, correction)

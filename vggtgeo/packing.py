@@ -7,7 +7,8 @@ inverse depth, and no other file asks which entries are real.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import jaxlie
@@ -16,6 +17,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from vggtgeo.errors import InputError
+from vggtgeo.line_segments import fractions, segment_slots, straightened
 from vggtgeo.problem import (
     DepthPrior,
     Edges,
@@ -25,7 +27,7 @@ from vggtgeo.problem import (
     Problem,
     State,
 )
-from vggtgeo.solvers.kernels import AbstractKernel, Huber
+from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,9 @@ class Observations:
     depth_weight: np.ndarray | None = None
     """`[D]`: its confidence; 0 = none."""
     alpha: float = 2.0
+    segment: np.ndarray | None = None
+    """int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples then lie on a
+    straight line (two unknowns a segment); None: each sample has its own."""
 
 
 @dataclass(frozen=True)
@@ -71,19 +76,25 @@ class PaddedSize:
     """Largest number of edges of one host."""
     edges: int | None = None
     """Number of edges stored; None = `keyframes * ranks`, every host padded to `ranks` edges."""
+    samples: int | None = None
+    """Samples of a segment, where observations have a `segment`; `lines` is a multiple of it."""
 
     @staticmethod
     def of(observations: Observations, keyframes: int) -> PaddedSize:
         """The smallest that fits, every host padded to the same number of edges."""
-        _, points, lines = _assign_slots(observations, keyframes)
+        slots = _assign_slots(observations, keyframes)
         _, _, ranks = _sort_edges(observations.edges, keyframes)
-        return PaddedSize(keyframes, points, lines, ranks)
+        return PaddedSize(keyframes, slots.points, slots.lines, ranks, samples=slots.samples)
 
     @staticmethod
     def largest(sizes: Sequence[PaddedSize]) -> PaddedSize:
         """The smallest that fits all of `sizes`, every host padded to the same number of edges."""
         most = lambda name: max(getattr(size, name) for size in sizes)
-        return PaddedSize(most("keyframes"), most("points"), most("lines"), most("ranks"))
+        if sizes[0].samples is None:
+            return PaddedSize(most("keyframes"), most("points"), most("lines"), most("ranks"))
+        samples = most("samples")
+        segments = max(size.lines // max(size.samples or 1, 1) for size in sizes)
+        return PaddedSize(most("keyframes"), most("points"), segments * samples, most("ranks"), samples=samples)
 
 
 @dataclass(frozen=True)
@@ -124,7 +135,7 @@ def pack(
         intrinsics_sigma: standard deviation of the intrinsics' prior in pixels; None = no prior.
         fixed_pose: bool `[n]`; None holds the first pose.
         fixed_intrinsics: bool or bool `[4]`: intrinsics that are held.
-        kernel: robust kernel; None = Huber with delta 1.5 px.
+        kernel: robust kernel; None = Cauchy with delta 1.5 px, the best of `benchmarks/robustness.py`.
         dtype: float type of all arrays.
 
     Raises:
@@ -138,18 +149,20 @@ def pack(
     _check_indices(observations, len(poses))
     _check_positive("inverse_depth", inverse_depth, count)
     _check_camera(poses, intrinsics, intrinsics_sigma)
-    index, needed_points, needed_lines = _assign_slots(observations, len(poses))
+    slots = _assign_slots(observations, len(poses), size.samples if size else None)
     edges, order, ranks = _sort_edges(observations.edges, len(poses))
-    size = size or PaddedSize(len(poses), needed_points, needed_lines, ranks, len(edges))
-    _check_size(size, PaddedSize(len(poses), needed_points, needed_lines, ranks, len(edges)))
-    lines = index.slot >= needed_points
-    index = SlotIndex(index.host, np.where(lines, index.slot - needed_points + size.points, index.slot))
+    needed = PaddedSize(len(poses), slots.points, slots.lines, ranks, len(edges), slots.samples)
+    size = size or needed
+    _check_size(size, needed)
+    lines = slots.index.slot >= slots.points
+    index = SlotIndex(
+        slots.index.host, np.where(lines, slots.index.slot - slots.points + size.points, slots.index.slot)
+    )
     graph, position = _pad_edges(edges, size)
     row = position[order]
-    slots = size.points + size.lines
 
     def per_slot(values: np.ndarray, empty: float) -> Array:
-        array = np.full((size.keyframes, slots, *np.shape(values)[1:]), empty, dtype)
+        array = np.full((size.keyframes, size.points + size.lines, *np.shape(values)[1:]), empty, dtype)
         array[index.host, index.slot] = values
         return jnp.asarray(array)
 
@@ -179,15 +192,33 @@ def pack(
         ),
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
         fixed_intrinsics=jnp.asarray(np.broadcast_to(fixed_intrinsics, 4)),
-        kernel=kernel or Huber(jnp.asarray(1.5, dtype)),
+        kernel=kernel or Cauchy(jnp.asarray(1.5, dtype)),
     )
+    depths = per_slot(inverse_depth, 1.0)
+    if observations.segment is not None:
+        problem, depths = _with_segments(problem, depths, per_slot(np.ones(count), 0.0), size)
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
     state = State(
         jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype)),
         jnp.asarray(intrinsics, dtype),
-        per_slot(inverse_depth, 1.0),
+        depths,
     )
     return problem, state, index
+
+
+def _with_segments(problem: Problem, depths: Array, present: Array, size: PaddedSize) -> tuple[Problem, Array]:
+    """The problem with two-ends lines, and depths that are straight along them."""
+    samples = max(size.samples or 1, 1)
+    shape = (size.keyframes, size.lines // samples, samples)
+    inside = lambda array: np.asarray(array[:, size.points :]).reshape(*shape, *array.shape[2:])
+    here = inside(present) > 0
+    fraction = fractions(inside(problem.pixels), here)
+    straight = straightened(inside(depths), fraction, here).reshape(size.keyframes, size.lines)
+    dtype = depths.dtype
+    return (
+        replace(problem, fraction=jnp.asarray(fraction, dtype)),
+        depths.at[:, size.points :].set(jnp.asarray(straight, dtype)),
+    )
 
 
 def _depth_prior(
@@ -215,8 +246,17 @@ def _scatter(at: tuple[np.ndarray, np.ndarray], values: np.ndarray, shape: tuple
     return jnp.asarray(array)
 
 
-def _assign_slots(observations: Observations, keyframes: int) -> tuple[SlotIndex, int, int]:
-    """Number the landmarks of each host: those with points first; also the largest counts of both kinds."""
+class _Slots(NamedTuple):
+    """Slot of each landmark (lines after `points` of them), and the largest numbers of slots a host."""
+
+    index: SlotIndex
+    points: int
+    lines: int
+    samples: int | None
+
+
+def _assign_slots(observations: Observations, keyframes: int, samples: int | None = None) -> _Slots:
+    """Number the landmarks of each host: those with points first; segments take at least `samples` slots."""
     is_line = np.zeros(len(observations.host), bool)
     is_line[observations.line_landmark] = True
     both = np.intersect1d(observations.point_landmark, np.nonzero(is_line)[0])
@@ -225,18 +265,26 @@ def _assign_slots(observations: Observations, keyframes: int) -> tuple[SlotIndex
             f"`point_landmark` and `line_landmark` both name landmark {both[0]} (and {len(both) - 1} others): a "
             "landmark is a point or a line sample; give the sample a landmark of its own"
         )
-    point_counts = np.bincount(observations.host[~is_line], minlength=keyframes)
-    line_counts = np.bincount(observations.host[is_line], minlength=keyframes)
-    points, lines = int(point_counts.max(initial=0)), int(line_counts.max(initial=0))
-    slot = np.zeros(len(observations.host), int)
-    for kind, offset in ((~is_line, 0), (is_line, points)):
-        hosts = observations.host[kind]
-        order = np.argsort(hosts, kind="stable")
-        starts = np.searchsorted(hosts[order], np.arange(keyframes))
-        within = np.empty(len(hosts), int)
-        within[order] = np.arange(len(hosts)) - starts[hosts[order]]
-        slot[kind] = within + offset
-    return SlotIndex(np.asarray(observations.host), slot), points, lines
+    host = np.asarray(observations.host)
+    slot = np.zeros(len(host), int)
+    slot[~is_line], points = _numbered(host[~is_line], keyframes)
+    if observations.segment is None:
+        within, lines = _numbered(host[is_line], keyframes)
+        slot[is_line] = points + within
+        return _Slots(SlotIndex(host, slot), points, lines, None)
+    found = segment_slots(host[is_line], np.asarray(observations.segment)[is_line])
+    samples = max(samples or 0, found.samples, 1)
+    slot[is_line] = points + samples * found.rank + found.position
+    return _Slots(SlotIndex(host, slot), points, samples * found.segments, samples)
+
+
+def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, int]:
+    """Position of each landmark among those of its host, and the largest count."""
+    order = np.argsort(host, kind="stable")
+    starts = np.searchsorted(host[order], np.arange(keyframes))
+    within = np.empty(len(host), int)
+    within[order] = np.arange(len(host)) - starts[host[order]]
+    return within, int(np.bincount(host, minlength=keyframes).max(initial=0))
 
 
 def _sort_edges(edges: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray, int]:
@@ -315,7 +363,7 @@ def _check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.
         "line_coefficients": (lines, 3),
         "line_weight": (lines,),
     }
-    optional = ("depth_mean", "depth_sigma", "depth_weight")
+    optional = ("depth_mean", "depth_sigma", "depth_weight", "segment")
     given = {name: getattr(observations, name) for name in (*expected, *optional)}
     expected |= {name: (landmarks,) for name in optional if given[name] is not None}
     given |= {"poses": poses, "intrinsics": intrinsics}
@@ -345,6 +393,8 @@ def _check_positive(name: str, values: np.ndarray, count: int) -> None:
 
 
 def _check_size(size: PaddedSize, needed: PaddedSize) -> None:
+    if needed.samples is not None and size.lines % needed.samples:
+        raise InputError(f"`size.lines` is {size.lines}; it must be a multiple of `size.samples`, {needed.samples}")
     for name in ("keyframes", "points", "lines", "ranks", "edges"):
         have, need = getattr(size, name), getattr(needed, name)
         if have is not None and (have < need or (name == "edges" and have != need)):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.solvers.kernels import AbstractKernel, Huber
+from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 
 class State(eqx.Module):
@@ -104,8 +104,12 @@ class Problem(eqx.Module):
     """Keyframes whose pose is held (the gauge)."""
     fixed_intrinsics: Bool[Array, "4"]
     """Intrinsics that are held."""
-    kernel: AbstractKernel = Huber()
+    kernel: AbstractKernel = Cauchy()
     marginal: MarginalPrior | None = None
+    fraction: Float[Array, "n g q"] | None = None
+    """Two-ends lines: the `l = g q` line slots are `g` segments of `q` samples, and the inverse depth of a segment is
+    an affine function of this position along it (0 and 1 at its ends). It is a constant to derivatives. None: each
+    sample has its own inverse depth."""
     positive_depth: bool = eqx.field(static=True, default=True)
     """Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver without bounds."""
 

@@ -8,6 +8,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
+from vggtgeo.graduation import Graduation
 from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.adjoint import ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import (
@@ -59,6 +60,7 @@ def solve(
     *,
     solver: SchurLevenbergMarquardt | None = None,
     adjoint: optx.AbstractAdjoint | None = None,
+    graduation: Graduation | None = None,
 ) -> Solution:
     """Minimise the energy of `problem` from `initial`.
 
@@ -72,9 +74,13 @@ def solve(
         solver: iteration and linear algebra; default `SchurLevenbergMarquardt()`.
         adjoint: how to differentiate; default `ArrowAdjoint()`. `optimistix.RecursiveCheckpointAdjoint()` with
             `SchurLevenbergMarquardt(differentiable_loop=True)` differentiates through the iterates instead.
+        graduation: wider kernels to go through first, for a redescending kernel and a start that outliers dominate;
+            `history` and `iterations` are those of the last kernel, the one of `problem`.
     """
     solver = SchurLevenbergMarquardt() if solver is None else solver
     adjoint = ArrowAdjoint() if adjoint is None else adjoint
+    if graduation is not None:
+        initial = graduation.start(problem, initial, solver)
     found: optx.Solution = optx.least_squares(
         lambda point, ba: ba.energy(point),
         solver,

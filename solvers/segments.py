@@ -1,0 +1,76 @@
+"""Landmarks that lie on a straight line: two unknowns a segment instead of one a sample.
+
+Let the last `m q` landmarks of a host be `m` segments of `q` samples, each an affine function of its fraction `t` along
+the segment: `z_s = (1 - t_s) a + t_s b`. In `(a, b)` the landmark block `V` has a 2 x 2 block a segment. With
+`l = V_ab / V_aa`, the coordinates `y_a = a + l b`, `y_b = b` make it diagonal again:
+
+    z_s = (1 - t_s) y_a + (t_s - l (1 - t_s)) y_b,      V_y = diag(V_aa, V_bb - l V_ab),
+
+so that all that is written for scalar landmarks (Schur complement, damping, covariance) holds for segments as well.
+Only what enters and leaves the system passes through this basis, `expand` and its transpose `restrict`.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from vggtgeo.solvers.arrow import ArrowSystem
+
+
+def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> ArrowSystem:
+    """The system whose last `m q` landmarks a host are restricted to `m` affine functions of `fraction`."""
+    _, segments, samples = fraction.shape
+    alone = system.cross.shape[-1] - segments * samples
+    rows = system.cross[..., alone:].reshape(*system.cross.shape[:2], segments, samples)
+    curvature = rows[:, -1]
+    first, second = 1 - fraction, fraction
+    total = lambda *factors: jnp.sum(_product(curvature, *factors), -1)
+    own, mixed, other = total(first, first), total(first, second), total(second, second)
+    ratio = jnp.where(own != 0, mixed / jnp.where(own != 0, own, 1.0), 0.0)
+    second = second - ratio[..., None] * first
+    rest = total(second, second)
+    # Where one sample alone determines the segment, the second coordinate is rounding error.
+    determined = jnp.abs(rest) > 1e3 * jnp.finfo(rest.dtype).eps * (jnp.abs(own) + jnp.abs(other))
+    second = jnp.where(determined[..., None], second, 0.0)
+    basis = jnp.stack([first, second], -1)
+    joined = jnp.einsum("nrms,nmsk->nrkm", rows, basis)
+    joined = joined.at[:, -1].set(jnp.stack([own, jnp.where(determined, rest, 0.0)], 1))
+    cross = jnp.concatenate([system.cross[..., :alone], joined.reshape(*joined.shape[:2], 2 * segments)], -1)
+    return eqx.tree_at(lambda s: (s.cross, s.segments), system, (cross, basis), is_leaf=lambda leaf: leaf is None)
+
+
+def expand(system: ArrowSystem, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
+    """From the system's landmarks to those of the problem: the samples of the segments."""
+    if system.segments is None:
+        return landmarks
+    _, segments, samples, _ = system.segments.shape
+    alone = landmarks.shape[-1] - 2 * segments
+    pairs = landmarks[..., alone:].reshape(*landmarks.shape[:-1], 2, segments)
+    values = jnp.einsum("n...km,nmsk->n...ms", pairs, system.segments)
+    flat = values.reshape(*landmarks.shape[:-1], segments * samples)
+    return jnp.concatenate([landmarks[..., :alone], flat], -1)
+
+
+def restrict(system: ArrowSystem, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:
+    """The transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
+    if system.segments is None:
+        return landmarks
+    hosts, segments, samples, _ = system.segments.shape
+    alone = landmarks.shape[-1] - segments * samples
+    values = landmarks[:, alone:].reshape(hosts, segments, samples)
+    pairs = jnp.einsum("nms,nmsk->nkm", values, system.segments)
+    return jnp.concatenate([landmarks[:, :alone], pairs.reshape(hosts, 2 * segments)], -1)
+
+
+def expand_variance(system: ArrowSystem, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
+    """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
+    squared = eqx.tree_at(lambda s: s.segments, system, None if system.segments is None else system.segments**2)
+    return expand(squared, variance)
+
+
+def _product(*factors: Array) -> Array:
+    product = factors[0]
+    for factor in factors[1:]:
+        product = product * factor
+    return product

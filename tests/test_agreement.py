@@ -1,0 +1,74 @@
+"""Every combination of reduced solver, precision and kernel ends at the same optimum of the same small problem."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import make_scene
+from vggtgeo.solvers.band_cholesky import BandCholesky
+from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, ConjugateGradients
+from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+
+from vggtgeo.problem import Problem, State
+from vggtgeo.solution import Solution, solve
+
+SCENE = make_scene(5, points=8, lines=1, samples=3, noise=0.5, outliers=0.1, depth_error=0.05, seed=4)
+SOLVERS: dict[str, AbstractReducedSolver] = {
+    "dense": DenseCholesky(),
+    "band": BandCholesky(4),
+    "matrix-free": ConjugateGradients(),
+    "matrix-free, band": ConjugateGradients(BandPreconditioner(1)),
+}
+KERNELS: dict[str, AbstractKernel] = {
+    "square": Square(),
+    "Huber": Huber(),
+    "Cauchy": Cauchy(),
+    "Geman-McClure": GemanMcClure(),
+    "Barron": Barron(alpha=0.5),
+}
+ALL = [(s, k, d) for s in SOLVERS for k in KERNELS for d in ("float64", "float32")]
+COVERING = [
+    *(("band", "Huber", "float64"), ("matrix-free", "Cauchy", "float64"), ("matrix-free, band", "square", "float64")),
+    *(("dense", "Huber", "float32"), ("band", "Cauchy", "float32"), ("matrix-free", "Huber", "float32")),
+]
+"""Each solver, each precision with each solver but one; `make test-slow` runs them all."""
+
+
+@eqx.filter_jit
+def run(problem: Problem, state: State, solver: SchurLevenbergMarquardt) -> Solution:
+    return solve(problem, state, solver=solver)
+
+
+def problem_of(kernel: str, dtype: str) -> tuple[Problem, State]:
+    in_precision = lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf
+    cast = jax.tree.map(in_precision, KERNELS[kernel])
+    problem, state, _ = SCENE.pack(kernel=cast, dtype=np.dtype(dtype))
+    return problem, state
+
+
+@cache
+def expected(kernel: str) -> Solution:
+    """Dense Cholesky in double precision."""
+    return run(*problem_of(kernel, "float64"), SchurLevenbergMarquardt(rtol=1e-13, max_iterations=100))
+
+
+@pytest.mark.parametrize(
+    ("solver", "kernel", "dtype"),
+    [pytest.param(*case, marks=() if case in COVERING else pytest.mark.slow, id="-".join(case)) for case in ALL],
+)
+def test_all_combinations_agree(solver: str, kernel: str, dtype: str) -> None:
+    # Proves energy and state of a combination. Oracle: dense Cholesky in double precision with the same kernel.
+    problem, state = problem_of(kernel, dtype)
+    double = dtype == "float64"
+    settings = SchurLevenbergMarquardt(
+        rtol=1e-13 if double else 1e-7, max_iterations=100, reduced_solver=SOLVERS[solver]
+    )
+    found, reference = run(problem, state, settings), expected(kernel)
+    assert float(found.energy) == pytest.approx(float(reference.energy), rel=1e-9 if double else 1e-4)
+    difference = jnp.abs(found.state.poses.wxyz_xyz - reference.state.poses.wxyz_xyz).max()
+    assert float(difference) < (1e-6 if double else 5e-3), float(difference)

@@ -1,0 +1,49 @@
+"""Graduated non-convexity: a way into the basin of a redescending kernel from a start that outliers dominate.
+
+A kernel so wide that it is nearly quadratic has few local minima; its optimum is the start for the next narrower one,
+and so on down to the kernel asked for (Blake & Zisserman 1987; Yang et al., RA-L 2020). Only the last, full solve is
+differentiated: the optimum does not depend on the way to it.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from vggtgeo.bundle_adjustment import BundleAdjustment
+from vggtgeo.problem import Problem, State
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+
+
+class Graduation(eqx.Module):
+    """A few iterations at each of these kernel widths before the solve proper."""
+
+    factors: tuple[float, ...] = eqx.field(static=True, default=(16.0, 8.0, 4.0, 2.0))
+    """Widths, in units of the kernel's own."""
+    iterations: int = eqx.field(static=True, default=4)
+    """Tries at each width."""
+
+    def start(self, problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> State:
+        """The state after the widest to the narrowest of the factors, held coordinates as in `initial`."""
+        brief = eqx.tree_at(lambda s: s.max_iterations, solver, self.iterations)
+
+        def stage(state: State, factor: Float[Array, ""]) -> tuple[State, None]:
+            wide = eqx.tree_at(lambda p: p.kernel, problem, problem.kernel.widened(factor))
+            found = optx.least_squares(
+                lambda point, ba: ba.energy(point),
+                brief,
+                state,
+                args=BundleAdjustment(wide),
+                max_steps=self.iterations,
+                throw=False,
+            )
+            return found.value, None
+
+        factors = jnp.asarray(self.factors, initial.intrinsics.dtype)
+        detached = jax.lax.stop_gradient((problem, initial))
+        problem, state = detached
+        state, _ = jax.lax.scan(stage, state, factors)
+        return BundleAdjustment(problem).hold(jax.lax.stop_gradient(state), initial)

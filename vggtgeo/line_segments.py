@@ -1,0 +1,99 @@
+"""Two-ends lines, before they are arrays: where each sample lies on its segment, and depths that are straight along it.
+
+Along the image of a 3D line, inverse depth is an affine function of the pixel. So the samples of a segment share two
+unknowns instead of having one each (see `solvers/segments.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vggtgeo.errors import InputError
+
+NONE = -1
+"""Segment number of a landmark that is on no segment."""
+
+
+@dataclass(frozen=True)
+class SegmentSlots:
+    """Where the line samples of a problem go: `slot = samples * rank + position`."""
+
+    rank: np.ndarray
+    """int `[B]`: number of the sample's segment among those of its host."""
+    position: np.ndarray
+    """int `[B]`: number of the sample on its segment."""
+    segments: int
+    """Most segments of one host."""
+    samples: int
+    """Most samples of one segment."""
+
+
+def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
+    """Number the samples of each segment, and the segments of each host, in the order in which they are given.
+
+    Args:
+        host: int `[B]`, keyframe of each line sample.
+        segment: int `[B]`, its segment; a number belongs to one host.
+
+    Raises:
+        InputError: a sample without a segment, or a segment with samples in two keyframes.
+
+    """
+    if np.any(segment < 0):
+        first = int(np.nonzero(segment < 0)[0][0])
+        raise InputError(
+            f"`segment` is {segment[first]} for a line sample; give every sample a segment, from 0, or none"
+        )
+    numbers, first, inverse = np.unique(segment, return_index=True, return_inverse=True)
+    wrong = host != host[first][inverse]
+    if np.any(wrong):
+        raise InputError(
+            f"`segment` {segment[wrong][0]} has samples hosted in two keyframes; number segments by keyframe"
+        )
+    owner = host[first]
+    rank = np.zeros(len(numbers), int)
+    order = np.lexsort((first, owner))
+    starts = np.searchsorted(owner[order], owner[order])
+    rank[order] = np.arange(len(numbers)) - starts
+    by_segment = np.argsort(inverse, kind="stable")
+    begin = np.searchsorted(inverse[by_segment], inverse[by_segment])
+    position = np.empty(len(segment), int)
+    position[by_segment] = np.arange(len(segment)) - begin
+    most = lambda values: int(values.max(initial=-1)) + 1
+    return SegmentSlots(rank[inverse], position, most(rank), most(position))
+
+
+def fractions(pixels: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Position of each sample along its segment, 0 at the first and 1 at the last one; 0 where absent.
+
+    Args:
+        pixels: `[n, g, q, 2]`.
+        present: bool `[n, g, q]`; the samples of a segment come first.
+
+    """
+    count = present.sum(-1)
+    last = np.maximum(count - 1, 0)
+    start = pixels[:, :, :1]
+    along = np.take_along_axis(pixels, last[:, :, None, None], 2) - start
+    length = np.sum(along**2, -1)
+    share = np.sum((pixels - start) * along, -1) / np.where(length > 0, length, 1.0)
+    return np.where(present & (length > 0), share, 0.0)
+
+
+def straightened(inverse_depth: np.ndarray, fraction: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """The affine functions of `fraction` nearest to the inverse depths, all `[n, g, q]`.
+
+    Where the least-squares line is not positive all along, the mean.
+    """
+    weight = present.astype(inverse_depth.dtype)
+    count = np.maximum(weight.sum(-1, keepdims=True), 1.0)
+    mean = lambda values: (weight * values).sum(-1, keepdims=True) / count
+    centre, level = mean(fraction), mean(np.where(present, inverse_depth, 0.0))
+    spread = mean((fraction - centre) ** 2)
+    slope = mean((fraction - centre) * np.where(present, inverse_depth, 0.0)) / np.where(spread > 0, spread, 1.0)
+    line = level + slope * (fraction - centre)
+    ends = np.minimum(level - slope * centre, level + slope * (1 - centre))
+    line = np.where(ends > 0, line, level)
+    return np.where(count * level > 0, line, 1.0)
