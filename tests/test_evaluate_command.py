@@ -10,10 +10,11 @@ import typer
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+import vggtgeo.cli.evaluate
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.datasets import open_sequence
 from vggtgeo.errors import InputError
-from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.evaluation import MAX_TIME_DIFFERENCE, evaluate_trajectory
 from vggtgeo.trajectory import Trajectory
 
 app = typer.Typer()
@@ -44,6 +45,11 @@ def test_json_has_the_metrics(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     expected = evaluate_trajectory(*_load(files), max_dt=0.02, delta=3, all_pairs=True)
     assert json.loads(result.output) == json.loads(json.dumps(expected.as_dict()))
+
+
+def test_the_default_of_max_dt_is_that_of_the_library() -> None:
+    # Proves that the copy of the constant, which keeps `--help` quick, is true.
+    assert vggtgeo.cli.evaluate.MAX_TIME_DIFFERENCE == MAX_TIME_DIFFERENCE
 
 
 def test_the_table_has_every_metric(tmp_path: Path) -> None:

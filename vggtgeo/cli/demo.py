@@ -2,25 +2,45 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.run import make_roles, run_and_write
-from vggtgeo.simulation import simulate
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.cli.settings_file import SettingsOption
 
 
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("runs/demo"),
+    settings: SettingsOption = None,
     scene: Annotated[str, typer.Option(help="Synthetic scene.")] = "room",
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of the scene and its noise.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no report.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Run on a synthetic room with exact truth, rendered on the spot."""
+    from vggtgeo.cli.run import make_roles
+    from vggtgeo.cli.run_sequence import run_and_write
+    from vggtgeo.simulation import simulate
+    from vggtgeo.slam.settings import SlamSettings
+
+    quiet = quiet or as_json
     sequence = simulate(scene, frames, seed, rate=10.0)
-    flags = {"scene": scene, "frames": frames, "seed": seed, "simulated": True}
     roles = make_roles(sequence, "pnp", "sift")
-    typer.echo(f"simulated scene `{scene}`: all numbers below are of a simulation")
-    run_and_write(sequence, roles, SlamSettings(), output, flags, (0, None, 1), label=f"simulated {scene}")
+    if not quiet:
+        typer.echo(f"simulated scene `{scene}`: all numbers below are of a simulation")
+    run_and_write(
+        sequence,
+        roles,
+        SlamSettings(),
+        output,
+        settings.values() if settings else {},
+        (0, None, 1),
+        quiet=quiet,
+        label=f"simulated {scene}",
+        facts={"simulated": True},
+    )
+    if as_json:
+        typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))

@@ -1,18 +1,23 @@
 """`vggtgeo evaluate`: an estimated trajectory against the truth."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from vggtgeo.datasets import open_sequence
 from vggtgeo.errors import InputError
-from vggtgeo.evaluation import MAX_TIME_DIFFERENCE, ErrorStatistics, TrajectoryReport, evaluate_trajectory
-from vggtgeo.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from vggtgeo.evaluation import ErrorStatistics, TrajectoryReport
+    from vggtgeo.trajectory import Trajectory
+
+MAX_TIME_DIFFERENCE = 0.01
+"""Seconds; that of `vggtgeo.evaluation`, repeated here so that `--help` need not load it (a test compares them)."""
 
 
 def evaluate(
@@ -24,6 +29,8 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT."""
+    from vggtgeo.evaluation import evaluate_trajectory
+
     report = evaluate_trajectory(load_estimate(estimate), load_truth(truth), max_dt, delta, all_pairs)
     if as_json:
         typer.echo(json.dumps(report.as_dict(), indent=2))
@@ -33,11 +40,16 @@ def evaluate(
 
 def load_estimate(path: Path) -> Trajectory:
     """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`."""
+    from vggtgeo.trajectory import Trajectory
+
     return Trajectory.load_tum(path / "trajectory.txt" if path.is_dir() else path)
 
 
 def load_truth(path: Path) -> Trajectory:
     """The trajectory in the file `path`, or the truth of the dataset in the folder `path`."""
+    from vggtgeo.datasets import open_sequence
+    from vggtgeo.trajectory import Trajectory
+
     if not path.is_dir():
         return Trajectory.load_tum(path)
     truth = open_sequence(path).ground_truth()
@@ -48,6 +60,12 @@ def load_truth(path: Path) -> Trajectory:
 
 def print_report(report: TrajectoryReport) -> None:
     """Prints the table that people read; `TrajectoryReport.as_dict` is what programs read."""
+    import numpy as np
+    from rich.console import Console
+    from rich.table import Table
+
+    from vggtgeo.evaluation import ErrorStatistics
+
     console = Console()
     step = f"{report.relative.delta} pose{'s' if report.relative.delta > 1 else ''}"
     console.print(

@@ -26,19 +26,48 @@ class CommandEntry(NamedTuple):
     module: str
     summary: str
     """First line of the function's docstring, repeated here so that `--help` need not load it."""
+    examples: tuple[str, ...] = ()
+    """Calls that the command's help ends with, each with what it is for after a `#`."""
 
 
 COMMANDS = (
-    CommandEntry("run", "vggtgeo.cli.run", "Estimate trajectory and map of the sequence at PATH."),
-    CommandEntry("demo", "vggtgeo.cli.demo", "Run on a synthetic room with exact truth, rendered on the spot."),
     CommandEntry(
-        "evaluate", "vggtgeo.cli.evaluate", "Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT."
+        "run",
+        "vggtgeo.cli.run",
+        "Estimate trajectory and map of the sequence at PATH.",
+        (
+            "vggtgeo run clip.mp4 -o runs/clip  # RGB alone: the scale is free",
+            "vggtgeo run tum/desk -o runs/desk  # RGB-D: metric",
+            "vggtgeo run tum/desk --stride 2 --no-lines --json  # an ablation",
+            "vggtgeo run --settings runs/desk/settings.toml -o runs/again  # the same",
+        ),
     ),
-    CommandEntry("solve", "vggtgeo.cli.solve", "Solve the bundle-adjustment problem in PROBLEM."),
+    CommandEntry(
+        "demo",
+        "vggtgeo.cli.demo",
+        "Run on a synthetic room with exact truth, rendered on the spot.",
+        ("vggtgeo demo -o runs/demo --frames 60",),
+    ),
+    CommandEntry(
+        "evaluate",
+        "vggtgeo.cli.evaluate",
+        "Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT.",
+        (
+            "vggtgeo evaluate runs/desk tum/desk  # a run's folder against a dataset's",
+            "vggtgeo evaluate mine.txt truth.txt --json  # two files in the TUM format",
+        ),
+    ),
+    CommandEntry(
+        "solve",
+        "vggtgeo.cli.solve",
+        "Solve the bundle-adjustment problem in PROBLEM.",
+        ("vggtgeo solve problem.npz -o solution.npz --dtype float32",),
+    ),
     CommandEntry(
         "simulate",
         "vggtgeo.cli.simulate",
         "Render a hand-held walk through SCENE as a TUM RGB-D folder with exact truth.",
+        ("vggtgeo simulate office -o data/office --frames 300 --blur 0.01",),
     ),
     CommandEntry("models", "vggtgeo.cli.models", "List, check, fetch and export the networks of the roles."),
     CommandEntry(
@@ -46,6 +75,17 @@ COMMANDS = (
         "vggtgeo.cli.bench",
         "Run the comparisons of the paper with simulated roles in rendered worlds, and print their tables.",
     ),
+)
+START = (
+    "vggtgeo demo  # a simulated room, results in runs/demo",
+    "vggtgeo run PATH -o runs/mine  # a video or a folder of images",
+    "vggtgeo evaluate runs/mine PATH  # errors, where the truth is known",
+    "vggtgeo COMMAND --help  # examples of each command",
+)
+EXIT_CODES = (
+    f"0 done; {EXIT_INPUT} something given is wrong (one line says what, and what to do); {EXIT_INTERRUPTED} "
+    f"interrupted (a run writes what it has first); {EXIT_INTERNAL} a fault of the program (`vggtgeo --debug ...` "
+    "shows where)."
 )
 
 
@@ -75,8 +115,13 @@ def load_command(entry: CommandEntry) -> Any:
         function.info.name = entry.name
         return typer.main.get_command(function)
     single = typer.Typer(add_completion=False)
-    single.command(entry.name)(function)
+    single.command(entry.name, epilog=_examples(entry.examples))(function)
     return typer.main.get_command(single)
+
+
+def _examples(calls: tuple[str, ...]) -> str | None:
+    """Text for the end of a help page; a blank line keeps the lines apart there."""
+    return "\n\n".join(("Examples:", *(f"  {call}" for call in calls))) if calls else None
 
 
 def _is_usage_error(error: BaseException) -> bool:
@@ -107,6 +152,7 @@ def make_app() -> typer.Typer:
         cls=_LazyGroup,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
+        epilog=f"{_examples(START)}\n\nExit codes: {EXIT_CODES}",
         context_settings={"help_option_names": ["-h", "--help"]},
     )
 

@@ -1,45 +1,36 @@
-"""`vggtgeo run`: a sequence in, a trajectory and a map out."""
+"""`vggtgeo run`: a sequence in, a trajectory and a map out.
+
+What is heavy is imported when a run begins, so that `vggtgeo run --help` answers at once.
+"""
 
 from __future__ import annotations
 
 import json
-import time
 import warnings
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import cv2
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from vggtgeo.datasets import Sequence, open_sequence, parse_intrinsics, split, with_intrinsics, without_depth
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.evaluation import TrajectoryReport
-from vggtgeo.models.classical import ConstantVelocity, NoDepth, OrbMatcher, SiftMatcher
-from vggtgeo.slam import outputs
-from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.run import finish
-from vggtgeo.slam.run import run as run_slam
-from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import warm_up
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.cli.settings_file import SettingsOption
+from vggtgeo.errors import InputWarning
 
 if TYPE_CHECKING:
     from vggtgeo.cli.presets import Perception
+    from vggtgeo.datasets import Sequence
+    from vggtgeo.slam.settings import Roles
 
 Init = Literal["pnp", "constant-velocity"]
 Features = Literal["sift", "orb"]
 Preset = Literal["classical", "light", "paper"]
+EXIT_INTERRUPTED = 130
 
 
 def run(
     path: Annotated[Path, typer.Argument(help="Folder of a sequence, or a video file.", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("run"),
+    settings: SettingsOption = None,
     kind: Annotated[str | None, typer.Option(help="Reader: 7scenes, tum, images or video; found by looking.")] = None,
     start: Annotated[int, typer.Option(help="First frame.")] = 0,
     end: Annotated[int | None, typer.Option(help="Frame to stop before.")] = None,
@@ -65,32 +56,31 @@ def run(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
+    import cv2
+
+    from vggtgeo.cli.run_sequence import run_and_write
+    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
+    from vggtgeo.slam.settings import SlamSettings
+
     cv2.setRNGSeed(seed)
     sequence = open_sequence(path, kind)
     if intrinsics is not None:
         sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
     if rgb_only:
         sequence = without_depth(sequence)
-    settings = SlamSettings(
+    slam_settings = SlamSettings(
         use_lines=not no_lines,
         use_confidence=not no_confidence,
         depth_weight=0.0 if no_depth_prior else SlamSettings.depth_weight,
         global_adjustment=not no_global,
     )
     perceived = make_perception(preset, make_roles(sequence, init, features), models, cache)
-    flags = {
-        "path": str(path),
-        **{"start": start, "end": end, "stride": stride, "intrinsics": intrinsics, "rgb_only": rgb_only},
-        **{"no_lines": no_lines, "no_depth_prior": no_depth_prior, "no_confidence": no_confidence},
-        **{"no_global": no_global, "init": init, "features": features, "seed": seed},
-        **{"preset": preset, "models": models and str(models), "cache": cache and str(cache)},
-    }
-    run_and_write(
+    finished = run_and_write(
         sequence,
         perceived.roles,
-        settings,
+        slam_settings,
         output,
-        flags,
+        settings.values() if settings else {},
         (start, end, stride),
         save_depth=save_depth,
         quiet=quiet or as_json,
@@ -98,6 +88,8 @@ def run(
     )
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
+    if finished.interrupted:
+        raise typer.Exit(EXIT_INTERRUPTED)
 
 
 def make_perception(preset: str, classical: Roles, models: Path | None, cache: Path | None) -> Perception:
@@ -112,123 +104,12 @@ def make_perception(preset: str, classical: Roles, models: Path | None, cache: P
 
 def make_roles(sequence: Sequence, init: str, features: str) -> Roles:
     """The classical role objects for a sequence; the one place where names become objects."""
+    from vggtgeo.models.classical import ConstantVelocity, NoDepth, OrbMatcher, SiftMatcher
+    from vggtgeo.slam.settings import Roles
+
     roles = Roles(points={"sift": SiftMatcher, "orb": OrbMatcher}[features]())
     if init == "constant-velocity":
         roles = replace(roles, geometry=ConstantVelocity())
     if not sequence.has_depth:
         roles = replace(roles, depth=NoDepth())
     return roles
-
-
-def run_and_write(
-    sequence: Sequence,
-    roles: Roles,
-    settings: SlamSettings,
-    folder: Path,
-    flags: dict[str, Any],
-    selection: tuple[int, int | None, int],
-    *,
-    save_depth: bool = False,
-    quiet: bool = False,
-    label: str = "",
-    facts: Mapping[str, Any] = MappingProxyType({}),
-) -> Slam:
-    """Run a sequence with a progress bar, write every output into `folder`, and print the report."""
-    console = Console(stderr=False, quiet=quiet)
-    clock, began = Clock(), time.perf_counter()
-    with clock.measure("compile"):
-        warm_up(settings)
-    started = time.perf_counter()
-    estimated, truth = _set_apart(sequence)
-    folder.mkdir(parents=True, exist_ok=True)
-    slam, interrupted = _fold(estimated, roles, settings, selection, clock, console)
-    if slam is None or not slam.frames:
-        raise InputError(f"`{sequence.name}` gave no frame that could be used; nothing was written")
-    frames_per_second = len(slam.frames) / (time.perf_counter() - started)
-    outputs.write_trajectories(folder, slam)
-    if not interrupted:
-        slam = finish(slam, roles, settings, clock)
-        outputs.write_trajectories(folder, slam)
-    with clock.measure("write"):
-        points = outputs.write_map(folder, slam)
-        outputs.write_plot(folder, slam, truth, label or sequence.name)
-        if save_depth:
-            outputs.write_depth(folder, slam)
-    report = outputs.compare(slam, truth)
-    seconds = {**clock.seconds, "all": time.perf_counter() - began}
-    outputs.write_summary(
-        folder,
-        slam,
-        flags,
-        seconds,
-        report,
-        **facts,
-        **{"map_points": points, "frames_per_second": round(frames_per_second, 2), "interrupted": interrupted},
-    )
-    _print_report(console, slam, report, folder, frames_per_second, points)
-    return slam
-
-
-def _set_apart(sequence: Sequence) -> tuple[Sequence, Trajectory | None]:
-    """The sequence without its truth, and the truth; a truth that cannot be read costs the comparison only."""
-    try:
-        return split(sequence)
-    except InputError as error:
-        warnings.warn(f"the truth cannot be used and is left out: {error}", InputWarning, stacklevel=2)
-        return sequence, None
-
-
-def _fold(
-    sequence: Sequence,
-    roles: Roles,
-    settings: SlamSettings,
-    selection: tuple[int, int | None, int],
-    clock: Clock,
-    console: Console,
-) -> tuple[Slam | None, bool]:
-    """The state after the last frame, and whether Ctrl-C ended the run."""
-    start, end, stride = selection
-    total = len(range(start, min(len(sequence), end if end is not None else len(sequence)), stride))
-    slam: Slam | None = None
-    said = 0
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TextColumn("{task.fields[state]}"), console=console) as progress:
-        task = progress.add_task(sequence.name, total=total, state="")
-        began = time.perf_counter()
-        try:
-            for slam in run_slam(sequence, roles, settings, start=start, end=end, stride=stride, clock=clock):
-                rate = len(slam.frames) / (time.perf_counter() - began)
-                state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {_state(slam)}"
-                progress.update(task, advance=1, state=state)
-                for note in slam.notes[said:]:
-                    progress.console.print(f"warning: {note}", markup=False, highlight=False)
-                said = len(slam.notes)
-        except KeyboardInterrupt:
-            console.print("interrupted: writing what there is")
-            return slam, True
-    return slam, False
-
-
-def _state(slam: Slam) -> str:
-    if slam.lost:
-        return "lost"
-    return "waiting for parallax" if slam.waiting else "tracking"
-
-
-def _print_report(
-    console: Console, slam: Slam, report: TrajectoryReport | None, folder: Path, rate: float, points: int
-) -> None:
-    fx, fy, cx, cy = slam.intrinsics
-    tracked = sum(record.tracked for record in slam.frames)
-    lines = [
-        f"{len(slam.frames)} frames ({tracked} tracked), {len(slam.keyframes)} keyframes, {rate:.1f} frames/s",
-        f"intrinsics fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}",
-    ]
-    if not slam.metric:
-        lines.append("scale: free, there is no metric depth; lengths have no unit")
-    if report is not None:
-        se3, sim3 = report.se3.statistics.rmse, report.sim3.statistics.rmse
-        lines.append(f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment")
-    lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply ({points} points) trajectory.png")
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)

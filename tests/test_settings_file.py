@@ -1,0 +1,131 @@
+"""`--settings FILE.toml`: what it accepts and refuses, who wins, and that what a run writes gives the run again."""
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+import typer
+from conftest import ROOT
+from typer.testing import CliRunner
+
+from vggtgeo.cli.main import COMMANDS, EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, make_app
+from vggtgeo.cli.settings_file import SettingsOption, write_settings
+from vggtgeo.errors import InputError
+
+DEFAULTS = {"path": "clip", "count": 3, "scale": None, "rgb-only": False, "mode": "fast", "json": False}
+
+
+def seen_by_the_command(*arguments: str) -> dict[str, Any]:
+    """The effective settings of a small command with one parameter of each kind, called with `arguments`."""
+    found: dict[str, Any] = {}
+
+    def command(
+        path: Annotated[Path, typer.Argument()],
+        settings: SettingsOption = None,
+        count: int = 3,
+        scale: Annotated[float | None, typer.Option()] = None,
+        rgb_only: Annotated[bool, typer.Option("--rgb-only")] = False,
+        mode: Annotated[Literal["fast", "slow"], typer.Option("-m", "--mode")] = "fast",
+        as_json: Annotated[bool, typer.Option("--json")] = False,
+    ) -> None:
+        assert settings is not None
+        found.update(settings.values())
+
+    app = typer.Typer(add_completion=False)
+    app.command()(command)
+    result = CliRunner().invoke(app, list(arguments))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return found
+
+
+def file_with(folder: Path, text: str) -> str:
+    (folder / "s.toml").write_text(text)
+    return str(folder / "s.toml")
+
+
+def test_a_file_says_what_flags_say(tmp_path: Path) -> None:
+    # Proves that a file equals the flags. Oracle: the same command called with flags.
+    text = 'path = "clip"\ncount = 7\nscale = 2\nrgb-only = true\nmode = "slow"\njson = true\n'
+    by_flags = seen_by_the_command("clip", "--count", "7", "--scale", "2", "--rgb-only", "--mode", "slow", "--json")
+    assert seen_by_the_command("--settings", file_with(tmp_path, text)) == by_flags
+    assert by_flags == {"path": "clip", "count": 7, "scale": 2.0, "rgb-only": True, "mode": "slow", "json": True}
+
+
+def test_a_flag_wins_over_the_file(tmp_path: Path) -> None:
+    # Proves the order: flag, file, default; also where the flag comes first.
+    path = file_with(tmp_path, 'count = 7\nmode = "slow"\n')
+    expected = {**DEFAULTS, "count": 9, "mode": "slow"}
+    assert seen_by_the_command("clip", "--settings", path, "--count", "9") == expected
+    assert seen_by_the_command("--count", "9", "clip", "--settings", path) == expected
+
+
+def test_what_is_written_gives_the_same_again(tmp_path: Path) -> None:
+    # Proves the round trip, and that what is not set is left out.
+    settings = {**DEFAULTS, "count": 5}
+    write_settings(tmp_path / "out.toml", settings)
+    assert seen_by_the_command("--settings", str(tmp_path / "out.toml")) == settings
+    assert "scale" not in tomllib.loads((tmp_path / "out.toml").read_text())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rgb_only = true", "`rgb_only` is no setting of this command; the nearest is `rgb-only`"),
+        ("cuont = 4", "`cuont` is no setting of this command; the nearest is `count`"),
+        ("zzz = 4", "`zzz` is no setting of this command; the nearest is"),
+        ('settings = "x"', "`settings` is no setting"),
+        ('count = "4"', "`count` is '4'; it must be a whole number"),
+        ("count = true", "`count` is True; it must be a whole number"),
+        ("count = 1.5", "`count` is 1.5; it must be a whole number"),
+        ("scale = true", "`scale` is True; it must be a number"),
+        ("rgb-only = 1", "`rgb-only` is 1; it must be true or false"),
+        ("mode = 3", "`mode` is 3; it must be text in quotes"),
+        ("count = ", "is no TOML file"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, text: str, message: str) -> None:
+    # Proves that an unknown key or a wrong type is refused with what was meant.
+    with pytest.raises(InputError) as raised:
+        seen_by_the_command("clip", "--settings", file_with(tmp_path, text))
+    assert message in str(raised.value)
+
+
+def test_a_value_that_is_no_choice_is_refused(tmp_path: Path) -> None:
+    # Proves that a value from a file is checked as that of a flag is.
+    with pytest.raises(AssertionError, match="medium"):
+        seen_by_the_command("clip", "--settings", file_with(tmp_path, 'mode = "medium"'))
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    # Proves that the message names the flag and the file.
+    with pytest.raises(InputError, match=r"`--settings` is .*none.toml"):
+        seen_by_the_command("clip", "--settings", str(tmp_path / "none.toml"))
+
+
+def test_help_of_every_command_is_quick_and_shows_examples() -> None:
+    # Proves that no command's help loads a numerical package, and that each ends with its examples.
+    # Oracle: `sys.modules` of a new process.
+    script = (
+        "import sys; from typer.testing import CliRunner; from vggtgeo.cli.main import COMMANDS, make_app\n"
+        "for entry in COMMANDS:\n"
+        "    out = CliRunner().invoke(make_app(), [entry.name, '--help'], env={'COLUMNS': '300'}).output\n"
+        "    assert all(call in out for call in entry.examples) and entry.examples, (entry.name, out)\n"
+        "print(sorted({'jax', 'cv2', 'matplotlib', 'scipy', 'onnxruntime', 'rerun', 'equinox'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_help_tells_the_exit_codes() -> None:
+    # Proves that a script's author finds the codes. Oracle: the constants of the program.
+    listing = " ".join(CliRunner().invoke(make_app(), ["--help"], env={"COLUMNS": "300"}).output.split())
+    for code, meaning in ((0, "done"), (EXIT_INPUT, "something given is wrong"), (EXIT_INTERRUPTED, "interrupted")):
+        assert f"{code} {meaning}" in listing
+    assert f"{EXIT_INTERNAL} a fault" in listing
+    assert len(COMMANDS) >= 5

@@ -1,0 +1,106 @@
+"""Settings files: a TOML file says what the flags say, and a run leaves the settings it used in its folder.
+
+A key is the long name of a flag without its dashes (`rgb-only = true`), or the name of an argument (`path = "..."`).
+The file takes the place of the defaults, so a flag that is given wins over it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+import typing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from vggtgeo.errors import InputError
+
+_NOT_SETTINGS = ("settings", "help")
+_KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
+    bool: ("true or false", (bool,)),
+    int: ("a whole number", (int,)),
+    float: ("a number", (int, float)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SettingsInUse:
+    """The settings of the running command, wherever each came from: flag, file or default."""
+
+    context: Any
+    """The command's context."""
+
+    def values(self) -> dict[str, Any]:
+        """Each flag and argument by its key, in the order of the help; None where not set."""
+        found = {key: self.context.params.get(name) for key, name in _keys(self.context).items()}
+        return {key: str(value) if isinstance(value, Path) else value for key, value in found.items()}
+
+
+def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
+    """The file's values become the defaults of the command's other parameters."""
+    if path is not None and not context.resilient_parsing:
+        context.default_map = _checked(path, _read(path), _keys(context), _types(context))
+    return SettingsInUse(context)
+
+
+SettingsOption = Annotated[
+    SettingsInUse | None,
+    typer.Option(
+        "--settings",
+        metavar="FILE.toml",
+        parser=Path,
+        callback=_use,
+        is_eager=True,
+        help="Flags from a file, as `rgb-only = true`; a flag that is given wins over it.",
+    ),
+]
+"""The option, for a command's signature. It raises InputError for a file that cannot be read or is no TOML, for a key
+that is no flag of the command, and for a value of a wrong type."""
+
+
+def write_settings(path: Path, values: dict[str, Any]) -> None:
+    """Writes a settings file that gives `values` again, atomically; what is None is left out, as TOML has no null."""
+    import tomli_w
+
+    from vggtgeo.files import write_text
+
+    write_text(path, tomli_w.dumps({key: value for key, value in values.items() if value is not None}))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"`--settings` is `{path}`, which cannot be read ({error.strerror}); give a TOML file"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"`{path}` is no TOML file: {error}; a line is `key = value`, text in quotes") from None
+
+
+def _checked(path: Path, given: dict[str, Any], names: dict[str, str], types: dict[str, Any]) -> dict[str, Any]:
+    for key, value in given.items():
+        if key not in names:
+            near = difflib.get_close_matches(key, names, 1, 0.0)[0]
+            raise InputError(f"`{path}`: `{key}` is no setting of this command; the nearest is `{near}`")
+        wanted, accepted = _KINDS.get(types[names[key]], ("text in quotes", (str,)))
+        if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
+            raise InputError(f"`{path}`: `{key}` is {value!r}; it must be {wanted}")
+    return {names[key]: value for key, value in given.items()}
+
+
+def _keys(context: Any) -> dict[str, str]:
+    """Name of the parameter behind each key, in the order of the help."""
+    keys = {}
+    for parameter in context.command.params:
+        if parameter.name is not None and parameter.name not in _NOT_SETTINGS:
+            keys[max(parameter.opts, key=len).lstrip("-")] = parameter.name
+    return keys
+
+
+def _types(context: Any) -> dict[str, Any]:
+    """The annotated type of each parameter, without `| None`."""
+    hints = typing.get_type_hints(context.command.callback)
+    return {name: next((t for t in typing.get_args(hint) if t in _KINDS), hint) for name, hint in hints.items()}
