@@ -126,7 +126,8 @@ def test_wheel_holds_every_source_file_and_nothing_else(source: Path, wheel: Pat
         files = [Path(name) for name in archive.namelist() if ".dist-info/" not in name]
     found = {".".join(file.with_suffix("").parts).removesuffix(".__init__") for file in files if file.suffix == ".py"}
     assert found == _source_modules(source)
-    assert [file for file in files if file.suffix != ".py"] == [Path("vggtgeo/py.typed")]
+    data = {file for file in files if file.suffix != ".py"}
+    assert data == {Path("vggtgeo/py.typed"), Path("vggtgeo/report/page.html.j2")}
 
 
 def test_every_module_imports_from_a_users_folder(installation: Installation, source: Path, user_folder: Path) -> None:

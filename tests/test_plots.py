@@ -33,7 +33,7 @@ def _turned(trajectory: Trajectory, seed: int) -> Trajectory:
 def test_up_is_found_in_any_frame_although_the_camera_looks_down(seed: int) -> None:
     # Proves that the views are level whatever the world frame. Oracle: the walk is level, so it has no height.
     turned = _turned(_walk(), seed)
-    view = plots._view_axes(turned)
+    view = plots.view_axes(turned)
     np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(view) == pytest.approx(1.0)
     heights = turned.positions @ view[2]
@@ -44,7 +44,7 @@ def test_up_is_found_in_any_frame_although_the_camera_looks_down(seed: int) -> N
 def test_up_of_a_camera_that_never_turns_is_its_own() -> None:
     # Proves that up is defined where image rows all have one direction. Oracle: the camera's own up direction.
     turned = _turned(_walk().select(slice(0, 15)), 0)
-    np.testing.assert_allclose(plots._view_axes(turned)[2], -turned.rotations[0, :, 1], atol=1e-12)
+    np.testing.assert_allclose(plots.view_axes(turned)[2], -turned.rotations[0, :, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize("with_truth", [False, True])

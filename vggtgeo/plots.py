@@ -51,14 +51,28 @@ def plot_trajectory(
     over the poses that match in time; where too few match, the truth is left out. `keyframes` are marked. The
     result of a reconstruction without scale and without truth has no unit. InputError for an empty estimate.
     """
+    figure = trajectory_figure(estimate, truth, keyframes, with_scale, title)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=130, format="png", facecolor="white")
+
+
+def trajectory_figure(
+    estimate: Trajectory,
+    truth: Trajectory | None = None,
+    keyframes: Trajectory | None = None,
+    with_scale: bool = False,
+    title: str | None = "",
+    width: float = _WIDTH,
+) -> Figure:
+    """The same as a figure, `width` inches wide; without a title where `title` is None."""
     if len(estimate) == 0:
         raise InputError("`estimate` has no pose; there is nothing to draw")
     drawn = _align(estimate, truth, keyframes, with_scale)
-    axes_of_view = _view_axes(drawn.truth or drawn.estimate)
-    figure = _draw(drawn, axes_of_view, unit="m" if drawn.error or not with_scale else "no unit")
-    figure.suptitle(_title(drawn, title, with_scale), x=0.01, ha="left", fontsize=12, color=_INK)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130, format="png", facecolor="white")
+    axes_of_view = view_axes(drawn.truth or drawn.estimate)
+    figure = _draw(drawn, axes_of_view, "m" if drawn.error or not with_scale else "no unit", width)
+    if title is not None:
+        figure.suptitle(_title(drawn, title, with_scale), x=0.01, ha="left", fontsize=12, color=_INK)
+    return figure
 
 
 def _align(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory | None, with_scale: bool) -> _Drawn:
@@ -74,8 +88,10 @@ def _align(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory
     return _Drawn(alignment.trajectory(estimate), alignment.points(places), truth.select(inside), error)
 
 
-def _view_axes(trajectory: Trajectory) -> Float[np.ndarray, "3 3"]:
-    """Rows: the longest horizontal direction, the other horizontal one, up; a right-handed frame."""
+def view_axes(trajectory: Trajectory) -> Float[np.ndarray, "3 3"]:
+    """A level frame for looking at `trajectory`, found from its cameras: rows are the longest horizontal direction, the
+    other horizontal one, and up; right-handed.
+    """
     up = _up(trajectory)
     centred = trajectory.positions - trajectory.positions.mean(axis=0)
     horizontal = centred - np.outer(centred @ up, up)
@@ -96,7 +112,7 @@ def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
     return up if up @ mean_up >= 0 else -up
 
 
-def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str) -> Figure:
+def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> Figure:
     origin = (drawn.truth or drawn.estimate).positions[0]
     everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
     points = (np.concatenate(everything) - origin) @ axes_of_view.T
@@ -105,8 +121,8 @@ def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str) -> Figure:
     extent = np.maximum(high - low, 0.15 * span)
     low, high = 0.5 * (low + high) - 0.56 * extent, 0.5 * (low + high) + 0.56 * extent
     heights = high - low
-    panel = min(0.85 * _WIDTH * (heights[1] + heights[2]) / heights[0], 9.0)
-    figure = Figure(figsize=(_WIDTH, panel + 2.2), layout="constrained")
+    panel = min(0.85 * width * (heights[1] + heights[2]) / heights[0], 0.82 * width)
+    figure = Figure(figsize=(width, panel + 2.2), layout="constrained")
     FigureCanvasAgg(figure)
     top, side = figure.subplots(2, 1, height_ratios=[heights[1], heights[2]], sharex=True)
     for axes, vertical, name in ((top, 1, "seen from above"), (side, 2, "seen from the side")):

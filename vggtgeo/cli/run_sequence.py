@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from vggtgeo.cli.settings_file import write_settings
-from vggtgeo.datasets import Sequence, split
+from vggtgeo.datasets import Frame, Sequence, split
 from vggtgeo.errors import InputError, InputWarning
 from vggtgeo.evaluation import TrajectoryReport
+from vggtgeo.report import write_page
 from vggtgeo.slam import outputs
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.run import finish
-from vggtgeo.slam.run import run as run_slam
+from vggtgeo.slam.run import finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.watching import Watcher, WindowRecorder
 from vggtgeo.slam.window import warm_up
 from vggtgeo.trajectory import Trajectory
 
@@ -47,46 +49,59 @@ def run_and_write(
     quiet: bool = False,
     label: str = "",
     facts: Mapping[str, Any] = MappingProxyType({}),
+    watchers: tuple[Watcher, ...] = (),
 ) -> Finished:
     """Run a sequence with a progress bar, write every output into `folder`, and print the report.
 
     flags: the effective settings, by the names of the flags; `settings.toml` and `summary.json` hold them.
-    facts: what else the summary shall say.
+    facts: what else the summary shall say. watchers: are told of every frame, and of the end.
     """
     console = Console(stderr=False, quiet=quiet)
     clock, began = Clock(), time.perf_counter()
+    recorder = WindowRecorder()
     with clock.measure("compile"):
-        warm_up(settings)
-    started = time.perf_counter()
-    estimated, truth = _set_apart(sequence)
-    folder.mkdir(parents=True, exist_ok=True)
-    slam, interrupted = _fold(estimated, roles, settings, selection, clock, console)
-    if slam is None or not slam.frames:
-        raise InputError(f"`{sequence.name}` gave no frame that could be used; nothing was written")
-    frames_per_second = len(slam.frames) / (time.perf_counter() - started)
+        recorder.warm_up(*warm_up(settings))
+    with collected_warnings() as said:
+        estimated, truth = _set_apart(sequence)
+        folder.mkdir(parents=True, exist_ok=True)
+        fold = _fold(estimated, roles, settings, selection, clock, console, (recorder, *watchers))
+    slam = fold.slam
     write_settings(folder / "settings.toml", flags)
     outputs.write_trajectories(folder, slam)
-    if not interrupted:
+    if not fold.interrupted:
         slam = finish(slam, roles, settings, clock)
         outputs.write_trajectories(folder, slam)
+    for watcher in watchers:
+        watcher.finish(slam)
     with clock.measure("write"):
-        points = outputs.write_map(folder, slam)
+        cloud = outputs.write_map(folder, slam)
         outputs.write_plot(folder, slam, truth, label or sequence.name)
         if save_depth:
             outputs.write_depth(folder, slam)
     report = outputs.compare(slam, truth)
-    seconds = {**clock.seconds, "all": time.perf_counter() - began}
-    outputs.write_summary(
+    summary = outputs.write_summary(
         folder,
         slam,
         {name.replace("-", "_"): value for name, value in flags.items()},
-        seconds,
+        {**clock.seconds, "all": time.perf_counter() - began},
         report,
         **facts,
-        **{"map_points": points, "frames_per_second": round(frames_per_second, 2), "interrupted": interrupted},
+        map_points=len(cloud),
+        frames_per_second=round(fold.frames_per_second, 2),
+        interrupted=fold.interrupted,
     )
-    _print_report(console, slam, report, folder, frames_per_second, points)
-    return Finished(slam, interrupted)
+    write_page(
+        folder / "report.html",
+        slam,
+        title=label or sequence.name,
+        truth=truth,
+        cloud=cloud,
+        records=recorder.records,
+        summary={**summary, "settings": flags},
+        warnings=said,
+    )
+    _print_report(console, slam, report, folder, fold.frames_per_second, len(cloud))
+    return Finished(slam, fold.interrupted)
 
 
 def _set_apart(sequence: Sequence) -> tuple[Sequence, Trajectory | None]:
@@ -98,6 +113,13 @@ def _set_apart(sequence: Sequence) -> tuple[Sequence, Trajectory | None]:
         return sequence, None
 
 
+@dataclass(frozen=True, eq=False)
+class _Fold:
+    slam: Slam
+    interrupted: bool
+    frames_per_second: float
+
+
 def _fold(
     sequence: Sequence,
     roles: Roles,
@@ -105,28 +127,66 @@ def _fold(
     selection: tuple[int, int | None, int],
     clock: Clock,
     console: Console,
-) -> tuple[Slam | None, bool]:
-    """The state after the last frame, and whether Ctrl-C ended the run."""
+    watchers: Iterable[Watcher],
+) -> _Fold:
+    """The loop over frames; Ctrl-C ends it early, an input error of the sequence ends it without a result."""
     start, end, stride = selection
     total = len(range(start, min(len(sequence), end if end is not None else len(sequence)), stride))
     slam: Slam | None = None
-    said = 0
+    interrupted = False
+    given: dict[int, Frame] = {}
+    frames = _remembered(sequence.frames(start, end, stride), given)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TextColumn("{task.fields[state]}"), console=console) as progress:
         task = progress.add_task(sequence.name, total=total, state="")
         began = time.perf_counter()
         try:
-            for slam in run_slam(sequence, roles, settings, start=start, end=end, stride=stride, clock=clock):
-                rate = len(slam.frames) / (time.perf_counter() - began)
-                state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {_state(slam)}"
-                progress.update(task, advance=1, state=state)
-                for note in slam.notes[said:]:
-                    progress.console.print(f"warning: {note}", markup=False, highlight=False)
-                said = len(slam.notes)
+            for slam in run_frames(frames, sequence.camera, roles, settings, clock):
+                _show(progress, task, slam, time.perf_counter() - began)
+                frame = given.pop(slam.frames[-1].frame)
+                for watcher in watchers:
+                    with clock.measure("record and draw"):
+                        watcher.see(slam, frame)
         except KeyboardInterrupt:
             console.print("interrupted: writing what there is")
-            return slam, True
-    return slam, False
+            interrupted = True
+    if slam is None or not slam.frames:
+        raise InputError(f"`{sequence.name}` gave no frame that could be used; nothing was written")
+    return _Fold(slam, interrupted, len(slam.frames) / (time.perf_counter() - began))
+
+
+def _remembered(frames: Iterable[Frame], given: dict[int, Frame]) -> Iterator[Frame]:
+    """The same frames, each kept in `given` by its index until somebody takes it."""
+    for frame in frames:
+        given[frame.index] = frame
+        yield frame
+
+
+def _show(progress: Progress, task: TaskID, slam: Slam, seconds: float) -> None:
+    state = f"{len(slam.frames) / seconds:.1f} frames/s, {len(slam.keyframes)} keyframes, {_state(slam)}"
+    progress.update(task, advance=1, state=state)
+    said = progress.tasks[0].fields.get("said", 0)
+    for note in slam.notes[said:]:
+        progress.console.print(f"warning: {note}", markup=False, highlight=False)
+    progress.update(task, said=len(slam.notes))
+
+
+@contextmanager
+def collected_warnings() -> Iterator[list[str]]:
+    """The texts of the warnings about the input, in order, gathered while they are shown as before."""
+    said: list[str] = []
+    show_as_before = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if issubclass(category, InputWarning):
+            said.append(str(message))
+        show_as_before(message, category, *rest, **more)
+
+    warnings.showwarning = show
+    try:
+        yield said
+    finally:
+        warnings.showwarning = show_as_before
 
 
 def _state(slam: Slam) -> str:
@@ -149,6 +209,6 @@ def _print_report(
     if report is not None:
         se3, sim3 = report.se3.statistics.rmse, report.sim3.statistics.rmse
         lines.append(f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment")
-    lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply ({points} points) trajectory.png")
+    lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply ({points} points) report.html")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

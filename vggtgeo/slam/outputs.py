@@ -18,6 +18,7 @@ from vggtgeo.errors import InputError
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.files import atomic_path, write_json
 from vggtgeo.plots import plot_trajectory
+from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.trajectory import Trajectory
@@ -32,11 +33,11 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
     keyframe_trajectory(slam).save_tum(folder / "keyframes.txt")
 
 
-def write_map(folder: Path, slam: Slam) -> int:
-    """`map.ply`; returns the number of points."""
+def write_map(folder: Path, slam: Slam) -> PointCloud:
+    """`map.ply`; returns the points."""
     cloud = map_points(slam.keyframes, slam.intrinsics)
     cloud.save_ply(folder / "map.ply")
-    return len(cloud)
+    return cloud
 
 
 def write_depth(folder: Path, slam: Slam) -> None:
@@ -78,8 +79,11 @@ def write_summary(
     seconds: Mapping[str, float],
     report: TrajectoryReport | None,
     **counts: Any,
-) -> None:
-    """`summary.json`: settings, versions, counts, time by stage, final intrinsics, and the ATE where truth is known."""
+) -> dict[str, Any]:
+    """`summary.json`: settings, versions, counts, time by stage, final intrinsics, and the ATE where truth is known.
+
+    Returns what it wrote.
+    """
     tracked = sum(record.tracked for record in slam.frames)
     values = {
         "settings": dict(settings),
@@ -99,6 +103,7 @@ def write_summary(
     if report is not None:
         values["truth"] = report.as_dict()
     write_json(folder / "summary.json", values)
+    return values
 
 
 def versions() -> dict[str, str]:

@@ -48,7 +48,8 @@ class Slam:
     intrinsics: current fx, fy, cx, cy. given_intrinsics, intrinsics_sigma: mean and standard deviation of their prior,
     pixels. keyframes: all, by number. pairs: all matches between them. window: numbers of
     the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
-    solved: the last window problem and its solution. frames: every frame's pose. velocity: last motion from frame to
+    solved: the last window problem and its solution. energies: `1/2 sum rho` of that window before its first and after
+    each iteration. frames: every frame's pose. velocity: last motion from frame to
     frame, camera -> camera. waiting: frames before the start of an RGB sequence. lost: frames since tracking was lost.
     metric: whether lengths are metres. notes: what the user should know.
     """
@@ -62,6 +63,7 @@ class Slam:
     window: tuple[int, ...] = ()
     prior: MarginalPrior | None = None
     solved: tuple[Adjustment, State] | None = None
+    energies: np.ndarray | None = None
     frames: tuple[FramePose, ...] = ()
     velocity: np.ndarray = field(default_factory=lambda: np.eye(4))
     waiting: tuple[Waiting, ...] = ()

@@ -10,7 +10,7 @@ import numpy as np
 
 from vggtgeo.marginalisation import marginalise_jit, no_prior, reorder
 from vggtgeo.packing import Observations, PaddedSize, pack
-from vggtgeo.problem import MarginalPrior
+from vggtgeo.problem import MarginalPrior, Problem, State
 from vggtgeo.slam import rigid
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
@@ -28,8 +28,11 @@ def window_size(settings: SlamSettings) -> PaddedSize:
     return PaddedSize(settings.window, settings.point_slots, settings.line_slots, settings.window - 1)
 
 
-def warm_up(settings: SlamSettings) -> None:
-    """Compile what every window needs, on a problem of the right shape that holds one observation."""
+def warm_up(settings: SlamSettings) -> tuple[Problem, State]:
+    """Compile what every window needs, on a problem of the right shape that holds one observation.
+
+    Returns that problem and its solution, for whoever has more to compile.
+    """
     one = Observations(
         edges=np.array([[0, 1]]),
         host=np.zeros(1, int),
@@ -45,6 +48,7 @@ def warm_up(settings: SlamSettings) -> None:
     problem = replace(problem, marginal=no_prior(settings.window))
     solution = solve_jit(problem, initial, solver=window_solver(settings))
     marginalise_jit(problem, solution.state, jnp.asarray(0)).root.block_until_ready()
+    return problem, solution.state
 
 
 def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
@@ -90,7 +94,14 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     keyframes = list(slam.keyframes)
     for keyframe in updated:
         keyframes[keyframe.number] = keyframe
-    return replace(slam, keyframes=tuple(keyframes), intrinsics=intrinsics, solved=(adjustment, solution.state))
+    history = np.asarray(solution.history, np.float64)
+    return replace(
+        slam,
+        keyframes=tuple(keyframes),
+        intrinsics=intrinsics,
+        solved=(adjustment, solution.state),
+        energies=history[np.isfinite(history)],
+    )
 
 
 def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> Adjustment:

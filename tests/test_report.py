@@ -1,0 +1,171 @@
+"""The page of a run, and what it is made of: residual sizes, the record of windows, pictures of the map."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+import pytest
+from scenes import make_scene
+from vggtgeo.models.classical import SiftMatcher
+from vggtgeo.solvers.kernels import Square
+
+from vggtgeo.dense import map_points
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.point_cloud import PointCloud
+from vggtgeo.report import map_view, write_page
+from vggtgeo.residual_sizes import residual_sizes
+from vggtgeo.simulation import simulate
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.outputs import write_summary
+from vggtgeo.slam.run import frame_trajectory, run_frames
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.watching import WindowRecorder
+from vggtgeo.trajectory import Trajectory
+
+# The shape of tests/test_pipeline.py, so that a run of both compiles the solver once.
+SETTINGS = SlamSettings(window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False)
+ROLES = Roles(points=SiftMatcher(count=500))
+VOID = {"meta", "img", "link", "br", "hr", "input"}
+
+
+def test_residual_sizes_of_known_noise() -> None:
+    """Noise of 0.7 px, and a prior off by one sigma, are found as such; oracle: the noise put in, at the truth."""
+    scene = make_scene(keyframes=4, points=200, lines=40, noise=0.7, depth_error=0.05)
+    problem, state, _ = scene.at_truth(kernel=Square())
+    sizes = eqx.filter_jit(residual_sizes)(problem, state)
+    assert float(sizes.points) == pytest.approx(0.7 * np.sqrt(2), rel=0.03)
+    assert float(sizes.lines) == pytest.approx(0.7, rel=0.1)
+    assert float(sizes.depth) == pytest.approx(1.0, rel=0.1)
+    count = len(scene.observations.point_edge), len(scene.observations.line_edge), len(scene.observations.host)
+    assert (int(sizes.point_count), int(sizes.line_count), int(sizes.depth_count)) == count
+    assert f"({count[0]})" in str(sizes)
+
+
+def test_an_absent_kind_has_no_size() -> None:
+    """Without lines their size is NaN and their count 0, so that nobody reads a zero residual."""
+    problem, state, _ = make_scene(keyframes=2, points=4, lines=0).at_truth()
+    sizes = eqx.filter_jit(residual_sizes)(problem, state).to_dict()
+    assert np.isnan(sizes["lines"])
+    assert sizes["line_count"] == 0
+
+
+class _Run:
+    """A short simulated run, recorded."""
+
+    def __init__(self) -> None:
+        self.sequence = simulate("room", 14, 0, (320, 240), rate=10.0)
+        frames = list(self.sequence.frames())
+        self.recorder = WindowRecorder()
+        for slam in run_frames(iter(frames), self.sequence.camera, ROLES, SETTINGS, Clock()):
+            self.recorder.see(slam, frames[slam.frames[-1].frame])
+        self.slam = slam
+        self.cloud = map_points(self.slam.keyframes, self.slam.intrinsics)
+
+    def page(self, folder: Path, slam: Slam | None = None, **options: object) -> str:
+        """The text of the page of this run, or of a changed state of it."""
+        slam = slam or self.slam
+        truth = self.sequence.ground_truth()
+        report = evaluate_trajectory(frame_trajectory(slam), truth)
+        facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
+        summary = write_summary(
+            folder, slam, {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}, report, **facts
+        )
+        given = {"title": "a <room>", "truth": truth, "cloud": self.cloud, "records": self.recorder.records}
+        write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
+        return (folder / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def run() -> _Run:
+    return _Run()
+
+
+def test_every_adjustment_is_recorded_once(run: _Run) -> None:
+    """One record a keyframe from the second on, energies falling; oracle: the state's keyframes and their frames."""
+    records = run.recorder.records
+    assert [record.frame for record in records] == [keyframe.frame for keyframe in run.slam.keyframes[1:]]
+    for record in records:
+        assert 0 < record.points < 3.0
+        assert record.counts[0] > 50
+        assert record.energy[1] <= record.energy[0]
+        assert 1 <= record.iterations <= SETTINGS.window_iterations
+
+
+class _Checker(HTMLParser):
+    """Notes elements that are not closed in order, addresses that lead elsewhere, and identifiers given twice."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.ids: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("src", "href", "xlink:href") and not (value or "").startswith(("data:", "#")):
+                self.wrong.append(f"{tag} {name}={value}")
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(f"</{tag}>")
+
+
+def test_the_page_is_whole_and_needs_nothing_else(run: _Run, tmp_path: Path) -> None:
+    """Elements close, no address leads out of the file, identifiers are unique, and every part is there."""
+    text = run.page(tmp_path, warnings=["frame 3 is torn & skipped"])
+    checker = _Checker()
+    checker.feed(text)
+    assert checker.wrong == []
+    assert checker.open == []
+    assert len(checker.ids) == len(set(checker.ids))
+    assert "@import" not in text
+    assert "<script" not in text
+    for part in ("Trajectory", "Residuals over time", "Map", "Depth and confidence", "Time by stage", "Settings"):
+        assert f"<h2>{part}</h2>" in text, part
+    assert "a &lt;room&gt;" in text
+    assert "frame 3 is torn &amp; skipped" in text
+    assert "simulated, and so is every number" in text
+    assert "14 / 14" in text
+    assert len(re.findall(r"data:image/jpeg", text)) == 2 + 3 * min(4, len(run.slam.keyframes))
+
+
+def test_the_page_without_depth_and_without_windows(run: _Run, tmp_path: Path) -> None:
+    """A run without depth, map, truth or window has a page that says so."""
+    blank = [replace(k, depth=np.full_like(k.depth, np.nan)) for k in run.slam.keyframes]
+    slam = replace(run.slam, keyframes=tuple(blank), metric=False)
+    empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    text = run.page(tmp_path, slam, cloud=empty, records=[], truth=None)
+    for words in ("No window was adjusted", "The sequence has no depth", "too few points", "lengths have no unit"):
+        assert words in text, words
+
+
+def test_a_cube_is_where_it_should_be() -> None:
+    """Seen from above, points right of the path appear at its right; nearer points hide those behind. Oracle: the
+    places the points were put.
+    """
+    poses = np.tile(np.eye(4), (21, 1, 1))
+    poses[:, 0, 3] = np.linspace(0, 4, 21)  # along x, looking along z, world y down
+    path = Trajectory(np.arange(21) / 10.0, poses)
+    grid = np.linspace(0, 4, 160)
+    floor = np.stack([*np.meshgrid(grid, [1.0], grid[:80])], -1).reshape(-1, 3)
+    red = np.array([[2.0, 0.9, 1.0]]) + np.random.default_rng(0).uniform(-0.2, 0.2, (4000, 3)) * [1, 0, 1]
+    points = np.concatenate([red, floor])
+    colours = np.concatenate([np.full((len(red), 3), (255, 0, 0)), np.full((len(floor), 3), (0, 255, 0))])
+    image = map_view.from_above(PointCloud(points, colours.astype(np.uint8)), path, 300)
+    rows, columns = np.nonzero((image == (255, 0, 0)).all(-1))
+    assert abs(columns.mean() - 150) < 6, "the cube is half way along the path"
+    path_rows = np.nonzero((image == map_view._PATH).all(-1))[0]
+    assert rows.mean() < path_rows.mean() - 20, "what the cameras look at is beyond the path, to its left"
+    assert (image == (0, 255, 0)).all(-1).sum() > 20 * len(rows)
+    inside = map_view.walk_in(PointCloud(points, colours.astype(np.uint8)), path, 300)
+    assert abs(np.nonzero((inside == (255, 0, 0)).all(-1))[1].mean() - 150) < 4

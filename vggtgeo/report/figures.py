@@ -1,0 +1,126 @@
+"""The drawings of a run's page, as SVG that takes its colours from the page, and its pictures, as data URIs."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from vggtgeo.plots import trajectory_figure
+from vggtgeo.slam.watching import WindowRecord
+from vggtgeo.trajectory import Trajectory
+
+COLOURS = {
+    "#1f5fbf": "var(--blue)",
+    "#e07b1a": "var(--orange)",
+    "#3a8f5c": "var(--green)",
+    "#333333": "var(--ink)",
+    "#bbbbbb": "var(--rule)",
+    "#e3e3e3": "var(--grid)",
+}
+"""Colours of the drawings, and the variables of the page that stand in for them."""
+_WIDTH = 4.6
+"""Inches: read at about its own size, on a desk as on a phone."""
+
+
+def trajectory_svg(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory, with_scale: bool) -> str:
+    """Top and side view of the path."""
+    return _svg(trajectory_figure(estimate, truth, keyframes, with_scale, title=None, width=_WIDTH + 0.4))
+
+
+def residuals_svg(records: Sequence[WindowRecord]) -> str:
+    """RMS residual of points and lines (pixels), and of depth (standard deviations), over the frames' times."""
+    figure = Figure(figsize=(_WIDTH, 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    pixels, sigmas = figure.subplots(2, 1, sharex=True)
+    time = np.array([record.timestamp for record in records]) - records[0].timestamp
+    rows = (
+        (pixels, "points", "#1f5fbf"),
+        (pixels, "lines", "#e07b1a"),
+        (sigmas, "depth", "#3a8f5c"),
+    )
+    for axes, name, colour in rows:
+        values = np.array([getattr(record, name) for record in records])
+        if np.isfinite(values).any():
+            axes.plot(time, values, color=colour, lw=1.4, marker=".", ms=3, label=name)
+    pixels.set_ylabel("pixels")
+    sigmas.set_ylabel("sigma")
+    sigmas.set_xlabel("seconds of the sequence")
+    for axes in (pixels, sigmas):
+        axes.set_ylim(bottom=0)
+        _calm(axes)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize=9, labelcolor="#333333", ncols=2)
+        else:
+            axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", color="#333333", fontsize=9)
+    return _svg(figure)
+
+
+def picture(image: UInt8[np.ndarray, "h w 3"], width: int, quality: int = 82) -> str:
+    """An RGB image as the data URI of a JPEG, at most `width` pixels wide."""
+    scale = min(1.0, width / image.shape[1])
+    if scale < 1.0:
+        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    done, code = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return f"data:image/jpeg;base64,{base64.b64encode(code.tobytes()).decode()}"
+
+
+def depth_colours(depth: Float[np.ndarray, "h w"], low: float, high: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Depth from `low` (bright) to `high` (dark) metres; what is not known is grey."""
+    share = np.clip((high - np.nan_to_num(depth, nan=high)) / max(high - low, 1e-6), 0.0, 1.0)
+    image = _map_colours(share)
+    image[~np.isfinite(depth)] = 128
+    return image
+
+
+def confidence_colours(confidence: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Confidence from none (dark) to full (bright)."""
+    return _map_colours(confidence / 255.0)
+
+
+def _map_colours(share: np.ndarray) -> np.ndarray:
+    return np.asarray(255 * mpl.colormaps["viridis"](share)[..., :3], np.uint8)
+
+
+def _calm(axes: Any) -> None:
+    axes.grid(color="#e3e3e3", lw=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors="#333333", labelsize=9)
+    axes.xaxis.label.set(color="#333333", fontsize=9)
+    axes.yaxis.label.set(color="#333333", fontsize=9)
+    for spine in axes.spines.values():
+        spine.set_color("#bbbbbb")
+
+
+def _svg(figure: Figure) -> str:
+    """The `<svg>` element, text as text, transparent, its colours the page's; the same bytes for the same figure."""
+    buffer = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "vggtgeo"}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px inherit; font-size: \1px; font-family: inherit", text)
+    for colour, variable in COLOURS.items():
+        text = text.replace(colour, variable)
+    return _unique_ids(text)
+
+
+def _unique_ids(svg: str) -> str:
+    """Identifiers with a prefix of their own: two drawings of one page must not share them."""
+    prefix = f"f{zlib.crc32(svg.encode())}-"
+    svg = re.sub(r'\bid="', f'id="{prefix}', svg)
+    return re.sub(r'(url\(#|href="#)', rf"\1{prefix}", svg)

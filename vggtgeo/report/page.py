@@ -1,0 +1,180 @@
+"""From the end of a run to `report.html`: what is shown is chosen here, how it looks is `page.html.j2`'s business."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from vggtgeo.dense import optimised_depth
+from vggtgeo.files import write_text
+from vggtgeo.point_cloud import PointCloud
+from vggtgeo.report import figures, map_view
+from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.watching import WindowRecord
+from vggtgeo.trajectory import Trajectory
+
+SAMPLES = 4
+"""Keyframes whose image, depth and confidence are shown."""
+_SAMPLE_WIDTH = 300
+"""Pixels."""
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A number at the head of the page."""
+
+    value: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A keyframe's pictures, as data URIs; no depth where there is none."""
+
+    name: str
+    image: str
+    depth: str | None
+    confidence: str | None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Seconds of a stage, and its share of the longest."""
+
+    name: str
+    seconds: float
+    share: float
+
+
+def write_page(
+    path: Path,
+    slam: Slam,
+    *,
+    title: str,
+    truth: Trajectory | None,
+    cloud: PointCloud,
+    records: Sequence[WindowRecord],
+    summary: Mapping[str, Any],
+    warnings: Sequence[str] = (),
+) -> None:
+    """Writes the page of a run, one HTML file that needs nothing else, atomically.
+
+    Args:
+        path: the file.
+        slam: the last state, with at least one frame.
+        title: of the page.
+        truth: camera -> world, drawn beside the estimate where it is known.
+        cloud: the map.
+        records: one an adjustment of the window, in order.
+        summary: what `summary.json` holds.
+        warnings: what was said about the input; the state's own notes come after them.
+
+    """
+    trajectory = frame_trajectory(slam)
+    low, high = _depth_range(slam)
+    text = _template().render(
+        title=title,
+        facts=_facts(slam, trajectory, cloud, summary),
+        simulated=bool(summary.get("simulated")),
+        interrupted=bool(summary.get("interrupted")),
+        scale_is_free=not slam.metric,
+        warnings=[*warnings, *slam.notes],
+        trajectory=figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric),
+        has_truth=truth is not None,
+        residuals=figures.residuals_svg(records) if records else None,
+        map_above=_map_picture(map_view.from_above, cloud, trajectory),
+        map_inside=_map_picture(map_view.walk_in, cloud, trajectory),
+        samples=[_sample(keyframe, low, high) for keyframe in _spread(slam.keyframes, SAMPLES)],
+        depth_range=(low, high) if np.isfinite(low) else None,
+        stages=_stages(summary["seconds_by_stage"]),
+        total=summary["seconds_by_stage"].get("all"),
+        settings={name: _plain(value) for name, value in summary["settings"].items()},
+        versions=summary["versions"],
+        intrinsics=summary["intrinsics"],
+        truth_table=_truth_table(summary.get("truth")),
+    )
+    write_text(path, text)
+
+
+def _template() -> jinja2.Template:
+    text = (files("vggtgeo.report") / "page.html.j2").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(text)
+
+
+def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[Fact]:
+    facts = [
+        Fact(f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
+        Fact(f"{summary['keyframes']}", "keyframes"),
+        Fact(f"{summary['frames_per_second']:.1f}", "frames a second"),
+    ]
+    if slam.metric:
+        facts.append(Fact(f"{trajectory.length:.2f} m", "length of the path"))
+    if "truth" in summary:
+        aligned, name = ("ate_se3_m", "SE(3)") if slam.metric else ("ate_sim3_m", "Sim(3)")
+        facts.append(Fact(f"{100 * summary['truth'][aligned]['rmse']:.2f} cm", f"ATE after {name}"))
+    facts.append(Fact(f"{len(cloud):,}".replace(",", "\u202f"), "points in the map"))
+    facts.append(Fact(f"{summary['peak_memory_gb']:.2f} GB", "peak memory"))
+    return facts
+
+
+def _truth_table(truth: Mapping[str, Any] | None) -> list[tuple[str, list[str]]]:
+    """Rows of errors: RMSE, mean, median, largest."""
+    if truth is None:
+        return []
+    rows = (
+        ("ATE, SE(3) [cm]", truth["ate_se3_m"], 100.0),
+        ("ATE, Sim(3) [cm]", truth["ate_sim3_m"], 100.0),
+        ("RPE translation [cm]", truth["rpe_translation_m"], 100.0),
+        ("RPE rotation [deg]", truth["rpe_rotation_deg"], 1.0),
+    )
+    names = ("rmse", "mean", "median", "maximum")
+    show = lambda value, factor: "\u2013" if value is None else f"{factor * value:.2f}"
+    return [(title, [show(errors[name], factor) for name in names]) for title, errors, factor in rows]
+
+
+def _stages(seconds: Mapping[str, float]) -> list[Stage]:
+    shown = {name: value for name, value in seconds.items() if name != "all" and value >= 0.005}
+    longest = max(shown.values(), default=1.0)
+    return [Stage(name, value, value / longest) for name, value in sorted(shown.items(), key=lambda item: -item[1])]
+
+
+def _spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
+    rows = np.unique(np.linspace(0, len(keyframes) - 1, min(count, len(keyframes))).round().astype(int))
+    return [keyframes[row] for row in rows]
+
+
+def _depth_range(slam: Slam) -> tuple[float, float]:
+    """The 2nd and 98th percentile of the depth in the samples, metres; NaN where there is none."""
+    depths = [keyframe.depth[::8, ::8].astype(np.float32) for keyframe in _spread(slam.keyframes, SAMPLES)]
+    known = np.concatenate([depth[np.isfinite(depth)] for depth in depths])
+    if not len(known):
+        return float("nan"), float("nan")
+    return float(np.quantile(known, 0.02)), float(np.quantile(known, 0.98))
+
+
+def _sample(keyframe: Keyframe, low: float, high: float) -> Sample:
+    image = figures.picture(keyframe.image, _SAMPLE_WIDTH)
+    depth = confidence = None
+    if np.isfinite(keyframe.depth).any():
+        depth = figures.picture(figures.depth_colours(optimised_depth(keyframe), low, high), _SAMPLE_WIDTH)
+        confidence = figures.picture(figures.confidence_colours(keyframe.depth_confidence), _SAMPLE_WIDTH)
+    return Sample(f"frame {keyframe.frame}, {keyframe.timestamp:.2f} s", image, depth, confidence)
+
+
+def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | None:
+    return figures.picture(view(cloud, trajectory), 900) if len(cloud) > 100 else None
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "\u2013" if value is None else str(value)

@@ -1,0 +1,81 @@
+"""Onlookers of a run: what draws or records while frames come in, and never changes the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import equinox as eqx
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.problem import Problem, State
+from vggtgeo.residual_sizes import residual_sizes
+from vggtgeo.slam.state import Slam
+
+_sizes_jit = eqx.filter_jit(residual_sizes)
+
+
+class Watcher(Protocol):
+    """Told of every frame once it is in the state, and of the end."""
+
+    def see(self, slam: Slam, frame: Frame) -> None:
+        """The state after `frame` (as it was read, before undistortion)."""
+        ...
+
+    def finish(self, slam: Slam) -> None:
+        """The state after the last adjustment."""
+        ...
+
+
+@dataclass(frozen=True)
+class WindowRecord:
+    """What one adjustment of the window left: number and time of the frame, residuals, effort.
+
+    points, lines: RMS residual, pixels; depth: in standard deviations; NaN where the window has none. counts: of the
+    three kinds. iterations: tried steps. energy: `1/2 sum rho` before and after.
+    """
+
+    frame: int
+    timestamp: float
+    points: float
+    lines: float
+    depth: float
+    counts: tuple[int, int, int]
+    iterations: int
+    energy: tuple[float, float]
+
+
+class WindowRecorder:
+    """Collects a `WindowRecord` of each adjustment."""
+
+    def __init__(self) -> None:
+        self.records: list[WindowRecord] = []
+        self._last: object = None
+
+    def warm_up(self, problem: Problem, state: State) -> None:
+        """Compile for windows of the shape of `problem`."""
+        _sizes_jit(problem, state).points.block_until_ready()
+
+    def see(self, slam: Slam, frame: Frame) -> None:
+        if slam.solved is None or slam.solved is self._last:
+            return
+        self._last = slam.solved
+        adjustment, state = slam.solved
+        sizes = _sizes_jit(adjustment.problem, state)
+        energies = slam.energies if slam.energies is not None else np.full(2, np.nan)
+        self.records.append(
+            WindowRecord(
+                frame.index,
+                frame.timestamp,
+                float(sizes.points),
+                float(sizes.lines),
+                float(sizes.depth),
+                (int(sizes.point_count), int(sizes.line_count), int(sizes.depth_count)),
+                len(energies) - 1,
+                (float(energies[0]), float(energies[-1])),
+            )
+        )
+
+    def finish(self, slam: Slam) -> None:
+        """Nothing: the last adjustment of the whole map is no window."""
