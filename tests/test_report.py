@@ -10,27 +10,19 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 import pytest
+from recorded_run import FRAMES, SETTINGS, RecordedRun, recorded_run
 from scenes import make_scene
-from vggtgeo.models.classical import SiftMatcher
 from vggtgeo.solvers.kernels import Square
 
-from vggtgeo.dense import map_points
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.report import map_view, write_page
 from vggtgeo.residual_sizes import residual_sizes
-from vggtgeo.simulation import simulate
-from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.outputs import write_summary
-from vggtgeo.slam.run import frame_trajectory, run_frames
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.watching import WindowRecorder
 from vggtgeo.trajectory import Trajectory
 
-# The shape of tests/test_pipeline.py, so that a run of both compiles the solver once.
-SETTINGS = SlamSettings(window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False)
-ROLES = Roles(points=SiftMatcher(count=500))
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
 
@@ -55,38 +47,24 @@ def test_an_absent_kind_has_no_size() -> None:
     assert sizes["line_count"] == 0
 
 
-class _Run:
-    """A short simulated run, recorded."""
-
-    def __init__(self) -> None:
-        self.sequence = simulate("room", 14, 0, (320, 240), rate=10.0)
-        frames = list(self.sequence.frames())
-        self.recorder = WindowRecorder()
-        for slam in run_frames(iter(frames), self.sequence.camera, ROLES, SETTINGS, Clock()):
-            self.recorder.see(slam, frames[slam.frames[-1].frame])
-        self.slam = slam
-        self.cloud = map_points(self.slam.keyframes, self.slam.intrinsics)
-
-    def page(self, folder: Path, slam: Slam | None = None, **options: object) -> str:
-        """The text of the page of this run, or of a changed state of it."""
-        slam = slam or self.slam
-        truth = self.sequence.ground_truth()
-        report = evaluate_trajectory(frame_trajectory(slam), truth)
-        facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
-        summary = write_summary(
-            folder, slam, {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}, report, **facts
-        )
-        given = {"title": "a <room>", "truth": truth, "cloud": self.cloud, "records": self.recorder.records}
-        write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
-        return (folder / "report.html").read_text()
+def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: object) -> str:
+    """The text of the page of this run, or of a changed state of it."""
+    slam = slam or run.slam
+    truth = run.sequence.ground_truth()
+    report = evaluate_trajectory(frame_trajectory(slam), truth)
+    facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
+    summary = write_summary(folder, slam, {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}, report, **facts)
+    given = {"title": "a <room>", "truth": truth, "cloud": run.cloud, "records": run.recorder.records}
+    write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
+    return (folder / "report.html").read_text()
 
 
 @pytest.fixture(scope="module")
-def run() -> _Run:
-    return _Run()
+def run() -> RecordedRun:
+    return recorded_run()
 
 
-def test_every_adjustment_is_recorded_once(run: _Run) -> None:
+def test_every_adjustment_is_recorded_once(run: RecordedRun) -> None:
     """One record a keyframe from the second on, energies falling; oracle: the state's keyframes and their frames."""
     records = run.recorder.records
     assert [record.frame for record in records] == [keyframe.frame for keyframe in run.slam.keyframes[1:]]
@@ -120,9 +98,9 @@ class _Checker(HTMLParser):
             self.wrong.append(f"</{tag}>")
 
 
-def test_the_page_is_whole_and_needs_nothing_else(run: _Run, tmp_path: Path) -> None:
+def test_the_page_is_whole_and_needs_nothing_else(run: RecordedRun, tmp_path: Path) -> None:
     """Elements close, no address leads out of the file, identifiers are unique, and every part is there."""
-    text = run.page(tmp_path, warnings=["frame 3 is torn & skipped"])
+    text = _page(run, tmp_path, warnings=["frame 3 is torn & skipped"])
     checker = _Checker()
     checker.feed(text)
     assert checker.wrong == []
@@ -135,16 +113,16 @@ def test_the_page_is_whole_and_needs_nothing_else(run: _Run, tmp_path: Path) -> 
     assert "a &lt;room&gt;" in text
     assert "frame 3 is torn &amp; skipped" in text
     assert "simulated, and so is every number" in text
-    assert "14 / 14" in text
+    assert f"{FRAMES} / {FRAMES}" in text
     assert len(re.findall(r"data:image/jpeg", text)) == 2 + 3 * min(4, len(run.slam.keyframes))
 
 
-def test_the_page_without_depth_and_without_windows(run: _Run, tmp_path: Path) -> None:
+def test_the_page_without_depth_and_without_windows(run: RecordedRun, tmp_path: Path) -> None:
     """A run without depth, map, truth or window has a page that says so."""
     blank = [replace(k, depth=np.full_like(k.depth, np.nan)) for k in run.slam.keyframes]
     slam = replace(run.slam, keyframes=tuple(blank), metric=False)
     empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    text = run.page(tmp_path, slam, cloud=empty, records=[], truth=None)
+    text = _page(run, tmp_path, slam, cloud=empty, records=[], truth=None)
     for words in ("No window was adjusted", "The sequence has no depth", "too few points", "lengths have no unit"):
         assert words in text, words
 

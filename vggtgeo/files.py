@@ -14,6 +14,11 @@ from pathlib import Path
 from typing import IO, Any
 
 
+def make_parent(path: Path) -> None:
+    """Makes the folder that `path` lies in, and those above it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Gives a temporary path beside `path`, of the same suffix, that becomes `path` when the block ends well.

@@ -69,8 +69,8 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
     depth = jax.vmap(jax.vmap(depth_residual))(state.inverse_depth, mean, sigma)
     points = _size(problem, problem.points.weight, jnp.sum(point**2, -1))
     lines = _size(problem, problem.lines.weight, line**2)
-    depths = _size(problem, depth_weight, depth**2)
-    return ResidualSizes(points[0], lines[0], depths[0], points[1], lines[1], depths[1])
+    priors = _size(problem, depth_weight, depth**2)
+    return ResidualSizes(points[0], lines[0], priors[0], points[1], lines[1], priors[1])
 
 
 def _size(problem: Problem, weight: Array, squared: Array) -> tuple[Float[Array, ""], Int[Array, ""]]:

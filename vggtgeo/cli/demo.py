@@ -8,7 +8,9 @@ from typing import Annotated
 
 import typer
 
+from vggtgeo.cli.run import RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
+from vggtgeo.cli.view import serve_until_interrupted
 
 
 def demo(
@@ -17,6 +19,7 @@ def demo(
     scene: Annotated[str, typer.Option(help="Synthetic scene.")] = "room",
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of the scene and its noise.")] = 0,
+    rerun: RerunOption = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no report.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -25,7 +28,9 @@ def demo(
     from vggtgeo.cli.run_sequence import run_and_write
     from vggtgeo.simulation import simulate
     from vggtgeo.slam.settings import SlamSettings
+    from vggtgeo.viewing.target import check_target
 
+    rerun = check_target(rerun) if rerun else None
     quiet = quiet or as_json
     sequence = simulate(scene, frames, seed, rate=10.0)
     roles = make_roles(sequence, "pnp", "sift")
@@ -40,7 +45,10 @@ def demo(
         (0, None, 1),
         quiet=quiet,
         label=f"simulated {scene}",
+        rerun=rerun,
         facts={"simulated": True},
     )
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
+    if rerun == "serve":
+        serve_until_interrupted()

@@ -39,6 +39,7 @@ COMMANDS = (
             "vggtgeo run clip.mp4 -o runs/clip  # RGB alone: the scale is free",
             "vggtgeo run tum/desk -o runs/desk  # RGB-D: metric",
             "vggtgeo run tum/desk --stride 2 --no-lines --json  # an ablation",
+            "vggtgeo run tum/desk -o runs/desk --rerun runs/desk/run.rrd  # for the Rerun viewer",
             "vggtgeo run --settings runs/desk/settings.toml -o runs/again  # the same",
         ),
     ),
@@ -55,6 +56,16 @@ COMMANDS = (
         (
             "vggtgeo evaluate runs/desk tum/desk  # a run's folder against a dataset's",
             "vggtgeo evaluate mine.txt truth.txt --json  # two files in the TUM format",
+        ),
+    ),
+    CommandEntry(
+        "view",
+        "vggtgeo.cli.view",
+        "Show the run in DIR: path, map, and depth where it was saved.",
+        (
+            "vggtgeo view runs/desk  # a window",
+            "vggtgeo view runs/desk --rerun serve  # a browser, also on another machine",
+            "vggtgeo view runs/desk --rerun desk.rrd  # a file, where there is no screen",
         ),
     ),
     CommandEntry(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from vggtgeo.cli.settings_file import SettingsOption
+from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.errors import InputWarning
 
 if TYPE_CHECKING:
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
 Init = Literal["pnp", "constant-velocity"]
 Features = Literal["sift", "orb"]
 Preset = Literal["classical", "light", "paper"]
+RerunOption = Annotated[
+    str | None,
+    typer.Option("--rerun", metavar="TARGET", help="Log to Rerun: spawn, serve, or a file ending with .rrd."),
+]
 EXIT_INTERRUPTED = 130
 
 
@@ -51,6 +56,7 @@ def run(
     models: Annotated[Path | None, typer.Option("--models", help="Folder of the networks' files.")] = None,
     cache: Annotated[Path | None, typer.Option("--cache", help="Folder to keep what the networks answer.")] = None,
     save_depth: Annotated[bool, typer.Option("--save-depth", help="Write each keyframe's dense depth.")] = False,
+    rerun: RerunOption = None,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no report.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
@@ -61,7 +67,9 @@ def run(
     from vggtgeo.cli.run_sequence import run_and_write
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
     from vggtgeo.slam.settings import SlamSettings
+    from vggtgeo.viewing.target import check_target
 
+    rerun = check_target(rerun) if rerun else None
     cv2.setRNGSeed(seed)
     sequence = open_sequence(path, kind)
     if intrinsics is not None:
@@ -83,11 +91,14 @@ def run(
         settings.values() if settings else {},
         (start, end, stride),
         save_depth=save_depth,
+        rerun=rerun,
         quiet=quiet or as_json,
         facts=perceived.facts(),
     )
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
+    if rerun == "serve":
+        serve_until_interrupted()
     if finished.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
 

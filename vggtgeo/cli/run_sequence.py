@@ -49,18 +49,21 @@ def run_and_write(
     quiet: bool = False,
     label: str = "",
     facts: Mapping[str, Any] = MappingProxyType({}),
-    watchers: tuple[Watcher, ...] = (),
+    rerun: str | None = None,
 ) -> Finished:
     """Run a sequence with a progress bar, write every output into `folder`, and print the report.
 
     flags: the effective settings, by the names of the flags; `settings.toml` and `summary.json` hold them.
-    facts: what else the summary shall say. watchers: are told of every frame, and of the end.
+    facts: what else the summary shall say. rerun: where to log the run, see `vggtgeo/viewing/target.py`.
     """
     console = Console(stderr=False, quiet=quiet)
+    watchers = () if rerun is None else (_rerun_watcher(rerun, label or sequence.name),)
     clock, began = Clock(), time.perf_counter()
     recorder = WindowRecorder()
     with clock.measure("compile"):
-        recorder.warm_up(*warm_up(settings))
+        compiled = warm_up(settings)
+        for watcher in (recorder, *watchers):
+            watcher.warm_up(*compiled)
     with collected_warnings() as said:
         estimated, truth = _set_apart(sequence)
         folder.mkdir(parents=True, exist_ok=True)
@@ -71,13 +74,14 @@ def run_and_write(
     if not fold.interrupted:
         slam = finish(slam, roles, settings, clock)
         outputs.write_trajectories(folder, slam)
-    for watcher in watchers:
-        watcher.finish(slam)
     with clock.measure("write"):
         cloud = outputs.write_map(folder, slam)
         outputs.write_plot(folder, slam, truth, label or sequence.name)
         if save_depth:
             outputs.write_depth(folder, slam)
+    with clock.measure("record and draw"):
+        for watcher in watchers:
+            watcher.finish(slam, cloud)
     report = outputs.compare(slam, truth)
     summary = outputs.write_summary(
         folder,
@@ -102,6 +106,13 @@ def run_and_write(
     )
     _print_report(console, slam, report, folder, fold.frames_per_second, len(cloud))
     return Finished(slam, fold.interrupted)
+
+
+def _rerun_watcher(target: str, name: str) -> Watcher:
+    from vggtgeo.viewing.target import open_target  # rerun is imported only when it is asked for
+    from vggtgeo.viewing.watcher import RerunWatcher
+
+    return RerunWatcher(open_target(target, name))
 
 
 def _set_apart(sequence: Sequence) -> tuple[Sequence, Trajectory | None]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.point_cloud import PointCloud
 from vggtgeo.problem import Problem, State
 from vggtgeo.residual_sizes import residual_sizes
 from vggtgeo.slam.state import Slam
@@ -16,6 +17,7 @@ from vggtgeo.slam.state import Slam
 _sizes_jit = eqx.filter_jit(residual_sizes)
 
 
+@runtime_checkable
 class Watcher(Protocol):
     """Told of every frame once it is in the state, and of the end."""
 
@@ -23,8 +25,12 @@ class Watcher(Protocol):
         """The state after `frame` (as it was read, before undistortion)."""
         ...
 
-    def finish(self, slam: Slam) -> None:
-        """The state after the last adjustment."""
+    def warm_up(self, problem: Problem, state: State) -> None:
+        """Before the first frame: compile for windows of the shape of `problem`."""
+        ...
+
+    def finish(self, slam: Slam, cloud: PointCloud) -> None:
+        """The state after the last adjustment, and the map."""
         ...
 
 
@@ -77,5 +83,5 @@ class WindowRecorder:
             )
         )
 
-    def finish(self, slam: Slam) -> None:
+    def finish(self, slam: Slam, cloud: PointCloud) -> None:
         """Nothing: the last adjustment of the whole map is no window."""

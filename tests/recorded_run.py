@@ -1,0 +1,49 @@
+"""A short simulated run for the tests of what is drawn: its last state, its map, and all that was seen on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+from vggtgeo.models.classical import SiftMatcher
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.dense import map_points
+from vggtgeo.point_cloud import PointCloud
+from vggtgeo.simulation import SyntheticSequence, simulate
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.run import run_frames
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.watching import WindowRecorder
+
+FRAMES = 9
+# The shape of tests/test_pipeline.py, so that a process that runs both compiles the solver once.
+SETTINGS = SlamSettings(window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False)
+ROLES = Roles(points=SiftMatcher(count=500))
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedRun:
+    """The states after each frame, the frames, and what a recorder noted."""
+
+    sequence: SyntheticSequence
+    frames: list[Frame]
+    states: list[Slam]
+    recorder: WindowRecorder
+    cloud: PointCloud
+
+    @property
+    def slam(self) -> Slam:
+        return self.states[-1]
+
+
+@cache
+def recorded_run() -> RecordedRun:
+    """The run, made once a process."""
+    sequence = simulate("room", FRAMES, 0, (320, 240), rate=10.0)
+    frames, states, recorder = list(sequence.frames()), [], WindowRecorder()
+    for slam in run_frames(iter(frames), sequence.camera, ROLES, SETTINGS, Clock()):
+        recorder.see(slam, frames[slam.frames[-1].frame])
+        states.append(slam)
+    return RecordedRun(sequence, frames, states, recorder, map_points(slam.keyframes, slam.intrinsics))

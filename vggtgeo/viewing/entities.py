@@ -1,0 +1,168 @@
+"""What is logged, one function an entity or a small group; each takes plain values and a stream whose time is set."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from vggtgeo.point_cloud import PointCloud
+from vggtgeo.slam import rigid
+from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.watching import WindowRecord
+from vggtgeo.trajectory import Trajectory
+
+ENTITIES = (
+    "/world",
+    "/world/camera",
+    "/world/camera/image",
+    "/world/trajectory",
+    "/world/keyframes",
+    "/world/covariance",
+    "/world/covisibility",
+    "/world/points",
+    "/world/map",
+    "/keyframe/image",
+    "/keyframe/image/matches",
+    "/keyframe/image/motion",
+    "/keyframe/image/lines",
+    "/keyframe/depth",
+    "/keyframe/confidence",
+    "/window/nodes",
+    "/window/edges",
+    "/plots/residuals/points",
+    "/plots/residuals/lines",
+    "/plots/residuals/depth",
+    "/plots/solver/energy",
+    "/plots/tracking/inliers",
+    "/notes",
+)
+"""All paths that a recording of a run with depth and lines holds."""
+SIGMAS = 20.0
+"""Standard deviations that the ellipsoids reach: those of a good window are millimetres."""
+_BLUE, _ORANGE, _GREEN, _GREY = (31, 95, 191), (224, 123, 26), (58, 143, 92), (150, 150, 150)
+_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
+
+
+def log_camera(stream: rr.RecordingStream, pose: np.ndarray, intrinsics: np.ndarray, image: np.ndarray) -> None:
+    """The current frame's camera (`pose` world -> camera, float [4, 4]) with its image at half size."""
+    height, width = image.shape[:2]
+    to_world = rigid.invert(pose)
+    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    stream.log("world/camera", rr.Transform3D(translation=to_world[:3, 3], mat3x3=to_world[:3, :3]))
+    half = (width // 2, height // 2)
+    camera = np.array([[fx / 2, 0, (cx - 0.5) / 2], [0, fy / 2, (cy - 0.5) / 2], [0, 0, 1]])
+    lens = rr.Pinhole(
+        image_from_camera=camera, resolution=half, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.25
+    )
+    stream.log("world/camera/image", lens, _jpeg(cv2.resize(image, half, interpolation=cv2.INTER_AREA)))
+
+
+def log_path(stream: rr.RecordingStream, trajectory: Trajectory, keyframes: Trajectory) -> None:
+    """The path through all frames so far, and the keyframes on it."""
+    stream.log("world/trajectory", rr.LineStrips3D([trajectory.positions], colors=[_BLUE], radii=-1.5))
+    stream.log("world/keyframes", rr.Points3D(keyframes.positions, colors=[_BLUE], radii=-4.0))
+
+
+def log_covariance(stream: rr.RecordingStream, keyframes: list[Keyframe], covariances: np.ndarray) -> None:
+    """Ellipsoids of the camera centres; `covariances` [n, 6, 6] of the left tangents, translation first."""
+    known = [
+        (keyframe.pose, covariance)
+        for keyframe, covariance in zip(keyframes, covariances, strict=True)
+        if np.isfinite(covariance).all() and covariance[:3, :3].any()
+    ]
+    drawn = [ellipsoid(pose, covariance) for pose, covariance in known]
+    centres, half_sizes, quaternions = ([part[i] for part in drawn] for i in range(3))
+    colours = [(*_ORANGE, 120)] * len(drawn)
+    stream.log(
+        "world/covariance",
+        rr.Ellipsoids3D(centers=centres, half_sizes=half_sizes, quaternions=quaternions, colors=colours),
+    )
+
+
+def ellipsoid(pose: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centre [3], half sizes [3] and quaternion (x, y, z, w) of the `SIGMAS` ellipsoid of a camera's centre.
+
+    A step `rho` of the translation moves the centre by `-R' rho`, so its covariance is `R' Sigma R`.
+    """
+    rotation = pose[:3, :3]
+    variances, axes = np.linalg.eigh(rotation.T @ covariance[:3, :3] @ rotation)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    frame = np.eye(4)
+    frame[:3, :3] = axes
+    quaternion = np.roll(rigid.to_quaternion(frame[None])[0, :4], -1)
+    return rigid.centre(pose), SIGMAS * np.sqrt(np.maximum(variances, 0.0)), quaternion
+
+
+def log_window(stream: rr.RecordingStream, keyframes: list[Keyframe], pairs: list[Pair]) -> None:
+    """The window's keyframes and the pairs that share matches, as a graph and as lines in the world."""
+    names = {keyframe.number: str(keyframe.number) for keyframe in keyframes}
+    inside = [pair for pair in pairs if pair.first in names and pair.second in names]
+    ids = list(names.values())
+    stream.log("window/nodes", rr.GraphNodes(ids, labels=[f"frame {k.frame}" for k in keyframes]))
+    stream.log("window/edges", rr.GraphEdges([(names[pair.first], names[pair.second]) for pair in inside]))
+    centre = {keyframe.number: rigid.centre(keyframe.pose) for keyframe in keyframes}
+    strips = [np.stack([centre[pair.first], centre[pair.second]]) for pair in inside]
+    stream.log("world/covisibility", rr.LineStrips3D(strips, colors=[(*_GREEN, 90)] * len(strips), radii=-0.8))
+
+
+def log_keyframe(stream: rr.RecordingStream, keyframe: Keyframe, pair: Pair | None) -> None:
+    """Image, matches to the keyframe `pair` joins it with, line segments, depth and confidence of a keyframe."""
+    stream.log("keyframe/image", _jpeg(keyframe.image))
+    seen = np.zeros((0, 2)) if pair is None else pair.points.pixels_j
+    before = np.zeros((0, 2)) if pair is None else pair.points.pixels_i
+    stream.log("keyframe/image/matches", rr.Points2D(seen, colors=[_BLUE], radii=2.0))
+    stream.log(
+        "keyframe/image/motion", rr.LineStrips2D(np.stack([before, seen], 1), colors=[(*_BLUE, 140)], radii=-0.7)
+    )
+    ends = np.asarray(keyframe.lines.segments.endpoints, np.float64).reshape(-1, 2, 2)
+    matched = np.isin(np.arange(len(ends)), [] if pair is None else pair.lines.index_j)
+    colours = np.where(matched[:, None], _ORANGE, _GREY).astype(np.uint8)
+    stream.log("keyframe/image/lines", rr.LineStrips2D(ends, colors=colours, radii=-1.5))
+    if np.isfinite(keyframe.depth).any():
+        millimetres = np.nan_to_num(1000.0 * keyframe.depth[::2, ::2].astype(np.float32)).astype(np.uint16)
+        stream.log("keyframe/depth", rr.DepthImage(millimetres, meter=1000.0, colormap="viridis"))
+    coloured = cv2.applyColorMap(keyframe.depth_confidence[::2, ::2], cv2.COLORMAP_VIRIDIS)
+    stream.log("keyframe/confidence", _jpeg(coloured[..., ::-1]))
+
+
+def log_points(stream: rr.RecordingStream, keyframes: list[Keyframe], intrinsics: np.ndarray) -> None:
+    """The window's adjusted points, in the colours of their pixels."""
+    points, colours = [], []
+    for keyframe in keyframes:
+        inverse = keyframe.points.inverse_depth
+        known = np.nonzero(np.isfinite(inverse) & (inverse > 0.1))[0]
+        points.append(rigid.unproject(keyframe.points.pixels[known], inverse[known], keyframe.pose, intrinsics))
+        columns, rows = np.rint(keyframe.points.pixels[known]).astype(int).T
+        colours.append(keyframe.image[rows, columns])
+    stream.log("world/points", rr.Points3D(np.concatenate(points), colors=np.concatenate(colours), radii=-1.5))
+
+
+def log_map(stream: rr.RecordingStream, cloud: PointCloud) -> None:
+    """The dense map; at all times, so that a finished recording opens with it."""
+    stream.log("world/map", rr.Points3D(cloud.points, colors=cloud.colours, radii=0.011), static=True)
+
+
+def log_residuals(stream: rr.RecordingStream, record: WindowRecord) -> None:
+    """RMS residual of each kind after an adjustment."""
+    for name in ("points", "lines", "depth"):
+        value = getattr(record, name)
+        if np.isfinite(value):
+            stream.log(f"plots/residuals/{name}", rr.Scalars(value))
+
+
+def log_tracking(stream: rr.RecordingStream, inliers: int) -> None:
+    """How many points the frame was tracked with."""
+    stream.log("plots/tracking/inliers", rr.Scalars(float(inliers)))
+
+
+def log_note(stream: rr.RecordingStream, text: str, level: str = "WARN") -> None:
+    """A message of the run."""
+    stream.log("notes", rr.TextLog(text, level=level))
+
+
+def _jpeg(image: np.ndarray) -> rr.EncodedImage:
+    done, code = cv2.imencode(".jpg", image[..., ::-1], _QUALITY)
+    assert done
+    return rr.EncodedImage(contents=code.tobytes(), media_type="image/jpeg")

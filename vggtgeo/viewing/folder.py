@@ -1,0 +1,53 @@
+"""A recording of a run's folder: what is on the disk, without running anything again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from vggtgeo.errors import InputError
+from vggtgeo.point_cloud import PointCloud
+from vggtgeo.slam.outputs import DEPTH_UNIT
+from vggtgeo.trajectory import Trajectory
+from vggtgeo.viewing import entities
+
+
+def log_folder(stream: rr.RecordingStream, folder: Path) -> None:
+    """Path, keyframes and map, and each keyframe's depth and confidence where the run saved them.
+
+    Raises:
+        InputError: `folder` has no `trajectory.txt`, `keyframes.txt` or `map.ply`.
+
+    """
+    for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
+        if not (folder / name).is_file():
+            raise InputError(f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote")
+    trajectory = Trajectory.load_tum(folder / "trajectory.txt")
+    stream.log("world", rr.ViewCoordinates.RDF, static=True)
+    stream.set_time("frame", sequence=0)
+    entities.log_path(stream, trajectory, Trajectory.load_tum(folder / "keyframes.txt"))
+    entities.log_map(stream, PointCloud.load_ply(folder / "map.ply"))
+    for file in sorted(folder.glob("depth/*.depth.png")):
+        _log_depth(stream, file)
+    stream.flush()
+
+
+def _log_depth(stream: rr.RecordingStream, file: Path) -> None:
+    number = file.name.split(".")[0]
+    stream.set_time("frame", sequence=int(number))
+    stream.log("keyframe/depth", rr.DepthImage(_read(file), meter=DEPTH_UNIT, colormap="viridis"))
+    confidence = file.with_name(f"{number}.confidence.png")
+    if confidence.is_file():
+        stream.log(
+            "keyframe/confidence", rr.Image(cv2.applyColorMap(_read(confidence), cv2.COLORMAP_VIRIDIS)[..., ::-1])
+        )
+
+
+def _read(file: Path) -> np.ndarray:
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError(f"`{file}` cannot be read as an image; run again with `--save-depth`")
+    return np.asarray(image)

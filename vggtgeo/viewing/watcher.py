@@ -1,0 +1,80 @@
+"""Logs a run while it goes on: every frame's camera, every keyframe's window, every iteration of its solver."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import numpy as np
+import rerun as rr
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.point_cloud import PointCloud
+from vggtgeo.problem import Problem, State
+from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.watching import WindowRecorder
+from vggtgeo.uncertainty import covariances
+from vggtgeo.viewing import entities
+
+_covariances_jit = eqx.filter_jit(covariances)
+
+
+class RerunWatcher:
+    """A `Watcher` that logs to `stream`. Timelines: `frame`, `time` (seconds of the sequence) and `iteration` (tried
+    steps of the window's solver, counted through the run).
+    """
+
+    def __init__(self, stream: rr.RecordingStream):
+        self.stream = stream
+        self._recorder = WindowRecorder()
+        self._keyframes = self._notes = self._iterations = 0
+        stream.log("world", rr.ViewCoordinates.RDF, static=True)
+
+    def warm_up(self, problem: Problem, state: State) -> None:
+        """Compile for windows of the shape of `problem`."""
+        self._recorder.warm_up(problem, state)
+        _covariances_jit(problem, state).poses.block_until_ready()
+
+    def see(self, slam: Slam, frame: Frame) -> None:
+        self.stream.set_time("frame", sequence=frame.index)
+        self.stream.set_time("time", duration=frame.timestamp)
+        entities.log_camera(self.stream, slam.last_pose, slam.intrinsics, frame.image)
+        entities.log_tracking(self.stream, slam.frames[-1].inliers)
+        for note in slam.notes[self._notes :]:
+            entities.log_note(self.stream, note)
+        self._notes = len(slam.notes)
+        self._recorder.see(slam, frame)
+        if len(slam.keyframes) > self._keyframes:
+            self._keyframes = len(slam.keyframes)
+            self._see_keyframe(slam)
+
+    def finish(self, slam: Slam, cloud: PointCloud) -> None:
+        """The path after the last adjustment, and the map."""
+        entities.log_path(self.stream, frame_trajectory(slam), keyframe_trajectory(slam))
+        entities.log_map(self.stream, cloud)
+        counts = f"{len(slam.frames)} frames, {len(slam.keyframes)} keyframes, {len(cloud)} points in the map"
+        entities.log_note(self.stream, f"finished: {counts}", level="INFO")
+        self.stream.flush()
+
+    def _see_keyframe(self, slam: Slam) -> None:
+        members = [slam.keyframes[number] for number in slam.window]
+        newest = members[-1].number
+        joined = [pair for pair in slam.pairs if pair.second == newest]
+        entities.log_keyframe(self.stream, members[-1], max(joined, key=lambda pair: pair.first, default=None))
+        entities.log_window(self.stream, members, list(slam.pairs))
+        entities.log_path(self.stream, frame_trajectory(slam), keyframe_trajectory(slam))
+        entities.log_points(self.stream, members, slam.intrinsics)
+        if slam.solved is None or not self._recorder.records:
+            return
+        adjustment, state = slam.solved
+        found = np.asarray(_covariances_jit(adjustment.problem, state).poses)[: len(members)]
+        entities.log_covariance(self.stream, members, found)
+        entities.log_residuals(self.stream, self._recorder.records[-1])
+        self._log_iterations(slam)
+
+    def _log_iterations(self, slam: Slam) -> None:
+        if slam.energies is None:
+            return
+        for energy in slam.energies:
+            self.stream.set_time("iteration", sequence=self._iterations)
+            self.stream.log("plots/solver/energy", rr.Scalars(float(energy)))
+            self._iterations += 1
