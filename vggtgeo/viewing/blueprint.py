@@ -34,6 +34,5 @@ def blueprint() -> rrb.Blueprint:
     )
     left = rrb.Vertical(world, curves, row_shares=[3, 1])
     right = rrb.Vertical(now, pictures, row_shares=[1, 1])
-    return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[2, 1]), rrb.TimePanel(timeline="frame"), collapse_panels=True
-    )
+    time = rrb.TimePanel(timeline="frame", play_state="following")  # opens at the end, where the map is whole
+    return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[2, 1]), time, collapse_panels=True)

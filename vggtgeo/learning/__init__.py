@@ -1,0 +1,14 @@
+"""Learning through bundle adjustment: windows with known truth, and a network that says how far to trust each match.
+
+An example of research on top of `vggtgeo.solve`; nothing else of the package uses it. Training needs optax (the extra
+`notebooks`).
+"""
+
+from vggtgeo.learning.network import ConfidenceNetwork as ConfidenceNetwork
+from vggtgeo.learning.tracked_windows import TrackedWindow as TrackedWindow
+from vggtgeo.learning.tracked_windows import tracked_windows as tracked_windows
+from vggtgeo.learning.training import Batch as Batch
+from vggtgeo.learning.training import PoseErrors as PoseErrors
+from vggtgeo.learning.training import compare as compare
+from vggtgeo.learning.training import stack as stack
+from vggtgeo.learning.training import train as train

@@ -1,0 +1,212 @@
+"""Simulated windows whose matches are found by a real tracker, so that they fail where trackers fail.
+
+Corners of each rendered keyframe are followed into the others by Lucas and Kanade (Bouguet's pyramid, OpenCV), started
+some pixels off. What goes wrong does so by the images: repeated bricks, edges without corners, occlusion, blur. The
+renderer then tells how far each match is off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from vggtgeo.models.classical import StructureTensor
+from vggtgeo.packing import Observations
+from vggtgeo.simulation import SimulatedOracle, SyntheticSequence
+from vggtgeo.slam import rigid
+
+FEATURES = (
+    "saliency at the host",
+    "saliency at the target",
+    "log corner strength",
+    "log patch difference",
+    "patch correlation",
+    "log forward-backward distance",
+    "log change of brightness",
+    "log motion against its neighbours",
+)
+"""What the network sees of a match; no truth is among it."""
+INLIER = 3.0
+"""Pixels of true error below which a match counts as right."""
+_SEARCH = 6.0
+"""Pixels, standard deviation: how far off the tracker starts."""
+_LK = {"winSize": (13, 13), "maxLevel": 2, "minEigThreshold": 1e-5}
+_PATCH = 9
+_DEPTH_NOISE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedWindow:
+    """Keyframes with matches, what can be seen of each match, and the truth.
+
+    images: uint8 [n, H, W, 3]. observations: all directed pairs as edges, landmarks hosted in every keyframe, a depth
+    prior of 5 % noise; the point weights are one. poses: true, world -> camera, [n, 7]. start: poses to start from.
+    intrinsics: [4]. features: [A, F], columns `FEATURES`. error: [A], pixels between a match and the truth, infinite
+    where the true point is hidden. saliency: [A] in [0, 1], product of both ends'.
+    """
+
+    name: str
+    images: UInt8[np.ndarray, "n h w 3"]
+    observations: Observations
+    poses: Float[np.ndarray, "n 7"]
+    start: Float[np.ndarray, "n 7"]
+    intrinsics: Float[np.ndarray, "4"]
+    features: Float[np.ndarray, "a f"]
+    error: Float[np.ndarray, " a"]
+    saliency: Float[np.ndarray, " a"]
+
+    @property
+    def right(self) -> np.ndarray:
+        """Matches that are right, bool [A]: what an oracle knows."""
+        return self.error < INLIER
+
+
+def tracked_windows(
+    sequence: SyntheticSequence, count: int, *, keyframes: int = 4, points: int = 24, spacing: int = 5, seed: int = 0
+) -> Iterator[TrackedWindow]:
+    """`count` windows at random places of a simulated sequence.
+
+    Args:
+        sequence: of `vggtgeo.simulate`.
+        count: how many.
+        keyframes: a window.
+        points: hosted in each keyframe.
+        spacing: frames from keyframe to keyframe.
+        seed: of places, corners and noise.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> from vggtgeo.learning import tracked_windows
+        >>> window = next(tracked_windows(vg.simulate("room", 40, size=(160, 120)), 1, points=8))
+        >>> window.features.shape[1], len(window.images)
+        (8, 4)
+
+    """
+    rng = np.random.default_rng([seed, 5])
+    oracle = SimulatedOracle(sequence)
+    span = spacing * (keyframes - 1) + 1
+    for number in range(count):
+        first = int(rng.integers(0, len(sequence) - span))
+        frames = list(range(first, first + span, spacing))
+        yield _window(oracle, f"{sequence.name}, window {number}", frames, points, rng)
+
+
+def _window(
+    oracle: SimulatedOracle, name: str, frames: list[int], points: int, rng: np.random.Generator
+) -> TrackedWindow:
+    images = np.stack([oracle.sequence.frame(k).image for k in frames])
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+    saliency = [StructureTensor().confidence(image) for image in images]
+    corners = [_corners(image, points, rng) for image in grey]
+    depth = np.concatenate([_read(oracle.depth(k), pixels) for k, pixels in zip(frames, corners, strict=True)])
+    host = np.repeat(np.arange(len(frames)), [len(pixels) for pixels in corners])
+    first = np.concatenate([[0], np.cumsum([len(pixels) for pixels in corners])])
+    edges = np.array(list(permutations(range(len(frames)), 2)))
+    parts = []
+    for e, (i, j) in enumerate(edges):
+        true, visible = oracle.correspond(frames[i], frames[j], corners[i])
+        found = _follow(grey[i], grey[j], corners[i], true + rng.normal(0, _SEARCH, true.shape))
+        kept = found.kept & _inside(true, grey[j]) & np.isfinite(depth[first[i] : first[i + 1]])
+        features = _features(grey[i], grey[j], saliency[i], saliency[j], corners[i], found)
+        error = np.where(visible, np.linalg.norm(found.pixels - true, axis=1), np.inf)
+        rows = np.nonzero(kept)[0]
+        product = features[:, 0] * features[:, 1]
+        parts.append(
+            (np.full(len(rows), e), first[i] + rows, found.pixels[rows], features[rows], error[rows], product[rows])
+        )
+    edge, landmark, target, features, error, product = (np.concatenate(column) for column in zip(*parts, strict=True))
+    prior = 1 / (np.where(np.isfinite(depth), depth, 3.0) * np.exp(_DEPTH_NOISE * rng.normal(size=len(depth))))
+    observations = Observations(
+        edges=edges,
+        host=host,
+        pixel=np.concatenate(corners),
+        point_edge=edge,
+        point_landmark=landmark,
+        point_target=target,
+        point_weight=np.ones(len(edge)),
+        depth_mean=prior,
+        depth_sigma=_DEPTH_NOISE * prior,
+        depth_weight=np.isfinite(depth).astype(float),
+    )
+    poses = rigid.to_quaternion(np.array([oracle.pose(k) for k in frames]))
+    start = poses.copy()
+    start[1:, 4:] += rng.normal(0, 0.01, (len(frames) - 1, 3))
+    return TrackedWindow(name, images, observations, poses, start, oracle.intrinsics, features, error, product)
+
+
+@dataclass(frozen=True, eq=False)
+class _Followed:
+    pixels: np.ndarray
+    difference: np.ndarray
+    back: np.ndarray
+    kept: np.ndarray
+
+
+def _follow(first: np.ndarray, second: np.ndarray, pixels: np.ndarray, guess: np.ndarray) -> _Followed:
+    """Track from `first` to `second` and back."""
+    here, there = pixels.astype(np.float32)[:, None], guess.astype(np.float32)[:, None]
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    found, status, difference = cv2.calcOpticalFlowPyrLK(first, second, here, there.copy(), flags=flags, **_LK)
+    returned, _, _ = cv2.calcOpticalFlowPyrLK(second, first, found, here.copy(), flags=flags, **_LK)
+    back = np.linalg.norm((returned - here)[:, 0], axis=1)
+    target = found[:, 0].astype(np.float64)
+    kept = (status[:, 0] == 1) & _inside(target, second)
+    return _Followed(target, np.nan_to_num(difference[:, 0]), back, kept)
+
+
+def _corners(grey: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    found = cv2.goodFeaturesToTrack(grey, 6 * count, 1e-3, 7)
+    pixels = np.zeros((0, 2)) if found is None else found[:, 0].astype(np.float64)
+    pixels = pixels[_inside(pixels, grey)]
+    return pixels[np.sort(rng.permutation(len(pixels))[:count])]
+
+
+def _features(
+    first: np.ndarray,
+    second: np.ndarray,
+    saliency_i: np.ndarray,
+    saliency_j: np.ndarray,
+    pixels: np.ndarray,
+    found: _Followed,
+) -> np.ndarray:
+    strength = cv2.cornerMinEigenVal(first, 5)
+    here, there = _patches(first, pixels), _patches(second, found.pixels)
+    deviation = [patch - patch.mean(axis=1, keepdims=True) for patch in (here, there)]
+    norms = [np.linalg.norm(patch, axis=1) + 1.0 for patch in deviation]
+    correlation = (deviation[0] * deviation[1]).sum(axis=1) / (norms[0] * norms[1])
+    motion = found.pixels - pixels
+    unusual = np.linalg.norm(motion - np.median(motion, axis=0), axis=1) if len(motion) else np.zeros(0)
+    return np.column_stack(
+        [
+            _read(saliency_i, pixels),
+            _read(saliency_j, found.pixels),
+            np.log(np.maximum(_read(strength, pixels), 0.0) + 1e-6),
+            np.log(found.difference + 0.1),
+            correlation,
+            np.log(found.back + 0.01),
+            np.log(np.abs(here.mean(axis=1) - there.mean(axis=1)) + 1.0),
+            np.log(unusual + 1.0),
+        ]
+    )
+
+
+def _patches(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    centres = np.nan_to_num(pixels).astype(np.float32)
+    patches = [cv2.getRectSubPix(image, (_PATCH, _PATCH), (float(x), float(y))) for x, y in centres]
+    return np.array(patches, np.float64).reshape(len(patches), _PATCH * _PATCH)
+
+
+def _read(image: np.ndarray, pixels: np.ndarray) -> Float[np.ndarray, " m"]:
+    height, width = image.shape
+    columns, rows = np.rint(np.nan_to_num(pixels)).astype(int).T
+    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
+
+
+def _inside(pixels: np.ndarray, image: np.ndarray, margin: float = 6.0) -> np.ndarray:
+    height, width = image.shape
+    return np.all((pixels >= margin) & (pixels <= np.array([width, height]) - 1 - margin), axis=1)

@@ -1,0 +1,156 @@
+"""Training a confidence by the pose error after bundle adjustment, and comparing confidences on windows not seen.
+
+The loss of a window is `log(e)`, with `e` the RMS error of its camera centres: windows count alike, whatever their
+size. Its gradient reaches the network through the optimum (implicit function theorem), see `vggtgeo.solve`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from vggtgeo.learning.network import LEAST, ConfidenceNetwork
+from vggtgeo.learning.tracked_windows import TrackedWindow
+from vggtgeo.packing import PaddedSize, pack
+from vggtgeo.problem import Problem, State
+from vggtgeo.solution import solve
+
+GAIN = 16.0
+"""Weight of a match of confidence 1: its standard deviation is 0.25 px, what the tracker reaches where it is right."""
+_SMALLEST = 1e-6
+"""Metres below which an error does not count as smaller."""
+
+
+class Batch(NamedTuple):
+    """Windows of one padded shape, stacked along a first axis `b`."""
+
+    problem: Problem
+    initial: State
+    truth: Float[Array, "b n 3"]
+    """True camera centres, metres."""
+    present: Bool[Array, "b e p"]
+    features: Float[Array, "b e p f"]
+    saliency: Float[Array, "b e p"]
+    right: Bool[Array, "b e p"]
+
+    def select(self, rows: np.ndarray) -> Batch:
+        """Some of the windows."""
+        chosen: Batch = jax.tree.map(lambda leaf: leaf[rows], self)
+        return chosen
+
+
+class PoseErrors(NamedTuple):
+    """RMS error of the camera centres of each window, metres, under each confidence."""
+
+    uniform: Float[Array, " b"]
+    saliency: Float[Array, " b"]
+    learned: Float[Array, " b"]
+    oracle: Float[Array, " b"]
+
+    def to_dict(self) -> dict[str, float]:
+        """The geometric mean over the windows, millimetres."""
+        return {name: 1e3 * float(jnp.exp(jnp.mean(jnp.log(getattr(self, name))))) for name in self._fields}
+
+
+def stack(windows: Sequence[TrackedWindow]) -> Batch:
+    """Pack `windows` into one padded shape: that of the largest."""
+    keyframes = len(windows[0].poses)
+    points = max(int(np.bincount(window.observations.host).max()) for window in windows)
+    size = PaddedSize(keyframes, points, 0, keyframes - 1, keyframes * (keyframes - 1))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(_packed(window, size) for window in windows))
+
+
+def _packed(window: TrackedWindow, size: PaddedSize) -> Batch:
+    seen = window.observations
+    assert seen.depth_mean is not None
+    guess = (window.start, window.intrinsics, seen.depth_mean)
+    problem, initial, index = pack(seen, *guess, size=size, fixed_intrinsics=True)
+
+    def per_match(values: np.ndarray) -> Array:
+        array = np.zeros((*problem.points.weight.shape, *values.shape[1:]), values.dtype)
+        array[seen.point_edge, index.slot[seen.point_landmark]] = values  # edges are given sorted by host
+        return jnp.asarray(array)
+
+    poses = jaxlie.SE3(jnp.asarray(window.poses))
+    return Batch(
+        problem=problem,
+        initial=initial,
+        truth=poses.inverse().translation(),
+        present=problem.points.weight > 0,
+        features=per_match(window.features),
+        saliency=per_match(window.saliency),
+        right=per_match(window.right),
+    )
+
+
+def pose_errors(batch: Batch, confidence: Float[Array, "b e p"]) -> Float[Array, " b"]:
+    """RMS error of the camera centres of each window after adjustment with weights `GAIN * confidence`, metres."""
+
+    def one(problem: Problem, initial: State, truth: Array, weight: Array) -> Array:
+        state = solve(eqx.tree_at(lambda p: p.points.weight, problem, weight), initial).state
+        off = state.poses.inverse().translation() - truth
+        return jnp.sqrt(jnp.sum(off[1:] ** 2) / (len(truth) - 1) + _SMALLEST**2)
+
+    weights = jnp.where(batch.present, GAIN * confidence, 0.0)
+    return jax.vmap(one)(batch.problem, batch.initial, batch.truth, weights)
+
+
+def train(
+    batch: Batch, *, seed: int = 0, steps: int = 150, size: int = 8, rate: float = 1e-2
+) -> Iterator[tuple[ConfidenceNetwork, float]]:
+    """Train a network on the windows of `batch` by Adam; yields it with its loss after every step.
+
+    Args:
+        batch: training windows.
+        seed: of the network's start and the order of windows.
+        steps: of the optimiser.
+        size: windows a step.
+        rate: learning rate at the start; it falls to a tenth along a cosine.
+
+    """
+    import optax
+
+    rng = np.random.default_rng([seed, 7])
+    network = ConfidenceNetwork(batch.features[batch.present], jax.random.key(seed))
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(rate, steps, 0.1)))
+    memory = optimiser.init(eqx.filter(network, eqx.is_inexact_array))
+
+    @eqx.filter_jit
+    def step(
+        network: ConfidenceNetwork, memory: optax.OptState, part: Batch
+    ) -> tuple[ConfidenceNetwork, optax.OptState, Array]:
+        loss, gradient = eqx.filter_value_and_grad(lambda n: jnp.mean(jnp.log(pose_errors(part, n(part.features)))))(
+            network
+        )
+        finite = jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), gradient)
+        update, memory = optimiser.update(finite, memory)
+        return eqx.apply_updates(network, update), memory, loss
+
+    for _ in range(steps):
+        rows = rng.choice(len(batch.truth), size, replace=False)
+        network, memory, loss = step(network, memory, batch.select(rows))
+        yield network, float(loss)
+
+
+def compare(batch: Batch, network: Callable[[Array], Array]) -> PoseErrors:
+    """Pose errors on `batch` with a confidence of one, saliency, `network`, and what an oracle knows."""
+    found = [
+        _pose_errors_jit(batch, confidence)
+        for confidence in (
+            jnp.ones(batch.present.shape),
+            batch.saliency,
+            network(batch.features),
+            jnp.where(batch.right, 1.0, LEAST),
+        )
+    ]
+    return PoseErrors(*found)
+
+
+_pose_errors_jit = eqx.filter_jit(pose_errors)
