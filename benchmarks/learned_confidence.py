@@ -14,9 +14,6 @@ import time
 from pathlib import Path
 
 import jax
-
-jax.config.update("jax_enable_x64", True)
-
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -39,6 +36,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--out", type=Path, default=Path("docs"))
     arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
     began = time.perf_counter()
     training = stack(windows_of(TRAINING))
     rows, losses = [], []
@@ -66,10 +64,8 @@ def windows_of(scenes: list[tuple[str, int]] | tuple[tuple[str, int], ...]) -> l
 
 def one_seed(training: Batch, held_out: Batch, seed: int, steps: int) -> tuple[dict[str, float], list[float]]:
     """Errors of each method on the held-out windows, millimetres, and the losses of the training."""
-    losses = []
-    for network, loss in train(training, seed=seed, steps=steps):
-        losses.append(loss)
-    return compare(held_out, network).to_dict(), losses
+    networks, losses = zip(*train(training, seed=seed, steps=steps), strict=True)
+    return compare(held_out, networks[-1]).to_dict(), list(losses)
 
 
 def markdown(table: np.ndarray) -> str:

@@ -17,7 +17,7 @@ from vggtgeo.solvers.kernels import Square
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.report import map_view, write_page
-from vggtgeo.residual_sizes import residual_sizes
+from vggtgeo.residual_rms import residual_sizes
 from vggtgeo.slam.outputs import write_summary
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam

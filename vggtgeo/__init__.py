@@ -34,7 +34,14 @@ if TYPE_CHECKING:
     from vggtgeo.problem import Problem as Problem
     from vggtgeo.problem import State as State
     from vggtgeo.problem_file import load_problem as load_problem
+    from vggtgeo.residual_rms import ResidualSizes as ResidualSizes
+    from vggtgeo.residual_rms import residual_sizes as residual_sizes
+    from vggtgeo.results import Result as Result
+    from vggtgeo.results import evaluate as evaluate
+    from vggtgeo.results import read as read
+    from vggtgeo.simulation import SimulatedWindow as SimulatedWindow
     from vggtgeo.simulation import simulate as simulate
+    from vggtgeo.simulation import simulate_window as simulate_window
     from vggtgeo.slam.run import finish as finish
     from vggtgeo.slam.run import frame_trajectory as frame_trajectory
     from vggtgeo.slam.run import run as run
@@ -68,7 +75,9 @@ _HOME = {
     "paper_bench.runner": ("BenchReport", "bench"),
     "problem": ("Problem", "State"),
     "problem_file": ("load_problem",),
-    "simulation": ("simulate",),
+    "residual_rms": ("ResidualSizes", "residual_sizes"),
+    "results": ("Result", "evaluate", "read"),
+    "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
     "slam.run": ("finish", "frame_trajectory", "run"),
     "slam.settings": ("Roles", "SlamSettings"),
     "solution": ("Solution", "solve"),

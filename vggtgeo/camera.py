@@ -38,6 +38,13 @@ class Camera:
         known: False for a starting guess, which is to be optimised and reported.
 
     Raises InputError where a number is missing, not finite, or not positive where it must be.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> camera = vg.Camera((525.0, 525.0, 319.5, 239.5), 640, 480)
+        >>> camera.known, vg.Camera.guess(640, 480).known
+        (True, False)
+
     """
 
     intrinsics: tuple[float, float, float, float]

@@ -2,7 +2,16 @@
 
 
 class InputError(ValueError):
-    """Something the user gave (a path, a file, a number) is wrong; the message says what, and what to do."""
+    """Something the user gave (a path, a file, a number) is wrong; the message says what, and what to do.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.simulate("moon")
+        Traceback (most recent call last):
+            ...
+        vggtgeo.errors.InputError: `scene` is 'moon'; it must be one of room, office, hall, corridor, staircase
+
+    """
 
 
 class InputWarning(UserWarning):

@@ -28,7 +28,14 @@ _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
 def no_prior(keyframes: int, dtype: np.dtype | type = np.float64) -> MarginalPrior:
-    """A prior that says nothing, of the shape of one for `keyframes` keyframes."""
+    """A prior that says nothing, of the shape of one for `keyframes` keyframes.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.no_prior(4).root.shape
+        (28, 28)
+
+    """
     size = 6 * keyframes + SHARED
     identity = np.tile(np.array([1.0, 0, 0, 0, 0, 0, 0], dtype), (keyframes, 1))
     return MarginalPrior(
@@ -44,6 +51,14 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> Marg
 
     `problem.marginal` must be set (`no_prior` to begin with). The result has the same shape; it says nothing about
     the keyframe that left. Pure; `leaving` may be traced.
+
+    Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
+        >>> from dataclasses import replace
+        >>> window = replace(problem, marginal=vg.no_prior(4))
+        >>> prior = jax.eval_shape(vg.marginalise, window, solution.state, jax.numpy.asarray(1))
+        >>> prior.root.shape
+        (28, 28)
+
     """
     prior = problem.marginal
     if prior is None:

@@ -32,7 +32,22 @@ from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 @dataclass(frozen=True)
 class Observations:
-    """What bundle adjustment sees, as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples."""
+    """What bundle adjustment sees, as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples.
+
+    Example:
+        >>> import numpy as np, vggtgeo as vg
+        >>> vg.Observations(
+        ...     edges=np.array([[0, 1]]),
+        ...     host=np.array([0, 0]),
+        ...     pixel=np.array([[10.0, 20.0], [30.0, 40.0]]),
+        ...     point_edge=np.array([0, 0]),
+        ...     point_landmark=np.array([0, 1]),
+        ...     point_target=np.array([[12.0, 20.0], [33.0, 40.0]]),
+        ...     point_weight=np.ones(2),
+        ... )
+        Observations(2 landmarks, 1 edge, 2 points, 0 line samples, no depth prior)
+
+    """
 
     edges: np.ndarray
     """int `[E, 2]`: (host keyframe, target keyframe)."""
@@ -64,10 +79,24 @@ class Observations:
     """int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples then lie on a
     straight line (two unknowns a segment); None: each sample has its own."""
 
+    def __repr__(self) -> str:
+        rows = {"landmark": self.host, "edge": self.edges, "point": self.point_edge, "line sample": self.line_edge}
+        named = ", ".join(f"{len(given)} {name}{'s' * (len(given) != 1)}" for name, given in rows.items())
+        return f"Observations({named}, {'no ' * (self.depth_mean is None)}depth prior)"
+
 
 @dataclass(frozen=True)
 class PaddedSize:
-    """Static shape of a problem: every problem packed to one size shares one compiled solver."""
+    """Static shape of a problem: every problem packed to one size shares one compiled solver.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> size = vg.PaddedSize(keyframes=10, points=320, lines=192, ranks=9)
+        >>> small, _, _ = vg.simulate_window(3).pack(size=size)
+        >>> small.pixels.shape
+        (10, 512, 2)
+
+    """
 
     keyframes: int
     points: int
@@ -142,6 +171,14 @@ def pack(
         InputError: an array of a wrong shape, an index out of range, a match given twice, a landmark with both points
             and lines, an observation between keyframes that its landmark is not hosted in, an inverse depth, focal
             length or standard deviation that is not positive, or a size that is too small.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> window = vg.simulate_window(keyframes=3, points=10, lines=1)
+        >>> guess = window.start, window.intrinsics, window.observations.depth_mean
+        >>> problem, initial, index = vg.pack(window.observations, *guess)
+        >>> problem.points.target.shape, index.gather(initial.inverse_depth).shape
+        ((6, 10, 2), (42,))
 
     """
     count = len(observations.host)

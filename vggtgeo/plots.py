@@ -5,9 +5,11 @@ without roll, so up is the direction that is most nearly at right angles to all 
 look one way, nearest to the mean up of the images). The longest horizontal extent lies along the x axis.
 """
 
+from __future__ import annotations
+
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,9 +17,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from vggtgeo.errors import InputError
-from vggtgeo.evaluation import AbsoluteError, absolute_error, associate
+from vggtgeo.evaluation import AbsoluteError, TrajectoryReport, absolute_error, associate
 from vggtgeo.files import atomic_path
 from vggtgeo.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from vggtgeo.results import Result
 
 _ESTIMATE, _TRUTH, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
 _WIDTH = 11.0
@@ -167,3 +172,55 @@ def _title(drawn: _Drawn, title: str, with_scale: bool) -> str:
         statistics = drawn.error.statistics
         facts = f"ATE {100 * statistics.rmse:.2f} cm after {alignment} ({statistics.count} poses)"
     return f"{title}:  {facts}" if title else facts
+
+
+def errors_figure(report: TrajectoryReport) -> Figure:
+    """Histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
+    figure = Figure(figsize=(6.0, 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    found = (("SE(3)", report.se3, _ESTIMATE), ("Sim(3)", report.sim3, _TRUTH))
+    edges = np.linspace(0, 100 * max(float(error.errors.max()) for _, error, _ in found) + 1e-9, 31)
+    for name, error, colour in found:
+        label = f"after {name}: RMSE {100 * error.statistics.rmse:.2f} cm"
+        axes.hist(100 * error.errors, edges, histtype="stepfilled", color=colour, alpha=0.45, label=label)
+    axes.set_xlabel("error of a camera centre [cm]")
+    axes.set_ylabel("poses")
+    axes.legend(frameon=False)
+    return figure
+
+
+def energy_figure(history: np.ndarray, message: str) -> Figure:
+    """Energy before the first and after each iteration, logarithmic; `history` [h] without NaN."""
+    figure = Figure(figsize=(5.0, 3.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.semilogy(history, ".-", color=_ESTIMATE)
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("energy")
+    axes.set_title(message, loc="left", fontsize=10, color=_INK)
+    axes.grid(color=_GRID, lw=0.7)
+    return figure
+
+
+def result_figure(result: Result, truth: Trajectory | None = None) -> Figure:
+    """Trajectory from above and from the side, and the map from behind and from above."""
+    from vggtgeo.report import map_view
+
+    figure = trajectory_figure(result.trajectory, truth, result.keyframes, not result.metric, title="", width=9.0)
+    if not len(result.cloud):
+        return figure
+    width, height = figure.get_size_inches()
+    whole = Figure(figsize=(width, height + 3.6))
+    FigureCanvasAgg(whole)
+    above, below = whole.subplots(2, 1, height_ratios=[height, 3.6])
+    figure.set_dpi(150)
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    canvas.draw()
+    views = [view(result.cloud, result.trajectory, 700) for view in (map_view.walk_in, map_view.from_above)]
+    for axes, picture in ((above, np.asarray(canvas.buffer_rgba())), (below, np.concatenate(views, axis=1))):
+        axes.imshow(picture)
+        axes.axis("off")
+    whole.subplots_adjust(0, 0, 1, 1, 0, 0.01)
+    return whole

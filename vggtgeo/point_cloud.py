@@ -33,6 +33,9 @@ class PointCloud:
         if not np.isfinite(self.points).all():
             raise InputError("`points` has a NaN or an infinity; leave such points out")
 
+    def __repr__(self) -> str:
+        return f"PointCloud({len(self)} points)"
+
     def __len__(self) -> int:
         return len(self.points)
 

@@ -35,6 +35,14 @@ def load_problem(path: Path, dtype: DTypeLike = np.float64) -> tuple[Problem, St
     Raises:
         InputError: the file is missing, is no `.npz`, lacks an array or holds one that does not fit.
 
+    Example:
+        >>> import vggtgeo as vg
+        >>> from pathlib import Path
+        >>> vg.load_problem(Path("no.npz"))
+        Traceback (most recent call last):
+            ...
+        vggtgeo.errors.InputError: `no.npz` is no file; give the .npz of a bundle-adjustment problem
+
     """
     arrays = _read(Path(path))
     observations = Observations(

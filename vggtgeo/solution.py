@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import equinox as eqx
 import jax
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
@@ -19,9 +22,18 @@ from vggtgeo.solvers.levenberg_marquardt import (
     termination_name,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 class Solution(eqx.Module):
-    """The outcome of `solve`; a pytree, so it passes through `jit` and `vmap`."""
+    """The outcome of `solve`; a pytree, so it passes through `jit` and `vmap`.
+
+    Example (of `solve`'s):
+        >>> solution.to_dict()["converged"]
+        True
+
+    """
 
     state: State
     energy: Float[Array, ""]
@@ -34,6 +46,29 @@ class Solution(eqx.Module):
     gradient_norm: Float[Array, ""]
     """Largest gradient entry of the last linearisation, scaled by its curvature (unit of the root of the energy)."""
     termination: Termination
+
+    def to_dict(self) -> dict[str, Any]:
+        """Result, energies and counts as plain values (outside `jit`, for one solution)."""
+        return {
+            "result": self.result,
+            "converged": bool(self.converged),
+            "energy_initial": float(self.history[0]),
+            "energy": float(self.energy),
+            "iterations": int(self.iterations),
+            "linearisations": int(self.linearisations),
+            "gradient_norm": float(self.gradient_norm),
+        }
+
+    def plot(self) -> Figure:
+        """The energy by iteration (outside `jit`, for one solution)."""
+        from vggtgeo.plots import energy_figure
+
+        history = np.asarray(self.history)
+        return energy_figure(history[np.isfinite(history)], self.message)
+
+    def __str__(self) -> str:
+        before, after = float(self.history[0]), float(self.energy)
+        return f"{self.result}: energy {before:.6g} -> {after:.6g} in {int(self.iterations)} iterations"
 
     @property
     def converged(self) -> Bool[Array, ""]:
@@ -76,6 +111,14 @@ def solve(
             `SchurLevenbergMarquardt(differentiable_loop=True)` differentiates through the iterates instead.
         graduation: wider kernels to go through first, for a redescending kernel and a start that outliers dominate;
             `history` and `iterations` are those of the last kernel, the one of `problem`.
+
+    Example:
+        >>> import jax, vggtgeo as vg
+        >>> problem, initial, index = vg.simulate_window().pack()
+        >>> solution = jax.jit(vg.solve)(problem, initial)
+        >>> bool(solution.converged), bool(solution.energy < solution.history[0])
+        (True, True)
+
     """
     solver = SchurLevenbergMarquardt() if solver is None else solver
     adjoint = ArrowAdjoint() if adjoint is None else adjoint

@@ -7,7 +7,7 @@ import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.errors import InputError, InputWarning
 from vggtgeo.files import write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
 _ROTATION_TOLERANCE = 1e-3
@@ -29,6 +32,14 @@ class Trajectory:
         poses: float64 [n, 4, 4], camera -> world, metres (or the unit of a scale-free reconstruction).
 
     Raises InputError for other shapes, NaN or infinity, times that do not increase, or what is no rotation.
+
+    Example:
+        >>> import numpy as np, vggtgeo as vg
+        >>> poses = np.tile(np.eye(4), (3, 1, 1))
+        >>> poses[:, 0, 3] = [0, 1, 2]
+        >>> vg.Trajectory(np.array([0.0, 0.5, 1.0]), poses)
+        Trajectory(3 poses, 1.00 s, path 2.00 m)
+
     """
 
     timestamps: Float[np.ndarray, " n"]
@@ -56,6 +67,25 @@ class Trajectory:
     def length(self) -> float:
         """Length of the path through the camera centres, metres."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    def to_dict(self) -> dict[str, list]:
+        """Times, positions and quaternions (x, y, z, w), as plain lists."""
+        quaternions = Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
+        return {
+            "timestamps": self.timestamps.tolist(),
+            "positions": self.positions.tolist(),
+            "quaternions": quaternions.tolist(),
+        }
+
+    def plot(self, truth: "Trajectory | None" = None, *, with_scale: bool = False) -> "Figure":
+        """Seen from above and from the side, the truth beside it after SE(3), or Sim(3) `with_scale`, alignment."""
+        from vggtgeo.plots import trajectory_figure
+
+        return trajectory_figure(self, truth, with_scale=with_scale)
+
+    def __repr__(self) -> str:
+        seconds = self.timestamps[-1] - self.timestamps[0] if len(self) else 0.0
+        return f"Trajectory({len(self)} pose{'s' * (len(self) != 1)}, {seconds:.2f} s, path {self.length:.2f} m)"
 
     def select(self, rows: np.ndarray | slice) -> Self:
         """The poses at `rows` (indices in increasing order, a boolean mask, or a slice)."""

@@ -22,6 +22,12 @@ class Frame:
         image: uint8 [H, W, 3], RGB.
         depth: float32 [H, W], z in metres, NaN where there is none; None for a sequence without depth.
         name: the file's name, for messages.
+
+    Example:
+        >>> import numpy as np, vggtgeo as vg
+        >>> vg.Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), None, "black")
+        Frame(0, 0.000 s, 320 x 240, no depth, 'black')
+
     """
 
     index: int
@@ -29,6 +35,11 @@ class Frame:
     image: UInt8[np.ndarray, "h w 3"]
     depth: Float[np.ndarray, "h w"] | None
     name: str
+
+    def __repr__(self) -> str:
+        height, width = self.image.shape[:2]
+        depth = "no depth" if self.depth is None else "depth"
+        return f"Frame({self.index}, {self.timestamp:.3f} s, {width} x {height}, {depth}, {self.name!r})"
 
 
 @runtime_checkable

@@ -28,6 +28,13 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequ
     values where the name tells the camera, else it is a guess (`camera.known` is False), with an
     InputWarning. InputError where the path is missing or empty, or holds nothing that can be read.
 
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.open_sequence("no/such/folder")
+        Traceback (most recent call last):
+            ...
+        vggtgeo.errors.InputError: `no/such/folder` does not exist; give a folder of images or a video file
+
     """
     place = Path(path).expanduser()
     if kind is not None and kind not in KINDS:

@@ -1,7 +1,7 @@
 """Everything the field asks of an estimated trajectory, in one value."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
 from vggtgeo.evaluation.relative import RelativeError, relative_error
 from vggtgeo.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MINIMUM_MATCHES = 3
 
@@ -28,6 +31,26 @@ class TrajectoryReport:
     sim3: AbsoluteError
     relative: RelativeError
     relative_sim3: RelativeError
+
+    def to_dict(self) -> dict[str, Any]:
+        """See `as_dict`."""
+        return self.as_dict()
+
+    def plot(self) -> "Figure":
+        """Histogram of the errors of the camera centres after either alignment."""
+        from vggtgeo.plots import errors_figure
+
+        return errors_figure(self)
+
+    def __str__(self) -> str:
+        se3, sim3, pairs = self.se3.statistics.rmse, self.sim3.statistics.rmse, self.relative
+        moved, turned = pairs.translation_statistics.rmse, np.degrees(pairs.rotation_statistics.rmse)
+        return (
+            f"{self.matched} poses: ATE {se3:.3f} m after SE(3), {sim3:.3f} m after Sim(3) (scale "
+            f"{self.sim3.alignment.scale:.4f}); RPE over {pairs.delta}: {moved:.3f} m, {turned:.3f} deg"
+        )
+
+    __repr__ = __str__
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON: metres and degrees; None where there was nothing to measure."""
@@ -59,6 +82,13 @@ def evaluate_trajectory(
     poses).
 
     InputError where fewer than three poses match: an alignment would hide any error.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> truth = vg.simulate("room", 30).ground_truth()
+        >>> vg.evaluate_trajectory(truth.select(slice(0, 20)), truth).matched
+        20
+
     """
     matched, reference = associate(estimate, truth, max_dt)
     if len(matched) < MINIMUM_MATCHES:

@@ -119,6 +119,14 @@ def simulate(
     scene: a key of `WORLDS`. size: (width, height), pixels. rate: frames a second. speed: metres a second, None for
     the scene's own. sensor: error model, None for `Sensor()`. The horizontal field of view is 62 degrees.
     Raises InputError for an unknown scene or a number that is not positive.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> sequence = vg.simulate("room", 10, size=(160, 120))
+        >>> frame = next(sequence.frames())
+        >>> frame.image.shape, len(sequence.ground_truth())
+        ((120, 160, 3), 10)
+
     """
     if scene not in WORLDS:
         raise InputError(f"`scene` is {scene!r}; it must be one of {', '.join(WORLDS)}")

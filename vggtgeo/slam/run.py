@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
 from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame, Sequence
+from vggtgeo.datasets.in_memory import frame_stream
 from vggtgeo.errors import InputError
+from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam import rigid
 from vggtgeo.slam.clock import Clock
@@ -25,21 +28,48 @@ AHEAD = 3
 
 
 def run(
-    sequence: Sequence,
+    frames: Sequence | Iterable[Any],
     roles: Roles | None = None,
     settings: SlamSettings | None = None,
     *,
+    camera: Camera | None = None,
     start: int = 0,
     end: int | None = None,
     stride: int = 1,
     clock: Clock | None = None,
 ) -> Iterator[Slam]:
-    """Track and map a sequence; yields the state after every frame, so that a caller can draw, stop or save.
+    """Track and map; yields the state after every frame, so that a caller can draw, stop or save.
 
-    `finish` turns the last state into the result. Frames are undistorted first.
+    Args:
+        frames: a sequence (`vggtgeo.read`, `vggtgeo.simulate`), or any iterable of `Frame`, of images uint8 [H, W, 3]
+            RGB, or of pairs of an image and depth (float [H, W], metres, NaN = none).
+        roles: perception objects; by default the classical ones, without depth where the frames have none.
+        settings: of the pipeline.
+        camera: of an iterable's frames; by default a guess, which is then estimated. A sequence has its own.
+        start: first frame.
+        end: frame to stop before.
+        stride: take every n-th frame.
+        clock: adds up seconds by stage.
+
+    Yields:
+        The state: poses are world -> camera, lengths metres where `metric`. `vggtgeo.finish` adjusts the last one as a
+        whole, `vggtgeo.Result.of` makes trajectory and map of one.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> next(vg.run(vg.simulate("room", 3, size=(160, 120))))
+        Slam(1 frame, 1 keyframe, tracking)
+
     """
-    frames = sequence.frames(start, end, stride)
-    yield from run_frames(frames, sequence.camera, roles or Roles(), settings or SlamSettings(), clock or Clock())
+    source = frames if isinstance(frames, Sequence) else frame_stream(frames, camera)
+    roles = roles or default_roles(source.has_depth)
+    selected = source.frames(start, end, stride)
+    yield from run_frames(selected, source.camera, roles, settings or SlamSettings(), clock or Clock())
+
+
+def default_roles(has_depth: bool) -> Roles:
+    """The classical roles, for frames with or without depth."""
+    return Roles() if has_depth else Roles(depth=NoDepth())
 
 
 def run_frames(
@@ -52,8 +82,24 @@ def run_frames(
         yield slam
 
 
-def finish(slam: Slam, roles: Roles, settings: SlamSettings, clock: Clock | None = None) -> Slam:
-    """Join what was seen twice, and adjust the whole map once more."""
+def finish(
+    slam: Slam, roles: Roles | None = None, settings: SlamSettings | None = None, clock: Clock | None = None
+) -> Slam:
+    """Join what was seen twice, and adjust the whole map once more.
+
+    Args:
+        slam: the last state of a run.
+        roles: those of the run, by default the default ones.
+        settings: those of the run, by default the default ones.
+        clock: adds up seconds by stage.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.finish(next(vg.run(vg.simulate("room", 3, size=(160, 120)))))
+        Slam(1 frame, 1 keyframe, tracking)
+
+    """
+    roles, settings = roles or default_roles(slam.metric), settings or SlamSettings()
     if not settings.global_adjustment or len(slam.keyframes) < 3:
         return slam
     clock = clock or Clock()
@@ -68,6 +114,12 @@ def frame_trajectory(slam: Slam) -> Trajectory:
 
     A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and
     the next is shared out over the frames in between, in proportion to time, so that the path has no steps.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.frame_trajectory(next(vg.run(vg.simulate("room", 3, size=(160, 120)))))
+        Trajectory(1 pose, 0.00 s, path 0.00 m)
+
     """
     poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
     times = np.array([record.timestamp for record in slam.frames])

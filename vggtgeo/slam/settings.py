@@ -24,7 +24,15 @@ from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 @dataclass(frozen=True)
 class Roles:
-    """The perception objects of one run."""
+    """The perception objects of one run.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> from vggtgeo.models.classical import NoDepth, OrbMatcher
+        >>> vg.Roles(points=OrbMatcher(), depth=NoDepth()).metric
+        False
+
+    """
 
     points: PointMatcher = field(default_factory=SiftMatcher)
     lines: LineDetector = field(default_factory=LsdDetector)
@@ -41,7 +49,14 @@ class Roles:
 
 @dataclass(frozen=True)
 class SlamSettings:
-    """Numbers of the pipeline; lengths in metres, angles in radians, pixels where named so."""
+    """Numbers of the pipeline; lengths in metres, angles in radians, pixels where named so.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.SlamSettings(window=8, use_lines=False).window
+        8
+
+    """
 
     window: int = 10
     """Keyframes adjusted together."""

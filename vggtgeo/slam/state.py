@@ -71,6 +71,11 @@ class Slam:
     origins: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        frames, keyframes = len(self.frames), len(self.keyframes)
+        doing = "lost" if self.lost else "waiting for parallax" if self.waiting else "tracking"
+        return f"Slam({frames} frame{'s' * (frames != 1)}, {keyframes} keyframe{'s' * (keyframes != 1)}, {doing})"
+
     def pose(self, record: FramePose) -> np.ndarray:
         """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
         return record.relative @ self.keyframes[record.reference].pose

@@ -11,7 +11,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.problem import Problem, State
-from vggtgeo.residual_sizes import residual_sizes
+from vggtgeo.residual_rms import residual_sizes
 from vggtgeo.slam.state import Slam
 
 _sizes_jit = eqx.filter_jit(residual_sizes)
