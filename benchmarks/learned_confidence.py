@@ -33,7 +33,7 @@ def main() -> None:
     """Train and compare, then write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--out", type=Path, default=Path("docs"))
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -45,6 +45,7 @@ def main() -> None:
         errors, loss = one_seed(training, held_out, seed, arguments.steps)
         rows.append(errors)
         losses.append(loss)
+        assert np.isfinite(list(errors.values())).all()
         print(seed, {name: round(value, 2) for name, value in errors.items()}, flush=True)
     table = np.array([[row[name] for name in METHODS] for row in rows])
     print(markdown(table))

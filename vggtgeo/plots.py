@@ -7,6 +7,7 @@ look one way, nearest to the mean up of the images). The longest horizontal exte
 
 from __future__ import annotations
 
+import io
 import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,15 @@ _WIDTH = 11.0
 _WEIGHT_OF_MEAN_UP = 0.02
 _LEAST_EXTENT = 0.1
 """Metres: how much the picture of a still camera shows."""
+
+
+class Picture(Figure):
+    """A figure that a notebook shows, whether or not it has started matplotlib's own machinery."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=100, facecolor="white")
+        return buffer.getvalue()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +78,7 @@ def trajectory_figure(
     with_scale: bool = False,
     title: str | None = "",
     width: float = _WIDTH,
-) -> Figure:
+) -> Picture:
     """The same as a figure, `width` inches wide; without a title where `title` is None."""
     if len(estimate) == 0:
         raise InputError("`estimate` has no pose; there is nothing to draw")
@@ -117,7 +127,7 @@ def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
     return up if up @ mean_up >= 0 else -up
 
 
-def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> Figure:
+def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> Picture:
     origin = (drawn.truth or drawn.estimate).positions[0]
     everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
     points = (np.concatenate(everything) - origin) @ axes_of_view.T
@@ -127,7 +137,7 @@ def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> F
     low, high = 0.5 * (low + high) - 0.56 * extent, 0.5 * (low + high) + 0.56 * extent
     heights = high - low
     panel = min(0.85 * width * (heights[1] + heights[2]) / heights[0], 0.82 * width)
-    figure = Figure(figsize=(width, panel + 2.2), layout="constrained")
+    figure = Picture(figsize=(width, panel + 2.2), layout="constrained")
     FigureCanvasAgg(figure)
     top, side = figure.subplots(2, 1, height_ratios=[heights[1], heights[2]], sharex=True)
     for axes, vertical, name in ((top, 1, "seen from above"), (side, 2, "seen from the side")):
@@ -174,25 +184,25 @@ def _title(drawn: _Drawn, title: str, with_scale: bool) -> str:
     return f"{title}:  {facts}" if title else facts
 
 
-def errors_figure(report: TrajectoryReport) -> Figure:
+def errors_figure(report: TrajectoryReport) -> Picture:
     """Histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
-    figure = Figure(figsize=(6.0, 3.2), layout="constrained")
+    figure = Picture(figsize=(6.0, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     found = (("SE(3)", report.se3, _ESTIMATE), ("Sim(3)", report.sim3, _TRUTH))
     edges = np.linspace(0, 100 * max(float(error.errors.max()) for _, error, _ in found) + 1e-9, 31)
     for name, error, colour in found:
         label = f"after {name}: RMSE {100 * error.statistics.rmse:.2f} cm"
-        axes.hist(100 * error.errors, edges, histtype="stepfilled", color=colour, alpha=0.45, label=label)
+        axes.hist(100 * error.errors, edges.tolist(), histtype="stepfilled", color=colour, alpha=0.45, label=label)
     axes.set_xlabel("error of a camera centre [cm]")
     axes.set_ylabel("poses")
     axes.legend(frameon=False)
     return figure
 
 
-def energy_figure(history: np.ndarray, message: str) -> Figure:
+def energy_figure(history: np.ndarray, message: str) -> Picture:
     """Energy before the first and after each iteration, logarithmic; `history` [h] without NaN."""
-    figure = Figure(figsize=(5.0, 3.0), layout="constrained")
+    figure = Picture(figsize=(5.0, 3.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.semilogy(history, ".-", color=_ESTIMATE)
@@ -203,7 +213,7 @@ def energy_figure(history: np.ndarray, message: str) -> Figure:
     return figure
 
 
-def result_figure(result: Result, truth: Trajectory | None = None) -> Figure:
+def result_figure(result: Result, truth: Trajectory | None = None) -> Picture:
     """Trajectory from above and from the side, and the map from behind and from above."""
     from vggtgeo.report import map_view
 
@@ -211,7 +221,7 @@ def result_figure(result: Result, truth: Trajectory | None = None) -> Figure:
     if not len(result.cloud):
         return figure
     width, height = figure.get_size_inches()
-    whole = Figure(figsize=(width, height + 3.6))
+    whole = Picture(figsize=(width, height + 3.6))
     FigureCanvasAgg(whole)
     above, below = whole.subplots(2, 1, height_ratios=[height, 3.6])
     figure.set_dpi(150)

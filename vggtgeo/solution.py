@@ -64,7 +64,7 @@ class Solution(eqx.Module):
         from vggtgeo.plots import energy_figure
 
         history = np.asarray(self.history)
-        return energy_figure(history[np.isfinite(history)], self.message)
+        return energy_figure(history[np.isfinite(history)], self.result)
 
     def __str__(self) -> str:
         before, after = float(self.history[0]), float(self.energy)

@@ -10,5 +10,6 @@ from vggtgeo.learning.tracked_windows import tracked_windows as tracked_windows
 from vggtgeo.learning.training import Batch as Batch
 from vggtgeo.learning.training import PoseErrors as PoseErrors
 from vggtgeo.learning.training import compare as compare
+from vggtgeo.learning.training import error_and_gradient as error_and_gradient
 from vggtgeo.learning.training import stack as stack
 from vggtgeo.learning.training import train as train

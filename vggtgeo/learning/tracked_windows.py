@@ -38,6 +38,8 @@ _SEARCH = 6.0
 _LK = {"winSize": (13, 13), "maxLevel": 2, "minEigThreshold": 1e-5}
 _PATCH = 9
 _DEPTH_NOISE = 0.05
+_START = 0.03
+"""Metres, standard deviation: how far off the poses start."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +112,10 @@ def _window(
     parts = []
     for e, (i, j) in enumerate(edges):
         true, visible = oracle.correspond(frames[i], frames[j], corners[i])
-        found = _follow(grey[i], grey[j], corners[i], true + rng.normal(0, _SEARCH, true.shape))
-        kept = found.kept & _inside(true, grey[j]) & np.isfinite(depth[first[i] : first[i + 1]])
+        known = np.isfinite(true).all(axis=1) & np.isfinite(depth[first[i] : first[i + 1]])
+        guess = np.where(known[:, None], true, corners[i]) + rng.normal(0, _SEARCH, true.shape)
+        found = _follow(grey[i], grey[j], corners[i], guess)
+        kept = found.kept & known & _inside(true, grey[j])
         features = _features(grey[i], grey[j], saliency[i], saliency[j], corners[i], found)
         error = np.where(visible, np.linalg.norm(found.pixels - true, axis=1), np.inf)
         rows = np.nonzero(kept)[0]
@@ -135,7 +139,7 @@ def _window(
     )
     poses = rigid.to_quaternion(np.array([oracle.pose(k) for k in frames]))
     start = poses.copy()
-    start[1:, 4:] += rng.normal(0, 0.01, (len(frames) - 1, 3))
+    start[1:, 4:] += rng.normal(0, _START, (len(frames) - 1, 3))
     return TrackedWindow(name, images, observations, poses, start, oracle.intrinsics, features, error, product)
 
 
@@ -180,7 +184,7 @@ def _features(
     norms = [np.linalg.norm(patch, axis=1) + 1.0 for patch in deviation]
     correlation = (deviation[0] * deviation[1]).sum(axis=1) / (norms[0] * norms[1])
     motion = found.pixels - pixels
-    unusual = np.linalg.norm(motion - np.median(motion, axis=0), axis=1) if len(motion) else np.zeros(0)
+    usual = np.median(motion[found.kept], axis=0) if found.kept.any() else np.zeros(2)
     return np.column_stack(
         [
             _read(saliency_i, pixels),
@@ -190,7 +194,7 @@ def _features(
             correlation,
             np.log(found.back + 0.01),
             np.log(np.abs(here.mean(axis=1) - there.mean(axis=1)) + 1.0),
-            np.log(unusual + 1.0),
+            np.log(np.linalg.norm(motion - usual, axis=1) + 1.0),
         ]
     )
 

@@ -40,8 +40,8 @@ class Batch(NamedTuple):
     saliency: Float[Array, "b e p"]
     right: Bool[Array, "b e p"]
 
-    def select(self, rows: np.ndarray) -> Batch:
-        """Some of the windows."""
+    def select(self, rows: np.ndarray | int) -> Batch:
+        """Some of the windows, or one, without the first axis."""
         chosen: Batch = jax.tree.map(lambda leaf: leaf[rows], self)
         return chosen
 
@@ -90,16 +90,28 @@ def _packed(window: TrackedWindow, size: PaddedSize) -> Batch:
     )
 
 
-def pose_errors(batch: Batch, confidence: Float[Array, "b e p"]) -> Float[Array, " b"]:
-    """RMS error of the camera centres of each window after adjustment with weights `GAIN * confidence`, metres."""
+@eqx.filter_jit
+def error_and_gradient(window: Batch, confidence: Float[Array, "e p"]) -> tuple[Float[Array, ""], Float[Array, "e p"]]:
+    """RMS error of the camera centres after adjustment with weights `GAIN * confidence`, metres, and the gradient of
+    its logarithm with respect to each match's confidence; NaN where the solve failed.
 
-    def one(problem: Problem, initial: State, truth: Array, weight: Array) -> Array:
-        state = solve(eqx.tree_at(lambda p: p.points.weight, problem, weight), initial).state
-        off = state.poses.inverse().translation() - truth
-        return jnp.sqrt(jnp.sum(off[1:] ** 2) / (len(truth) - 1) + _SMALLEST**2)
+    Args:
+        window: one window of a batch, `batch.select(i)`.
+        confidence: of each match, in [0, 1].
 
-    weights = jnp.where(batch.present, GAIN * confidence, 0.0)
-    return jax.vmap(one)(batch.problem, batch.initial, batch.truth, weights)
+    """
+
+    def log_error(confidence: Array) -> Array:
+        weight = jnp.where(window.present, GAIN * confidence, 0.0)
+        problem = eqx.tree_at(lambda p: p.points.weight, window.problem, weight)
+        solution = solve(problem, window.initial)
+        off = solution.state.poses.inverse().translation() - window.truth
+        error = jnp.log(jnp.sum(off[1:] ** 2) / (len(window.truth) - 1) + _SMALLEST**2) / 2
+        # A solve that stayed at its start, for a weight that is no number, must not count as an error.
+        return jnp.where(jnp.isfinite(solution.energy), error, jnp.nan)
+
+    error, gradient = jax.value_and_grad(log_error)(confidence)
+    return jnp.exp(error), gradient
 
 
 def train(
@@ -123,34 +135,35 @@ def train(
     memory = optimiser.init(eqx.filter(network, eqx.is_inexact_array))
 
     @eqx.filter_jit
-    def step(
-        network: ConfidenceNetwork, memory: optax.OptState, part: Batch
-    ) -> tuple[ConfidenceNetwork, optax.OptState, Array]:
-        loss, gradient = eqx.filter_value_and_grad(lambda n: jnp.mean(jnp.log(pose_errors(part, n(part.features)))))(
-            network
-        )
-        finite = jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), gradient)
-        update, memory = optimiser.update(finite, memory)
-        return eqx.apply_updates(network, update), memory, loss
+    def improve(network: ConfidenceNetwork, memory: Any, features: Array, pull: Array) -> tuple[ConfidenceNetwork, Any]:
+        # The chain rule by hand: the gradient with respect to the confidences, carried on into the network.
+        gradient = eqx.filter_grad(lambda n: jnp.sum(pull * n(features)))(network)
+        update, memory = optimiser.update(gradient, memory)
+        return eqx.apply_updates(network, update), memory
 
     for _ in range(steps):
         rows = rng.choice(len(batch.truth), size, replace=False)
-        network, memory, loss = step(network, memory, batch.select(rows))
-        yield network, float(loss)
+        confidence = _apply(network, batch.features[rows])
+        found = [error_and_gradient(batch.select(row), confidence[i]) for i, row in enumerate(rows)]
+        errors, gradients = (jnp.stack(part) for part in zip(*found, strict=True))
+        good = jnp.isfinite(gradients).all((1, 2), keepdims=True)
+        network, memory = improve(network, memory, batch.features[rows], jnp.where(good, gradients, 0.0) / size)
+        yield network, float(jnp.mean(jnp.log(errors)))
 
 
 def compare(batch: Batch, network: Callable[[Array], Array]) -> PoseErrors:
     """Pose errors on `batch` with a confidence of one, saliency, `network`, and what an oracle knows."""
-    found = [
-        _pose_errors_jit(batch, confidence)
-        for confidence in (
-            jnp.ones(batch.present.shape),
-            batch.saliency,
-            network(batch.features),
-            jnp.where(batch.right, 1.0, LEAST),
-        )
+    ones = jnp.ones_like(batch.saliency)
+    oracle = jnp.where(batch.right, ones, LEAST)
+    methods = (ones, batch.saliency, _apply(network, batch.features), oracle)
+    windows = [batch.select(row) for row in range(len(batch.truth))]
+    errors = [
+        jnp.stack([error_and_gradient(window, confidence[row])[0] for row, window in enumerate(windows)])
+        for confidence in methods
     ]
-    return PoseErrors(*found)
+    return PoseErrors(*errors)
 
 
-_pose_errors_jit = eqx.filter_jit(pose_errors)
+@eqx.filter_jit
+def _apply(network: Callable[[Array], Array], features: Array) -> Array:
+    return network(features)

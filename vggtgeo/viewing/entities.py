@@ -119,7 +119,7 @@ def log_keyframe(stream: rr.RecordingStream, keyframe: Keyframe, pair: Pair | No
     ends = np.asarray(keyframe.lines.segments.endpoints, np.float64).reshape(-1, 2, 2)
     matched = np.isin(np.arange(len(ends)), [] if pair is None else pair.lines.index_j)
     colours = np.where(matched[:, None], _ORANGE, _GREY).astype(np.uint8)
-    stream.log("keyframe/image/lines", rr.LineStrips2D(ends, colors=colours, radii=-1.5))
+    stream.log("keyframe/image/lines", rr.LineStrips2D(list(ends), colors=colours, radii=-1.5))
     if np.isfinite(keyframe.depth).any():
         millimetres = np.nan_to_num(1000.0 * keyframe.depth[::2, ::2].astype(np.float32)).astype(np.uint16)
         stream.log("keyframe/depth", rr.DepthImage(millimetres, meter=1000.0, colormap="viridis"))
