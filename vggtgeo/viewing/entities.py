@@ -29,8 +29,7 @@ ENTITIES = (
     "/keyframe/image/lines",
     "/keyframe/depth",
     "/keyframe/confidence",
-    "/window/nodes",
-    "/window/edges",
+    "/window/graph",
     "/plots/residuals/points",
     "/plots/residuals/lines",
     "/plots/residuals/depth",
@@ -100,8 +99,8 @@ def log_window(stream: rr.RecordingStream, keyframes: list[Keyframe], pairs: lis
     names = {keyframe.number: str(keyframe.number) for keyframe in keyframes}
     inside = [pair for pair in pairs if pair.first in names and pair.second in names]
     ids = list(names.values())
-    stream.log("window/nodes", rr.GraphNodes(ids, labels=[f"frame {k.frame}" for k in keyframes]))
-    stream.log("window/edges", rr.GraphEdges([(names[pair.first], names[pair.second]) for pair in inside]))
+    nodes = rr.GraphNodes(ids, labels=[f"frame {k.frame}" for k in keyframes])
+    stream.log("window/graph", nodes, rr.GraphEdges([(names[pair.first], names[pair.second]) for pair in inside]))
     centre = {keyframe.number: rigid.centre(keyframe.pose) for keyframe in keyframes}
     strips = [np.stack([centre[pair.first], centre[pair.second]]) for pair in inside]
     stream.log("world/covisibility", rr.LineStrips3D(strips, colors=[(*_GREEN, 90)] * len(strips), radii=-0.8))
