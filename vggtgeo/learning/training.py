@@ -7,7 +7,7 @@ size. Its gradient reaches the network through the optimum (implicit function th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax

@@ -41,6 +41,7 @@ ENTITIES = (
 SIGMAS = 20.0
 """Standard deviations that the ellipsoids reach: those of a good window are millimetres."""
 _BLUE, _ORANGE, _GREEN, _GREY = (31, 95, 191), (224, 123, 26), (58, 143, 92), (150, 150, 150)
+_GRAPH_RADIUS = 160.0
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
 
@@ -99,7 +100,9 @@ def log_window(stream: rr.RecordingStream, keyframes: list[Keyframe], pairs: lis
     names = {keyframe.number: str(keyframe.number) for keyframe in keyframes}
     inside = [pair for pair in pairs if pair.first in names and pair.second in names]
     ids = list(names.values())
-    nodes = rr.GraphNodes(ids, labels=[f"frame {k.frame}" for k in keyframes])
+    turn = 2 * np.pi * np.arange(len(keyframes)) / len(keyframes)
+    places = _GRAPH_RADIUS * np.stack([np.sin(turn), -np.cos(turn)], 1)  # the oldest at the top, clockwise
+    nodes = rr.GraphNodes(ids, positions=places, labels=[f"frame {k.frame}" for k in keyframes])
     stream.log("window/graph", nodes, rr.GraphEdges([(names[pair.first], names[pair.second]) for pair in inside]))
     centre = {keyframe.number: rigid.centre(keyframe.pose) for keyframe in keyframes}
     strips = [np.stack([centre[pair.first], centre[pair.second]]) for pair in inside]
