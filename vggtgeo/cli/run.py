@@ -82,6 +82,8 @@ def run(
         depth_weight=0.0 if no_depth_prior else SlamSettings.depth_weight,
         global_adjustment=not no_global,
     )
+    if preset == "paper" and features != "sift":
+        raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
     perceived = make_perception(preset, make_roles(sequence, init, features), models, cache)
     finished = run_and_write(
         sequence,
