@@ -11,7 +11,7 @@ from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 from vggtgeo.models.onnx.moge2 import MogeDepth, recover_focal_shift
 from vggtgeo.models.onnx.session import open_session
-from vggtgeo.models.onnx.vggt import VggtWindow, confidence_of, decode_cameras, robust_mean, shared_intrinsics
+from vggtgeo.models.onnx.vggt import VggtWindow, decode_cameras, robust_mean, shared_intrinsics
 from vggtgeo.models.roles import GeometryResult, MetricDepth, WindowGeometry
 from vggtgeo.models.window_alignment import align_window
 
@@ -134,7 +134,7 @@ def test_a_window_has_the_geometry_that_was_put_in(tmp_path: Path) -> None:
     expected = 1.01 + 0.002 * x
     np.testing.assert_allclose(guess.depth[1][:, 2:-2], np.tile(expected[2:-2], (168, 1)), atol=1e-5)
     y = (np.arange(168) + 0.5) / 2 - 0.5
-    np.testing.assert_allclose(guess.confidence[0][2:-2, 5], confidence_of(1 + y / 84)[2:-2], atol=1e-5)
+    np.testing.assert_allclose(guess.confidence[0][2:-2, 5], (1 - 1 / (1 + y / 84))[2:-2], atol=1e-5)
 
 
 def test_given_intrinsics_are_kept_and_too_many_views_refused(tmp_path: Path) -> None:

@@ -104,6 +104,9 @@ WRONG_SIZES = {
     "Q is 2 in `pred_logits` and 3 in `pred_lines`": lambda path: tiny.constant(
         path, "letr", {"image": (1, 3, 28, 42)}, {"pred_logits": np.zeros((1, 2, 2)), "pred_lines": np.zeros((1, 3, 4))}
     ),
+    "expected `maps .1, 9, 256, 256. float32 or float16`, found .1, 8, 256, 256. float32": lambda path: tiny.constant(
+        path, "mlsd", {"image": (1, 4, 512, 512)}, {"maps": np.zeros((1, 8, 256, 256))}
+    ),
     "`features` has 6 tokens, expected 12": lambda path: tiny.constant(
         path, "mast3r_encoder", {"image": (1, 3, 48, 64)}, {"features": np.zeros((1, 6, 8))}
     ),
