@@ -64,6 +64,7 @@ def run(
     """Estimate trajectory and map of the sequence at PATH."""
     import cv2
 
+    from vggtgeo.cli.network_errors import as_input_errors
     from vggtgeo.cli.run_sequence import run_and_write
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
     from vggtgeo.slam.settings import SlamSettings
@@ -85,18 +86,19 @@ def run(
     if preset == "paper" and features != "sift":
         raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
     perceived = make_perception(preset, make_roles(sequence, init, features), models, cache)
-    finished = run_and_write(
-        sequence,
-        perceived.roles,
-        slam_settings,
-        output,
-        settings.values() if settings else {},
-        (start, end, stride),
-        save_depth=save_depth,
-        rerun=rerun,
-        quiet=quiet or as_json,
-        facts=perceived.facts(),
-    )
+    with as_input_errors():
+        finished = run_and_write(
+            sequence,
+            perceived.roles,
+            slam_settings,
+            output,
+            settings.values() if settings else {},
+            (start, end, stride),
+            save_depth=save_depth,
+            rerun=rerun,
+            quiet=quiet or as_json,
+            facts=perceived.facts(),
+        )
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
     if rerun == "serve":
