@@ -122,18 +122,19 @@ def test_a_command_that_is_not_there() -> None:
 
 
 def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
-    # Proves that the program computes in 64 bits and keeps compiled code in the user's cache folder.
+    # Proves that the program computes in 64 bits, keeps compiled code in the user's cache folder, and leaves memory of
+    # a GPU to others.
     script = (
-        "from vggtgeo.cli.jax_flags import set_jax_flags; set_jax_flags(); import jax; "
+        "from vggtgeo.cli.jax_flags import set_jax_flags; set_jax_flags(); import jax, os; "
         "print(jax.numpy.ones(1).dtype, jax.config.jax_compilation_cache_dir, "
-        "jax.config.jax_persistent_cache_min_compile_time_secs)"
+        "jax.config.jax_persistent_cache_min_compile_time_secs, os.environ['XLA_PYTHON_CLIENT_PREALLOCATE'])"
     )
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
-    for name in ("JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR"):
+    for name in ("JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "XLA_PYTHON_CLIENT_PREALLOCATE"):
         environment.pop(name, None)
     command = [sys.executable, "-c", script]
     result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
-    assert result.stdout.split() == ["float64", str(tmp_path / "vggtgeo" / "jax"), "0.5"]
+    assert result.stdout.split() == ["float64", str(tmp_path / "vggtgeo" / "jax"), "0.5", "false"]
 
 
 def test_no_cache_where_none_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,11 +8,13 @@ SHORTEST_CACHED_COMPILATION = 0.5
 
 
 def set_jax_flags() -> None:
-    """64-bit numbers, and compiled code kept between runs; a setting of the user's environment wins.
+    """64-bit numbers, compiled code kept between runs, and memory of a GPU taken as needed, not three quarters at once:
+    the networks of onnxruntime share it. A setting of the user's environment wins.
 
     Settings go through environment variables, which JAX reads when it is imported: most of `--help` never does.
     """
     os.environ.setdefault("JAX_ENABLE_X64", "1")
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     folder = cache_folder()
     if folder is not None:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
