@@ -134,10 +134,13 @@ def test_a_checkpoint_of_another_network_is_refused(checkouts: Path, tmp_path: P
     torch.save({"state_dict": {"layer.weight": torch.zeros(3)}}, saved)
     text = tmp_path / "text.pth"
     text.write_text("no checkpoint")
+    other = tmp_path / "model.safetensors"
+    other.touch()
     for network, checkpoint, words in (
         ("mlsd", saved, r"missing: .*\.\.\.; 1 superfluous: layer\.weight"),
         ("mlsd", text, "cannot be read as a PyTorch checkpoint"),
         ("mlsd", tmp_path / "none.pth", "no such file"),
+        ("mlsd", other, "safetensors"),
         ("moge2", saved, "`model_config`"),
         ("vggt", saved, "`--variant` test"),
     ):

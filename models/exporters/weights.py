@@ -28,6 +28,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     expected = "expected the published weights, a .pt or .pth file that torch.save wrote"
     if not path.is_file():
         raise ExportError(f"`--checkpoint` {path}: no such file; {expected}")
+    if path.suffix == ".safetensors":
+        raise ExportError(f"`--checkpoint` {path} is a safetensors file, often with other names of weights; {expected}")
     try:
         # some checkpoints keep their training options beside the weights
         with torch.serialization.safe_globals([argparse.Namespace]), warnings.catch_warnings():

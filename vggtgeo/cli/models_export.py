@@ -27,6 +27,10 @@ def export(
     tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None,
     variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Attention and perceptrons in float16.")] = False,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Largest difference from PyTorch; 0.001, or 0.03 with --half.", show_default=False),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Write the network NAME as an ONNX file and compare it with PyTorch."""
@@ -41,7 +45,7 @@ def export(
         request = recipe.request(source, checkpoint, height, width, views, tokens, variant, half)
         from vggtgeo.models.exporters.export import export as write
 
-        report = write(recipe, request, output, lambda stage: typer.echo(f"{stage} ...", err=True))
+        report = write(recipe, request, output, lambda stage: typer.echo(f"{stage} ...", err=True), tolerance)
     except ExportError as error:
         raise InputError(str(error)) from error
     if as_json:
