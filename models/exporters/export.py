@@ -117,7 +117,7 @@ def _write(
     tolerance: float,
     say: Callable[[str], None],
 ) -> tuple[_Expected, int, float]:
-    """Build, compare with the published code, and write. On return the torch module is gone from memory."""
+    """Build, compare with the published code, and write. On return the torch module's weights are gone from memory."""
     say(f"building {recipe.network} ({request.variant}) from {request.source}")
     graph = recipe.build(request)
     names = _output_names(recipe.network, graph)
@@ -126,9 +126,7 @@ def _write(
     rewrite = _compare("the changed module", values, graph.published, tolerance)
     say("exporting")
     parameters = _save(graph, names, path, properties)
-    del graph.module.network
-    gc.collect()
-    _return_memory()
+    _free(graph.module)
     return _Expected(graph.inputs, values), parameters, rewrite
 
 
@@ -286,7 +284,17 @@ def _quiet() -> Iterator[None]:
         logging.disable(previous)
 
 
-def _return_memory() -> None:
-    """Hand freed memory back to the system before onnxruntime takes as much again (glibc keeps it otherwise)."""
+def _free(module: Any) -> None:
+    """Give the memory of a module's weights back before onnxruntime takes as much again.
+
+    torch and its exporter keep tensors of what they exported, so all that share the weights' memory are emptied; and
+    glibc keeps what was freed.
+    """
+    torch = load("torch")
+    weights = {tensor.untyped_storage().data_ptr() for tensor in (*module.parameters(), *module.buffers())}
+    for tensor in [item for item in gc.get_objects() if type(item) in (torch.Tensor, torch.nn.Parameter)]:
+        if not tensor.is_meta and tensor.layout is torch.strided and tensor.untyped_storage().data_ptr() in weights:
+            tensor.data = tensor.new_empty(0)
+    gc.collect()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)

@@ -13,11 +13,11 @@ def as_module(network: Any, forward: Callable[..., Any]) -> Any:
     base: Any = load("torch").nn.Module
 
     class Wrapped(base):
-        def __init__(self) -> None:
+        def __init__(self, owned: Any) -> None:  # an argument: a class that knows the network would outlive it
             super().__init__()
-            self.network = network
+            self.network = owned
 
         def forward(self, *inputs: Any) -> Any:
             return forward(self.network, *inputs)
 
-    return Wrapped().eval()
+    return Wrapped(network).eval()
