@@ -10,7 +10,7 @@ from vggtgeo.paper_bench.courses import Course
 from vggtgeo.paper_bench.variants import FULL, VARIANTS
 
 TABLE_6 = (FULL, "A", "B", "C", "D")
-OURS = ("pnp", "window-5", "window-15", "huber", "square", "formula", "text", "global")
+OURS = ("pnp", "window-5", "window-15", "huber", "square", "alpha", "formula", "text", "global")
 
 
 @dataclass(frozen=True)
@@ -102,14 +102,18 @@ def _paper(name: str, office: Course, hall: Course, corridor: Course, seeds: int
     return Plan(name, groups)
 
 
-_QUICK_OFFICE = Course("office", 150, 8.0)
-_QUICK_HALL = Course("hall", 120, 8.0, keyframe_distance=0.2)
-_LONG_CORRIDOR = Course("corridor", 520, 8.0, keyframe_distance=0.3, keyframe_angle=8.0)
+_QUICK_OFFICE = Course("office", 100, 6.0, keyframe_distance=0.2, keyframe_angle=7.0)
+_QUICK_HALL = Course("hall", 80, 5.0, keyframe_distance=0.3, keyframe_angle=7.0)
+_LONG_CORRIDOR = Course("corridor", 380, 6.0, keyframe_distance=0.4, keyframe_angle=10.0)
 
 PLANS: dict[str, Plan] = {
+    # To see the machinery in a minute; walks of 1.5 m prove nothing.
     "small": Plan(
         "small",
-        (Group(Course("office", 24, 8.0, (160, 120), key_points=300), (FULL, "B", "C"), 2),),
+        (
+            Group(Course("room", 12, 4.0, (160, 120), key_points=300, keyframe_distance=0.1), (FULL, "A", "C"), 2),
+            Group(Course("corridor", 12, 8.0, (160, 120), key_points=300), (FULL, "A", "C"), 2),
+        ),
     ),
     "quick": _paper("quick", _QUICK_OFFICE, _QUICK_HALL, _LONG_CORRIDOR, seeds=5, ours=3),
     "full": _paper(

@@ -20,6 +20,13 @@ _Change = Callable[[SlamSettings], SlamSettings]
 _Start = Callable[[SimulatedVggt], InitialGeometry]
 
 
+_GAIN = 4.0
+"""Weight of a match of full confidence, 1/px^2: the simulated matcher is then within 0.5 px."""
+_DEPTH_WEIGHT = 0.05
+"""A network's depth errs smoothly: the some 400 slots of a keyframe share about ten independent errors, so each of them
+carries a fortieth of the weight that a depth camera's pixel would, 2.0."""
+
+
 def _same(settings: SlamSettings) -> SlamSettings:
     return settings
 
@@ -42,6 +49,8 @@ class Variant:
         base = SlamSettings(
             keyframe_distance=course.keyframe_distance,
             keyframe_angle=math.radians(course.keyframe_angle),
+            confidence_gain=_GAIN,
+            depth_weight=_DEPTH_WEIGHT,
             global_adjustment=False,
         )
         return self.change(base)
@@ -63,6 +72,7 @@ VARIANTS: dict[str, Variant] = {
         Variant("window-15", "window of 15 keyframes", lambda s: replace(s, window=15)),
         Variant("huber", "Huber kernel, 1.5 px (the paper)", lambda s: replace(s, kernel=Huber(jnp.asarray(1.5)))),
         Variant("square", "no robust kernel", lambda s: replace(s, kernel=Square())),
+        Variant("alpha", "depth prior of every slot x 2.0 (the paper)", lambda s: replace(s, depth_weight=2.0)),
         Variant("formula", "depth prior x Omega (the paper's formula)", lambda s: replace(s, depth_trust="saliency")),
         Variant("text", "depth prior x (1 - Omega) (its text)", lambda s: replace(s, depth_trust="complement")),
         Variant("global", "one adjustment of the whole map at the end", lambda s: replace(s, global_adjustment=True)),

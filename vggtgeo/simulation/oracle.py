@@ -39,6 +39,7 @@ class _Known:
     view: View
     texture: np.ndarray
     farthest: np.ndarray
+    edges: list[VisibleEdges]  # empty until they are asked for, which most frames never are
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,7 @@ class SimulatedOracle:
     kept: int = _KEPT_FRAMES
     _given: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
     _cache: OrderedDict[int, _Known] = field(default_factory=OrderedDict, repr=False)
+    _poses: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
 
     @property
     def name(self) -> str:
@@ -100,7 +102,9 @@ class SimulatedOracle:
 
     def pose(self, index: int) -> np.ndarray:
         """True pose, world -> camera, float64 [4, 4]."""
-        return self.sequence.pose(index)
+        if index not in self._poses:
+            self._poses[index] = self.sequence.pose(index)
+        return self._poses[index].copy()
 
     def depth(self, index: int) -> np.ndarray:
         """True depth float64 [H, W], metres, NaN = none."""
@@ -116,7 +120,10 @@ class SimulatedOracle:
 
     def edges(self, index: int) -> VisibleEdges:
         """Visible parts of the scene's straight edges."""
-        return visible_edges(self.sequence.scene, self.pose(index), self.camera, self._known(index).picture)
+        known = self._known(index)
+        if not known.edges:
+            known.edges.append(visible_edges(self.sequence.scene, self.pose(index), self.camera, known.picture))
+        return known.edges[0]
 
     def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where `pixels` [n, 2] of frame i are in frame j, float64 [n, 2], and whether they are seen there, bool."""
@@ -135,7 +142,7 @@ class SimulatedOracle:
     def _learn(self, index: int) -> _Known:
         picture = self.sequence.picture(index)
         view = view_from(self.sequence.scene.surfaces, self.pose(index))
-        return _Known(picture, view, texture_strength(picture), farthest_depth(picture))
+        return _Known(picture, view, texture_strength(picture), farthest_depth(picture), [])
 
 
 def _fingerprint(image: np.ndarray) -> tuple[int, int]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
 
 import jax.numpy as jnp
 
@@ -88,9 +87,9 @@ class SlamSettings:
     """Weight of a match: `gain * confidence + floor`."""
     depth_weight: float = 2.0
     """The paper's alpha; 0 switches the depth prior off."""
-    depth_trust: Literal["own", "saliency", "complement"] = "own"
-    """What scales the depth prior of a pixel: the confidence of the depth itself; the saliency Omega that weights the
-    matches, as in the paper's formula; or 1 - Omega, as the paper's text describes it."""
+    depth_trust: str = "own"
+    """What scales the depth prior of a pixel. "own": the confidence of the depth itself; "saliency": the Omega that
+    weights the matches, as in the paper's formula; "complement": 1 - Omega, as the paper's text describes it."""
     known_intrinsics_sigma: float = 0.01
     """Standard deviation of the prior on known intrinsics, relative to the focal length."""
     guessed_intrinsics_sigma: float = 0.3
