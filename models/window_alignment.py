@@ -9,6 +9,9 @@ import numpy as np
 from vggtgeo.models.checks import check_array
 from vggtgeo.models.roles import WindowGuess
 
+_ENOUGH_PIXELS = 5000
+"""Of one view, for its scale."""
+
 
 def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray] = ()) -> WindowGuess | None:
     """The window in the world in which `poses` are, with metric translations and depths; None if that is undetermined.
@@ -56,9 +59,14 @@ def _depth_scale(guess: WindowGuess, depths: Sequence[np.ndarray], use: np.ndarr
     ratios, weights = [], []
     for view in use[use < len(depths)]:
         check_array("depths", depths[view], guess.depth.shape[1:], finite=False)
-        both = (guess.depth[view] > 0) & (depths[view] > 0)
-        ratios.append(depths[view][both] / guess.depth[view][both])
-        weights.append(guess.confidence[view][both])
+        # A median of some thousand pixels is that of all.
+        step = max(1, int(np.sqrt(depths[view].size / _ENOUGH_PIXELS)))
+        own, known, confidence = (
+            image[::step, ::step] for image in (guess.depth[view], depths[view], guess.confidence[view])
+        )
+        both = (own > 0) & (known > 0)
+        ratios.append(known[both] / own[both])
+        weights.append(confidence[both])
     if not ratios:
         return None
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)

@@ -158,3 +158,22 @@ def test_depth_of_a_straight_edge() -> None:
     expected = 1.0 / (0.4 + 0.002 * ends[..., 0] - 0.001 * ends[..., 1])
     np.testing.assert_allclose(found[:2], expected[:2], rtol=0.01)
     assert np.isnan(found[2]).all()
+
+
+def test_depth_of_segments_on_a_slanted_floor_is_not_too_near() -> None:
+    # Proves that the search for the foremost surface does not bias depth on a plane seen at a grazing angle, where
+    # neighbouring pixels differ by up to 6 %, nor under noise. Oracle: the plane 0.3 m / (row - 8) * f, to 0.3 % in
+    # the mean of segments that cross it in all directions (the nearest of 3 x 3 pixels is off by over 2 %).
+    rng = np.random.default_rng(0)
+    rows = np.arange(24, 120, dtype=float)
+    plane = np.tile((90.0 / (rows - 8.0))[:, None], (1, 160))
+    middle = rng.uniform([50, 30], [110, 65], (200, 2))
+    angle = rng.uniform(0, 2 * np.pi, 200)
+    way = 25.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ends = np.stack([middle - way, middle + way], axis=1)
+    truth = 90.0 / (ends[..., 1] + 24.0 - 8.0)
+    for noise in (0.0, 0.01):
+        found = segment_depths(ends, plane * np.exp(noise * rng.standard_normal(plane.shape)))
+        off = np.log(found / truth)
+        assert np.isfinite(off).mean() > 0.9
+        assert abs(np.nanmean(off)) < 0.003, f"{noise=}: mean log error {np.nanmean(off):.4f}"

@@ -102,9 +102,9 @@ def _paper(name: str, office: Course, hall: Course, corridor: Course, seeds: int
     return Plan(name, groups)
 
 
-_QUICK_OFFICE = Course("office", 100, 6.0, keyframe_distance=0.2, keyframe_angle=7.0)
-_QUICK_HALL = Course("hall", 80, 5.0, keyframe_distance=0.3, keyframe_angle=7.0)
-_LONG_CORRIDOR = Course("corridor", 380, 6.0, keyframe_distance=0.4, keyframe_angle=10.0)
+_QUICK_OFFICE = Course("office", 80, 6.0, keyframe_distance=0.2, keyframe_angle=7.0)
+_QUICK_HALL = Course("hall", 60, 5.0, keyframe_distance=0.3, keyframe_angle=7.0)
+_LONG_CORRIDOR = Course("corridor", 380, 6.0, key_points=600, keyframe_distance=0.5, keyframe_angle=12.0)
 
 PLANS: dict[str, Plan] = {
     # To see the machinery in a minute; walks of 1.5 m prove nothing.

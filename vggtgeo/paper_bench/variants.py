@@ -20,8 +20,12 @@ _Change = Callable[[SlamSettings], SlamSettings]
 _Start = Callable[[SimulatedVggt], InitialGeometry]
 
 
-_GAIN = 4.0
-"""Weight of a match of full confidence, 1/px^2: the simulated matcher is then within 0.5 px."""
+_GAIN, _FLOOR = 4.0, 0.5
+"""Weight of a match, `gain * confidence * Omega + floor`, 1/px^2: close to one over the variance that the simulated
+matcher states, from 0.5 px on good texture to 1 px on none."""
+_LINE_WEIGHT = 0.1
+"""A matched segment is two measurements, its ends, of 0.7 px, and so is its host in all its views: shared out over some
+ten samples."""
 _DEPTH_WEIGHT = 0.05
 """A network's depth errs smoothly: the some 400 slots of a keyframe share about ten independent errors, so each of them
 carries a fortieth of the weight that a depth camera's pixel would, 2.0."""
@@ -50,6 +54,8 @@ class Variant:
             keyframe_distance=course.keyframe_distance,
             keyframe_angle=math.radians(course.keyframe_angle),
             confidence_gain=_GAIN,
+            confidence_floor=_FLOOR,
+            line_weight=_LINE_WEIGHT,
             depth_weight=_DEPTH_WEIGHT,
             global_adjustment=False,
         )
