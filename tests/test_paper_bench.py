@@ -98,7 +98,7 @@ def test_tables_hold_means_and_standard_deviations() -> None:
         (result("full", 0, 2.0), result("full", 1, 4.0), result("C", 0, 5.0), result("C", 1, 9.0)),
     )
     text = report.markdown()
-    assert "| office | full system | 2 | 3.00 +- 1.41 |  |  | 0.30 +- 0.00 | 5.00 +- 0.00 |" in text
+    assert "| office | full system | 2 | 3.00 +- 1.41 |  |  | 0.80 +- 0.00 |  | 0.30 +- 0.00 | 5.00 +- 0.00 |" in text
     assert "| office | C: without lines | 2 | 7.00 +- 2.83 | 4.00 +- 1.41 | 2.33 |" in text
     assert text.count("imulated") >= 3
     rows = list(csv.DictReader(io.StringIO(report.csv())))

@@ -4,6 +4,7 @@ from vggtgeo.models.classical.depth import NoDepth, SensorDepth
 from vggtgeo.models.classical.line_detector import LsdDetector
 from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
 from vggtgeo.models.classical.line_matcher import BandLineMatcher
+from vggtgeo.models.classical.manhattan import ManhattanEstimator, ManhattanView, nearest_frame
 from vggtgeo.models.classical.orb import OrbMatcher
 from vggtgeo.models.classical.pnp import ConstantVelocity, PnpGeometry
 from vggtgeo.models.classical.sift import SiftMatcher
@@ -17,6 +18,8 @@ __all__ = [
     "ConstantVelocity",
     "EpipolarVerifier",
     "LsdDetector",
+    "ManhattanEstimator",
+    "ManhattanView",
     "NoDepth",
     "OrbMatcher",
     "PatchAlignment",
@@ -26,6 +29,7 @@ __all__ = [
     "StructureTensor",
     "TwoViewStart",
     "line_coefficients",
+    "nearest_frame",
     "sample_segments",
     "segment_depths",
 ]

@@ -99,7 +99,10 @@ def _accuracy(results: Sequence[Result], scenes: Sequence[str]) -> str:
 
 def _comparison(results: Sequence[Result], scenes: Sequence[str], variants: Sequence[str]) -> str:
     """ATE of each variant, and by how much it is worse than the full system on the same seeds."""
-    head = ("scene", "variant", "seeds", "ATE cm", "worse than full by cm", "times", "RRE deg/s", "depth RMSE cm")
+    head = (
+        *("scene", "variant", "seeds", "ATE cm", "worse than full by cm", "times"),
+        *("ATE Sim(3) cm", "worse than full by cm", "RRE deg/s", "depth RMSE cm"),
+    )
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for scene in scenes:
         if not any(select(results, scene, key) for key in variants if key != FULL):
@@ -121,6 +124,8 @@ def _comparison_row(results: Sequence[Result], own: Sequence[Result], scene: str
         *(scene, VARIANTS[key].title, str(len(own)), cell(values(own, ATE))),
         "" if key == FULL else cell(difference),
         ratio,
+        cell(values(own, COLUMNS[1])),
+        "" if key == FULL else cell(paired(results, scene, key, COLUMNS[1])),
         cell(values(own, COLUMNS[3])),
         cell(values(own, COLUMNS[4])),
     ]

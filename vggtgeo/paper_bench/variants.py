@@ -39,6 +39,11 @@ def _window_start(vggt: SimulatedVggt) -> InitialGeometry:
     return WindowLocator(vggt, PnpGeometry())
 
 
+def _adjusted_at_the_end(settings: SlamSettings) -> SlamSettings:
+    # Surfaces are aligned with the noise of a depth camera, which the depth of a network does not have.
+    return replace(settings, global_adjustment=True, surface_points=0.0)
+
+
 @dataclass(frozen=True)
 class Variant:
     """One row of a table. change: of the settings. start: how a new frame's pose starts, given the simulated VGGT."""
@@ -74,14 +79,20 @@ VARIANTS: dict[str, Variant] = {
         Variant("C", "C: without lines", lambda s: replace(s, use_lines=False)),
         Variant("D", "D: constant-velocity start", start=lambda vggt: ConstantVelocity()),
         Variant("pnp", "start from PnP alone", start=lambda vggt: PnpGeometry()),
+        Variant("manhattan", "rotations from vanishing directions", lambda s: replace(s, manhattan=True)),
         Variant("window-5", "window of 5 keyframes", lambda s: replace(s, window=5)),
         Variant("window-15", "window of 15 keyframes", lambda s: replace(s, window=15)),
         Variant("huber", "Huber kernel, 1.5 px (the paper)", lambda s: replace(s, kernel=Huber(jnp.asarray(1.5)))),
+        Variant(
+            "huber-B",
+            "Huber kernel, without confidence",
+            lambda s: replace(s, kernel=Huber(jnp.asarray(1.5)), use_confidence=False),
+        ),
         Variant("square", "no robust kernel", lambda s: replace(s, kernel=Square())),
         Variant("alpha", "depth prior of every slot x 2.0 (the paper)", lambda s: replace(s, depth_weight=2.0)),
         Variant("formula", "depth prior x Omega (the paper's formula)", lambda s: replace(s, depth_trust="saliency")),
         Variant("text", "depth prior x (1 - Omega) (its text)", lambda s: replace(s, depth_trust="complement")),
-        Variant("global", "one adjustment of the whole map at the end", lambda s: replace(s, global_adjustment=True)),
+        Variant("global", "one adjustment of the whole map at the end", _adjusted_at_the_end),
         # A line carried by two inverse depths instead of one for each sample belongs here once `SlamSettings` has it.
     )
 }

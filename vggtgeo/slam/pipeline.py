@@ -12,6 +12,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam import rigid
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.keyframe import make_keyframe
+from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import start_without_depth
 from vggtgeo.slam.state import FramePose, Slam
@@ -55,6 +56,7 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
         prior=None,
         solved=None,
         origins=(*slam.origins, number),
+        axes=(),
         frames=(*slam.frames, record),
         velocity=np.eye(4),
         lost=0,
@@ -79,7 +81,7 @@ def _follow(slam: Slam, frame: Frame, features: Features, roles: Roles, settings
     with clock.measure("keyframe"):
         keyframe = make_keyframe(number, frame, pose, features, roles, settings, slam.intrinsics)
     with clock.measure("match keyframes"):
-        slam = enter(slam, keyframe, roles, settings)
+        slam = constrain_rotation(enter(slam, keyframe, roles, settings), settings)
     with clock.measure("adjust window"):
         slam = adjust(slam, settings)
     arrival = (found.keyframe.number, pose @ rigid.invert(found.keyframe.pose))

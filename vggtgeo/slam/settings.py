@@ -81,6 +81,8 @@ class SlamSettings:
     use_lines: bool = True
     line_weight: float = 0.25
     """Weight of one line sample against one point: neighbouring samples share their segment's error."""
+    manhattan: bool = False
+    """Measure each keyframe's rotation from lines along three perpendicular directions, where they agree on them."""
     use_confidence: bool = True
     confidence_gain: float = 1.0
     confidence_floor: float = 0.1

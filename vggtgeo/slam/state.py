@@ -51,7 +51,8 @@ class Slam:
     solved: the last window problem and its solution. energies: `1/2 sum rho` of that window before its first and after
     each iteration. frames: every frame's pose. velocity: last motion from frame to
     frame, camera -> camera. waiting: frames before the start of an RGB sequence. lost: frames since tracking was lost.
-    metric: whether lengths are metres. notes: what the user should know.
+    metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
+    world), as the first keyframes saw them. notes: what the user should know.
     """
 
     intrinsics: np.ndarray
@@ -69,6 +70,7 @@ class Slam:
     waiting: tuple[Waiting, ...] = ()
     lost: int = 0
     origins: tuple[int, ...] = ()
+    axes: tuple[np.ndarray, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
