@@ -23,9 +23,9 @@ _Start = Callable[[SimulatedVggt], InitialGeometry]
 _GAIN, _FLOOR = 4.0, 0.5
 """Weight of a match, `gain * confidence * Omega + floor`, 1/px^2: close to one over the variance that the simulated
 matcher states, from 0.5 px on good texture to 1 px on none."""
-_LINE_WEIGHT = 0.1
-"""A matched segment is two measurements, its ends, of 0.7 px, and so is its host in all its views: shared out over some
-ten samples."""
+_LINE_WEIGHT = 0.02
+"""A matched segment is two measurements, its ends, of 0.7 px each. The host's own error comes back in each of its some
+six views, and every match counts in both directions: 2 / (0.7^2 * 7 * 2), shared out over some ten samples."""
 _DEPTH_WEIGHT = 0.05
 """A network's depth errs smoothly: the some 400 slots of a keyframe share about ten independent errors, so each of them
 carries a fortieth of the weight that a depth camera's pixel would, 2.0."""
