@@ -10,7 +10,10 @@ from vggtgeo.paper_bench.courses import Course
 from vggtgeo.paper_bench.variants import FULL, VARIANTS
 
 TABLE_6 = (FULL, "A", "B", "C", "D")
-OURS = ("pnp", "window-5", "window-15", "huber", "square", "alpha", "formula", "text", "global")
+OURS = (
+    *("pnp", "window-5", "window-15", "huber", "huber-B", "square", "alpha", "formula", "text"),
+    *("heavy-lines", "manhattan", "global"),
+)
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,7 @@ class Plan:
         if variants is not None:
             wanted = _known("variants", variants, [key for group in groups for key in group.variants])
             groups = tuple(replace(g, variants=tuple(key for key in g.variants if key in wanted)) for g in groups)
+            groups = tuple(group for group in groups if group.variants)
         if seeds is not None:
             if seeds < 1:
                 raise InputError(f"`seeds` is {seeds}; it must be at least 1")
@@ -97,6 +101,7 @@ def _paper(name: str, office: Course, hall: Course, corridor: Course, seeds: int
         Group(hall, (FULL,), seeds),
         Group(corridor, TABLE_6, seeds),
         Group(office, (FULL, *OURS), ours),
+        Group(corridor, (FULL, "manhattan"), ours),
     )
     assert all(key in VARIANTS for group in groups for key in group.variants)
     return Plan(name, groups)

@@ -79,6 +79,7 @@ VARIANTS: dict[str, Variant] = {
         Variant("C", "C: without lines", lambda s: replace(s, use_lines=False)),
         Variant("D", "D: constant-velocity start", start=lambda vggt: ConstantVelocity()),
         Variant("pnp", "start from PnP alone", start=lambda vggt: PnpGeometry()),
+        Variant("heavy-lines", "lines x 5", lambda s: replace(s, line_weight=5 * s.line_weight)),
         Variant("manhattan", "rotations from vanishing directions", lambda s: replace(s, manhattan=True)),
         Variant("window-5", "window of 5 keyframes", lambda s: replace(s, window=5)),
         Variant("window-15", "window of 15 keyframes", lambda s: replace(s, window=15)),
