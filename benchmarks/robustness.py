@@ -62,6 +62,13 @@ def main() -> None:
             solver = vg.SchurLevenbergMarquardt(max_iterations=ITERATIONS, **flags)
             lines.append(_row(f"{name}, {label}", problems, KERNELS[name](), solver, None))
             print(lines[-1], flush=True)
+    lines += ["", _header("lines")]
+    for label, ends in (("a depth a sample", False), ("two ends", True)):
+        for name in ("Huber", "Cauchy"):
+            solver = vg.SchurLevenbergMarquardt(max_iterations=ITERATIONS)
+            chosen = _problems(options, ends) if ends else problems
+            lines.append(_row(f"{name}, {label}", chosen, KERNELS[name](), solver, None))
+            print(lines[-1], flush=True)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "robustness.md").write_text("\n".join(lines) + "\n")
 
@@ -75,7 +82,7 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _problems(options: argparse.Namespace) -> Problems:
+def _problems(options: argparse.Namespace, two_ends: bool = False) -> Problems:
     """`(problem, initial, true poses)` of each seed, by kind and share."""
     spec = importlib.util.spec_from_file_location("problems", options.bench / "problems.py")
     if spec is None or spec.loader is None or not (options.bench / "problems.py").is_file():
@@ -89,12 +96,20 @@ def _problems(options: argparse.Namespace) -> Problems:
         for share in SHARES:
             found[kind, share] = []
             for seed in range(options.seeds):
-                path = folder / f"{options.size}-{how}-{share}-{seed}.npz"
+                path = folder / f"{options.size}-{how}-{share}-{seed}{'-ends' * two_ends}.npz"
                 if not path.exists():
-                    np.savez(path, **generator.generate(options.size, seed, how, share))
+                    arrays = generator.generate(options.size, seed, how, share)
+                    np.savez(path, **arrays, **({"var_segment": _segments(arrays)} if two_ends else {}))
                 problem, initial, _ = vg.load_problem(path)
                 found[kind, share].append((problem, initial, np.load(path)["T_gt"]))
     return found
+
+
+def _segments(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Segment of each landmark: after the points come line samples, by keyframe, segment and sample."""
+    keyframes, points, segments, samples = arrays["sizes"]
+    number = np.repeat(np.arange(keyframes * segments), samples)
+    return np.concatenate([np.full(keyframes * points, -1), number])
 
 
 def _header(first: str) -> str:

@@ -32,7 +32,7 @@ class Graduation(eqx.Module):
 
         def stage(state: State, factor: Float[Array, ""]) -> tuple[State, None]:
             wide = eqx.tree_at(lambda p: p.kernel, problem, problem.kernel.widened(factor))
-            found = optx.least_squares(
+            found: optx.Solution = optx.least_squares(
                 lambda point, ba: ba.energy(point),
                 brief,
                 state,

@@ -46,17 +46,17 @@ def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
         raise InputError(
             f"`segment` is {segment[first]} for a line sample; give every sample a segment, from 0, or none"
         )
-    numbers, first, inverse = np.unique(segment, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(segment, return_index=True, return_inverse=True)
     wrong = host != host[first][inverse]
     if np.any(wrong):
         raise InputError(
             f"`segment` {segment[wrong][0]} has samples hosted in two keyframes; number segments by keyframe"
         )
     owner = host[first]
-    rank = np.zeros(len(numbers), int)
+    rank = np.zeros(len(first), int)
     order = np.lexsort((first, owner))
     starts = np.searchsorted(owner[order], owner[order])
-    rank[order] = np.arange(len(numbers)) - starts
+    rank[order] = np.arange(len(first)) - starts
     by_segment = np.argsort(inverse, kind="stable")
     begin = np.searchsorted(inverse[by_segment], inverse[by_segment])
     position = np.empty(len(segment), int)

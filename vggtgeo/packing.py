@@ -191,9 +191,9 @@ def pack(
     needed = PaddedSize(len(poses), slots.points, slots.lines, ranks, len(edges), slots.samples)
     size = size or needed
     _check_size(size, needed)
-    lines = slots.index.slot >= slots.points
+    lines = slots.where.slot >= slots.points
     index = SlotIndex(
-        slots.index.host, np.where(lines, slots.index.slot - slots.points + size.points, slots.index.slot)
+        slots.where.host, np.where(lines, slots.where.slot - slots.points + size.points, slots.where.slot)
     )
     graph, position = _pad_edges(edges, size)
     row = position[order]
@@ -286,7 +286,7 @@ def _scatter(at: tuple[np.ndarray, np.ndarray], values: np.ndarray, shape: tuple
 class _Slots(NamedTuple):
     """Slot of each landmark (lines after `points` of them), and the largest numbers of slots a host."""
 
-    index: SlotIndex
+    where: SlotIndex
     points: int
     lines: int
     samples: int | None

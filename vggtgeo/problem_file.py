@@ -61,6 +61,7 @@ def load_problem(path: Path, dtype: DTypeLike = np.float64) -> tuple[Problem, St
         depth_sigma=arrays["d_sigma"],
         depth_weight=arrays["d_weight"],
         alpha=float(arrays["alpha"]),
+        segment=arrays["var_segment"].astype(int) if "var_segment" in arrays else None,
     )
     if not arrays["huber"] > 0:
         raise InputError(f"array `huber` of `{path}` is {arrays['huber']}; it must be positive")

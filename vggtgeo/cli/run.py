@@ -15,7 +15,7 @@ import typer
 
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.cli.view import serve_until_interrupted
-from vggtgeo.errors import InputWarning
+from vggtgeo.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
     from vggtgeo.cli.presets import Perception
