@@ -34,6 +34,7 @@ def result(variant: str, seed: int, ate_cm: float, scene: str = "office") -> Res
     return Result(scene, variant, seed, replace(ERRORS, ate_m=ate_cm / 100))
 
 
+@pytest.mark.slow  # 30 s of compilation; notebooks/evaluate.ipynb runs the same path in the quick suite
 def test_two_runs_from_start_to_tables(tiny: None, tmp_path: Path) -> None:
     # Proves that the stubs, the pipeline and the metrics fit together, and that a second call runs nothing.
     # Oracle: a run without lines gives other numbers; stored files that do not change; a trajectory within 5 cm.
