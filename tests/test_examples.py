@@ -10,8 +10,8 @@ import pytest
 
 import vggtgeo as vg
 
-WITHOUT = {"ArrowAdjoint", "Problem", "SchurLevenbergMarquardt", "State"}
-"""Arguments and results of other names, shown by the examples of those."""
+WITHOUT = {"ArrowAdjoint", "BenchReport", "Problem", "SchurLevenbergMarquardt", "State", "bench"}
+"""Arguments and results of other names, shown by the examples of those; and `bench`, which takes minutes."""
 
 
 @pytest.fixture(scope="module")

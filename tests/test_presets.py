@@ -28,7 +28,7 @@ from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.run import frame_trajectory, run
 from vggtgeo.slam.settings import Roles, SlamSettings
 
-RUN_AND_WRITE = "vggtgeo.cli.run"
+RUN_AND_WRITE = "vggtgeo.cli.run_sequence"
 """The module from which the command takes `run_and_write`."""
 EXPORTS = "VGGTGEO_EXPORTS"
 SIZE = (192, 256)

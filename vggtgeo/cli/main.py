@@ -80,11 +80,17 @@ COMMANDS = (
         "Render a hand-held walk through SCENE as a TUM RGB-D folder with exact truth.",
         ("vggtgeo simulate office -o data/office --frames 300 --blur 0.01",),
     ),
-    CommandEntry("models", "vggtgeo.cli.models", "List, check, fetch and export the networks of the roles."),
+    CommandEntry(
+        "models",
+        "vggtgeo.cli.models",
+        "List, check, fetch and export the networks of the roles.",
+        ("vggtgeo models list  # what each is for, its licence, and whether its file is there",),
+    ),
     CommandEntry(
         "bench",
         "vggtgeo.cli.bench",
         "Run the comparisons of the paper with simulated roles in rendered worlds, and print their tables.",
+        ("vggtgeo bench paper --help  # what it compares, and for how long",),
     ),
 )
 START = (
@@ -124,6 +130,7 @@ def load_command(entry: CommandEntry) -> Any:
     function = getattr(importlib.import_module(entry.module), entry.name.replace("-", "_"))
     if isinstance(function, typer.Typer):  # a group of commands
         function.info.name = entry.name
+        function.info.epilog = _examples(entry.examples)
         return typer.main.get_command(function)
     single = typer.Typer(add_completion=False)
     single.command(entry.name, epilog=_examples(entry.examples))(function)

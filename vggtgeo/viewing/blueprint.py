@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-import rerun.blueprint as rrb
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
 
 ORIGINS = (
     *("/world", "/world/camera/image", "/keyframe/image", "/keyframe/depth", "/keyframe/confidence", "/window"),
@@ -13,6 +17,8 @@ ORIGINS = (
 
 def blueprint() -> rrb.Blueprint:
     """The arrangement of the views; entities are those of `vggtgeo/viewing/entities.py`."""
+    import rerun.blueprint as rrb
+
     world = rrb.Spatial3DView(
         name="World: path, map, covariance ellipsoids of 20 sigma",
         origin="/world",

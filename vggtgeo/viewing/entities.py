@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
-import rerun as rr
 
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam import rigid
@@ -12,6 +13,9 @@ from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.watching import WindowRecord
 from vggtgeo.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import rerun as rr
 
 ENTITIES = (
     "/world",
@@ -47,6 +51,8 @@ _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
 def log_camera(stream: rr.RecordingStream, pose: np.ndarray, intrinsics: np.ndarray, image: np.ndarray) -> None:
     """The current frame's camera (`pose` world -> camera, float [4, 4]) with its image at half size."""
+    import rerun as rr
+
     height, width = image.shape[:2]
     to_world = rigid.invert(pose)
     fx, fy, cx, cy = (float(value) for value in intrinsics)
@@ -61,12 +67,16 @@ def log_camera(stream: rr.RecordingStream, pose: np.ndarray, intrinsics: np.ndar
 
 def log_path(stream: rr.RecordingStream, trajectory: Trajectory, keyframes: Trajectory) -> None:
     """The path through all frames so far, and the keyframes on it."""
+    import rerun as rr
+
     stream.log("world/trajectory", rr.LineStrips3D([trajectory.positions], colors=[_BLUE], radii=-1.5))
     stream.log("world/keyframes", rr.Points3D(keyframes.positions, colors=[_BLUE], radii=-4.0))
 
 
 def log_covariance(stream: rr.RecordingStream, keyframes: list[Keyframe], covariances: np.ndarray) -> None:
     """Ellipsoids of the camera centres; `covariances` [n, 6, 6] of the left tangents, translation first."""
+    import rerun as rr
+
     known = [
         (keyframe.pose, covariance)
         for keyframe, covariance in zip(keyframes, covariances, strict=True)
@@ -97,6 +107,8 @@ def ellipsoid(pose: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.
 
 def log_window(stream: rr.RecordingStream, keyframes: list[Keyframe], pairs: list[Pair]) -> None:
     """The window's keyframes and the pairs that share matches, as a graph and as lines in the world."""
+    import rerun as rr
+
     names = {keyframe.number: str(keyframe.number) for keyframe in keyframes}
     inside = [pair for pair in pairs if pair.first in names and pair.second in names]
     ids = list(names.values())
@@ -111,6 +123,8 @@ def log_window(stream: rr.RecordingStream, keyframes: list[Keyframe], pairs: lis
 
 def log_keyframe(stream: rr.RecordingStream, keyframe: Keyframe, pair: Pair | None) -> None:
     """Image, matches to the keyframe `pair` joins it with, line segments, depth and confidence of a keyframe."""
+    import rerun as rr
+
     stream.log("keyframe/image", _jpeg(keyframe.image))
     seen = np.zeros((0, 2)) if pair is None else pair.points.pixels_j
     before = np.zeros((0, 2)) if pair is None else pair.points.pixels_i
@@ -131,6 +145,8 @@ def log_keyframe(stream: rr.RecordingStream, keyframe: Keyframe, pair: Pair | No
 
 def log_points(stream: rr.RecordingStream, keyframes: list[Keyframe], intrinsics: np.ndarray) -> None:
     """The window's adjusted points, in the colours of their pixels."""
+    import rerun as rr
+
     points, colours = [], []
     for keyframe in keyframes:
         inverse = keyframe.points.inverse_depth
@@ -143,11 +159,15 @@ def log_points(stream: rr.RecordingStream, keyframes: list[Keyframe], intrinsics
 
 def log_map(stream: rr.RecordingStream, cloud: PointCloud) -> None:
     """The dense map; at all times, so that a finished recording opens with it."""
+    import rerun as rr
+
     stream.log("world/map", rr.Points3D(cloud.points, colors=cloud.colours, radii=0.011), static=True)
 
 
 def log_residuals(stream: rr.RecordingStream, record: WindowRecord) -> None:
     """RMS residual of each kind after an adjustment."""
+    import rerun as rr
+
     for name in ("points", "lines", "depth"):
         value = getattr(record, name)
         if np.isfinite(value):
@@ -156,15 +176,21 @@ def log_residuals(stream: rr.RecordingStream, record: WindowRecord) -> None:
 
 def log_tracking(stream: rr.RecordingStream, inliers: int) -> None:
     """How many points the frame was tracked with."""
+    import rerun as rr
+
     stream.log("plots/tracking/inliers", rr.Scalars(float(inliers)))
 
 
 def log_note(stream: rr.RecordingStream, text: str, level: str = "WARN") -> None:
     """A message of the run."""
+    import rerun as rr
+
     stream.log("notes", rr.TextLog(text, level=level))
 
 
 def _jpeg(image: np.ndarray) -> rr.EncodedImage:
+    import rerun as rr
+
     done, code = cv2.imencode(".jpg", image[..., ::-1], _QUALITY)
     assert done
     return rr.EncodedImage(contents=code.tobytes(), media_type="image/jpeg")

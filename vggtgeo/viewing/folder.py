@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import rerun as rr
 
 from vggtgeo.errors import InputError
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam.outputs import DEPTH_UNIT
 from vggtgeo.trajectory import Trajectory
 from vggtgeo.viewing import entities
+
+if TYPE_CHECKING:
+    import rerun as rr
 
 
 def log_folder(stream: rr.RecordingStream, folder: Path) -> None:
@@ -22,6 +25,8 @@ def log_folder(stream: rr.RecordingStream, folder: Path) -> None:
         InputError: `folder` has no `trajectory.txt`, `keyframes.txt` or `map.ply`.
 
     """
+    import rerun as rr
+
     for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
         if not (folder / name).is_file():
             raise InputError(f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote")
@@ -36,6 +41,8 @@ def log_folder(stream: rr.RecordingStream, folder: Path) -> None:
 
 
 def _log_depth(stream: rr.RecordingStream, file: Path) -> None:
+    import rerun as rr
+
     number = file.name.split(".")[0]
     stream.set_time("frame", sequence=int(number))
     stream.log("keyframe/depth", rr.DepthImage(_read(file), meter=DEPTH_UNIT, colormap="viridis"))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import numpy as np
-import rerun as rr
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.point_cloud import PointCloud
@@ -15,6 +16,9 @@ from vggtgeo.slam.watching import WindowRecorder
 from vggtgeo.uncertainty import covariances
 from vggtgeo.viewing import entities
 
+if TYPE_CHECKING:
+    import rerun as rr
+
 _covariances_jit = eqx.filter_jit(covariances)
 
 
@@ -24,6 +28,8 @@ class RerunWatcher:
     """
 
     def __init__(self, stream: rr.RecordingStream):
+        import rerun as rr
+
         self.stream = stream
         self._recorder = WindowRecorder()
         self._keyframes = self._notes = self._iterations = 0
@@ -72,6 +78,8 @@ class RerunWatcher:
         self._log_iterations(slam)
 
     def _log_iterations(self, slam: Slam) -> None:
+        import rerun as rr
+
         if slam.energies is None:
             return
         for energy in slam.energies:
