@@ -4,11 +4,11 @@
         [--iterations 10] [--rounds 5] [--cpu-devices 2] [--bench ../shared/bench] [--out runs/batches]
 
 Every window of a batch is the problem of `problems.py` from a start of its own, and takes the same number of
-iterations. Ways: *alone* (one `solve` after the other, called from Python), *in turn* (`solve_batch`, the default on a CPU),
-*in one program* (`vmap`, the default on a GPU), *shared out* (in turn on each of several devices). Rounds interleave
-the ways, and the table has the median. For *in one program* the operations and bytes that XLA counts for one iteration
-of the window are given too, a second (its counts are those of the compiled program before any cache: an upper bound of
-the traffic); `--peak-gflops` and `--peak-gbytes` turn them into fractions of a roofline.
+iterations. Ways: *alone* (one `solve` after the other, called from Python), *in turn* (`solve_batch`, the default on a
+CPU), *in one program* (`vmap`, the default on a GPU), *shared out* (in turn on each of several devices). Rounds
+interleave the ways, and the table has the median. For *in one program* the operations and bytes that XLA counts for one
+iteration of the window are given too, a second (its counts are those of the compiled program before any cache: an upper
+bound of the traffic); `--peak-gflops` and `--peak-gbytes` turn them into fractions of a roofline.
 On a GPU: `--batches 1 16 256 4096`.
 """
 
