@@ -33,10 +33,10 @@ KERNELS: dict[str, AbstractKernel] = {
 }
 ALL = [(s, k, d) for s in SOLVERS for k in KERNELS for d in ("float64", "float32")]
 COVERING = [
-    *(("band", "Huber", "float64"), ("matrix-free", "Cauchy", "float64"), ("matrix-free, band", "square", "float64")),
-    *(("dense", "Huber", "float32"), ("band", "Cauchy", "float32"), ("matrix-free", "Huber", "float32")),
+    *(("band", "Huber", "float32"), ("matrix-free", "Huber", "float64")),
+    *(("matrix-free, band", "Huber", "float64"), ("dense", "Huber", "float32")),
 ]
-"""Each solver, each precision with each solver but one; `make test-slow` runs them all."""
+"""One kernel with each solver; `make test-slow` runs them all."""
 
 
 @eqx.filter_jit

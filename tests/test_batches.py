@@ -34,7 +34,7 @@ def batch() -> tuple[Problem, State, list]:
     return pack_batch([window(scene) for scene in SCENES], intrinsics_sigma=5.0)
 
 
-@pytest.mark.parametrize("at_once", [1, 2, 3])
+@pytest.mark.parametrize("at_once", [1, pytest.param(2, marks=pytest.mark.slow), 3])
 def test_a_ragged_batch_gives_what_each_window_gives(at_once: int) -> None:
     # Proves padding to one shape, mapping and vmapping, and `gather` of every window. Oracle: `solve` of each alone,
     # packed to its own size.
@@ -53,7 +53,7 @@ def solve_alone(problem: Problem, state: State):
     return solve(problem, state, solver=SOLVER)
 
 
-@pytest.mark.parametrize("at_once", [1, 3])
+@pytest.mark.parametrize("at_once", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_gradients_of_a_batch_are_those_of_its_windows(at_once: int) -> None:
     # Proves `grad` through `solve_batch`, mapped and vmapped. Oracle: `grad` through `solve`, window by window.
     problems, states, _ = batch()

@@ -109,6 +109,7 @@ def test_graduation_finds_the_better_basin() -> None:
     assert float(graduated.energy) == pytest.approx(float(truth.energy), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_graduation_has_the_derivative_of_the_optimum() -> None:
     # Proves that the way to the optimum adds nothing to its derivative, held pose included. Oracle: the same without.
     problem, state, _ = make_scene(noise=0.5, seed=7).pack()
