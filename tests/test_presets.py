@@ -219,10 +219,11 @@ def _whole_run(folder: Path, models: Path, size: tuple[int, int]) -> dict:
 
 @pytest.mark.slow
 def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
-    # Proves that `vggtgeo run --preset paper` writes every output, and the warning into its summary.
+    # Proves that `vggtgeo run --preset paper` writes every output, and the warning into its summary and its page.
     summary = _whole_run(tmp_path, files, SIZE[::-1])
     assert summary["frames"] == 10
     assert "this result means nothing" in summary["meaningless"]
+    assert "this result means nothing" in (tmp_path / "run" / "report.html").read_text()
 
 
 def _exports() -> Path:

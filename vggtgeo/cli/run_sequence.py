@@ -102,7 +102,7 @@ def run_and_write(
         cloud=cloud,
         records=recorder.records,
         summary={**summary, "settings": flags},
-        warnings=said,
+        warnings=[*([facts["meaningless"]] if "meaningless" in facts else []), *said],
     )
     _print_report(console, slam, report, folder, fold.frames_per_second, len(cloud))
     return Finished(slam, fold.interrupted)
