@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
-
+from typing import Any
 
 ORIGINS = (
     *("/world", "/world/camera/image", "/keyframe/image", "/keyframe/depth", "/keyframe/confidence", "/window"),
@@ -15,7 +11,7 @@ ORIGINS = (
 """Where the views look."""
 
 
-def blueprint() -> rrb.Blueprint:
+def blueprint() -> Any:
     """The arrangement of the views; entities are those of `vggtgeo/viewing/entities.py`."""
     import rerun.blueprint as rrb
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,9 +13,6 @@ from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.watching import WindowRecord
 from vggtgeo.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 ENTITIES = (
     "/world",
@@ -49,7 +46,7 @@ _GRAPH_RADIUS = 160.0
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
 
-def log_camera(stream: rr.RecordingStream, pose: np.ndarray, intrinsics: np.ndarray, image: np.ndarray) -> None:
+def log_camera(stream: Any, pose: np.ndarray, intrinsics: np.ndarray, image: np.ndarray) -> None:
     """The current frame's camera (`pose` world -> camera, float [4, 4]) with its image at half size."""
     import rerun as rr
 
@@ -65,7 +62,7 @@ def log_camera(stream: rr.RecordingStream, pose: np.ndarray, intrinsics: np.ndar
     stream.log("world/camera/image", lens, _jpeg(cv2.resize(image, half, interpolation=cv2.INTER_AREA)))
 
 
-def log_path(stream: rr.RecordingStream, trajectory: Trajectory, keyframes: Trajectory) -> None:
+def log_path(stream: Any, trajectory: Trajectory, keyframes: Trajectory) -> None:
     """The path through all frames so far, and the keyframes on it."""
     import rerun as rr
 
@@ -73,7 +70,7 @@ def log_path(stream: rr.RecordingStream, trajectory: Trajectory, keyframes: Traj
     stream.log("world/keyframes", rr.Points3D(keyframes.positions, colors=[_BLUE], radii=-4.0))
 
 
-def log_covariance(stream: rr.RecordingStream, keyframes: list[Keyframe], covariances: np.ndarray) -> None:
+def log_covariance(stream: Any, keyframes: list[Keyframe], covariances: np.ndarray) -> None:
     """Ellipsoids of the camera centres; `covariances` [n, 6, 6] of the left tangents, translation first."""
     import rerun as rr
 
@@ -105,7 +102,7 @@ def ellipsoid(pose: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.
     return rigid.centre(pose), SIGMAS * np.sqrt(np.maximum(variances, 0.0)), quaternion
 
 
-def log_window(stream: rr.RecordingStream, keyframes: list[Keyframe], pairs: list[Pair]) -> None:
+def log_window(stream: Any, keyframes: list[Keyframe], pairs: list[Pair]) -> None:
     """The window's keyframes and the pairs that share matches, as a graph and as lines in the world."""
     import rerun as rr
 
@@ -121,7 +118,7 @@ def log_window(stream: rr.RecordingStream, keyframes: list[Keyframe], pairs: lis
     stream.log("world/covisibility", rr.LineStrips3D(strips, colors=[(*_GREEN, 90)] * len(strips), radii=-0.8))
 
 
-def log_keyframe(stream: rr.RecordingStream, keyframe: Keyframe, pair: Pair | None) -> None:
+def log_keyframe(stream: Any, keyframe: Keyframe, pair: Pair | None) -> None:
     """Image, matches to the keyframe `pair` joins it with, line segments, depth and confidence of a keyframe."""
     import rerun as rr
 
@@ -143,7 +140,7 @@ def log_keyframe(stream: rr.RecordingStream, keyframe: Keyframe, pair: Pair | No
     stream.log("keyframe/confidence", _jpeg(coloured[..., ::-1]))
 
 
-def log_points(stream: rr.RecordingStream, keyframes: list[Keyframe], intrinsics: np.ndarray) -> None:
+def log_points(stream: Any, keyframes: list[Keyframe], intrinsics: np.ndarray) -> None:
     """The window's adjusted points, in the colours of their pixels."""
     import rerun as rr
 
@@ -157,14 +154,14 @@ def log_points(stream: rr.RecordingStream, keyframes: list[Keyframe], intrinsics
     stream.log("world/points", rr.Points3D(np.concatenate(points), colors=np.concatenate(colours), radii=-1.5))
 
 
-def log_map(stream: rr.RecordingStream, cloud: PointCloud) -> None:
+def log_map(stream: Any, cloud: PointCloud) -> None:
     """The dense map; at all times, so that a finished recording opens with it."""
     import rerun as rr
 
     stream.log("world/map", rr.Points3D(cloud.points, colors=cloud.colours, radii=0.011), static=True)
 
 
-def log_residuals(stream: rr.RecordingStream, record: WindowRecord) -> None:
+def log_residuals(stream: Any, record: WindowRecord) -> None:
     """RMS residual of each kind after an adjustment."""
     import rerun as rr
 
@@ -174,21 +171,21 @@ def log_residuals(stream: rr.RecordingStream, record: WindowRecord) -> None:
             stream.log(f"plots/residuals/{name}", rr.Scalars(value))
 
 
-def log_tracking(stream: rr.RecordingStream, inliers: int) -> None:
+def log_tracking(stream: Any, inliers: int) -> None:
     """How many points the frame was tracked with."""
     import rerun as rr
 
     stream.log("plots/tracking/inliers", rr.Scalars(float(inliers)))
 
 
-def log_note(stream: rr.RecordingStream, text: str, level: str = "WARN") -> None:
+def log_note(stream: Any, text: str, level: str = "WARN") -> None:
     """A message of the run."""
     import rerun as rr
 
     stream.log("notes", rr.TextLog(text, level=level))
 
 
-def _jpeg(image: np.ndarray) -> rr.EncodedImage:
+def _jpeg(image: np.ndarray) -> Any:
     import rerun as rr
 
     done, code = cv2.imencode(".jpg", image[..., ::-1], _QUALITY)

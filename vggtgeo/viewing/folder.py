@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,11 +14,8 @@ from vggtgeo.slam.outputs import DEPTH_UNIT
 from vggtgeo.trajectory import Trajectory
 from vggtgeo.viewing import entities
 
-if TYPE_CHECKING:
-    import rerun as rr
 
-
-def log_folder(stream: rr.RecordingStream, folder: Path) -> None:
+def log_folder(stream: Any, folder: Path) -> None:
     """Path, keyframes and map, and each keyframe's depth and confidence where the run saved them.
 
     Raises:
@@ -40,7 +37,7 @@ def log_folder(stream: rr.RecordingStream, folder: Path) -> None:
     stream.flush()
 
 
-def _log_depth(stream: rr.RecordingStream, file: Path) -> None:
+def _log_depth(stream: Any, file: Path) -> None:
     import rerun as rr
 
     number = file.name.split(".")[0]

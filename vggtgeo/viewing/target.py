@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from vggtgeo.errors import InputError
 from vggtgeo.files import make_parent
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 APPLICATION = "vggtgeo"
 
@@ -23,7 +20,7 @@ def check_target(target: str) -> str:
     return target
 
 
-def open_target(target: str, name: str) -> rr.RecordingStream:
+def open_target(target: str, name: str) -> Any:
     """A stream that sends what is logged to `target`, arranged by the blueprint of this package.
 
     A file grows while the run goes on, so that an interrupted run leaves one that opens.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -16,9 +16,6 @@ from vggtgeo.slam.watching import WindowRecorder
 from vggtgeo.uncertainty import covariances
 from vggtgeo.viewing import entities
 
-if TYPE_CHECKING:
-    import rerun as rr
-
 _covariances_jit = eqx.filter_jit(covariances)
 
 
@@ -27,7 +24,7 @@ class RerunWatcher:
     steps of the window's solver, counted through the run).
     """
 
-    def __init__(self, stream: rr.RecordingStream):
+    def __init__(self, stream: Any):
         import rerun as rr
 
         self.stream = stream
