@@ -157,7 +157,7 @@ def test_an_error_in_a_change_is_seen(
     network: str, module, function: str, checkouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Proves that the comparison with the published code has the power to see a wrong change with random weights.
-    # Oracle: rotary embeddings one patch off (VGGT, MASt3R); attention of the last block read one block early (DINOv3).
+    # Oracle: positions in the wrong order (VGGT, MASt3R); attention of the last block without positions (DINOv3).
     if module is not None:
         right = getattr(module, function)
         monkeypatch.setattr(module, function, lambda rope, places, *others: right(rope, places[::-1].copy(), *others))
@@ -165,7 +165,8 @@ def test_an_error_in_a_change_is_seen(
         from vggtgeo.models.exporters import dinov3
 
         right = dinov3._last_attention
-        monkeypatch.setattr(dinov3, "_last_attention", lambda block, tokens, rope: right(block, tokens * 0.9 + 1, rope))
+        flat = lambda block, tokens, rope: right(block, tokens, (0 * rope[0], 0 * rope[1] + 1))
+        monkeypatch.setattr(dinov3, "_last_attention", flat)
     with pytest.raises(ExportError, match="the changed module differs"):
         export(recipe_of(network), request_of(network, checkouts), tmp_path / "file.onnx")
     assert list(tmp_path.iterdir()) == []
