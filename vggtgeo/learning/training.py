@@ -108,7 +108,8 @@ def error_and_gradient(window: Batch, confidence: Float[Array, "e p"]) -> tuple[
         off = solution.state.poses.inverse().translation() - window.truth
         error = jnp.log(jnp.sum(off[1:] ** 2) / (len(window.truth) - 1) + _SMALLEST**2) / 2
         # A solve that stayed at its start, for a weight that is no number, must not count as an error.
-        return jnp.where(jnp.isfinite(solution.energy), error, jnp.nan)
+        usable = jnp.isfinite(solution.energy) & jnp.isfinite(weight).all()
+        return jnp.where(usable, error, jnp.nan)
 
     error, gradient = jax.value_and_grad(log_error)(confidence)
     return jnp.exp(error), gradient
