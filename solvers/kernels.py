@@ -39,7 +39,13 @@ class AbstractKernel(eqx.Module):
 
 
 class Square(AbstractKernel):
-    """No robustness: `rho(s) = s`."""
+    """No robustness: `rho(s) = s`.
+
+    Example:
+        >>> float(vg.Square().weight(jax.numpy.asarray(9.0)))
+        1.0
+
+    """
 
     def rho(self, s: Values) -> Values:
         return s
@@ -52,7 +58,13 @@ class Square(AbstractKernel):
 
 
 class Huber(AbstractKernel):
-    """`rho(s) = s` up to `delta^2`, then `2 delta sqrt(s) - delta^2`: outliers pull with a constant force."""
+    """`rho(s) = s` up to `delta^2`, then `2 delta sqrt(s) - delta^2`: outliers pull with a constant force.
+
+    Example: a residual of four times the width counts a quarter.
+        >>> float(vg.Huber(delta=1.5).weight(jax.numpy.asarray(6.0**2)))
+        0.25
+
+    """
 
     delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
 
@@ -75,7 +87,13 @@ class Huber(AbstractKernel):
 
 
 class Cauchy(AbstractKernel):
-    """`rho(s) = delta^2 log(1 + s / delta^2)`: the pull of an outlier falls with its distance."""
+    """`rho(s) = delta^2 log(1 + s / delta^2)`: the pull of an outlier falls with its distance.
+
+    Example: a residual of twice the width counts a fifth.
+        >>> float(vg.Cauchy(delta=1.5).weight(jax.numpy.asarray(3.0**2)))
+        0.2
+
+    """
 
     delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
 
@@ -90,7 +108,13 @@ class Cauchy(AbstractKernel):
 
 
 class GemanMcClure(AbstractKernel):
-    """`rho(s) = s / (1 + s / delta^2)`: redescending, bounded by `delta^2`."""
+    """`rho(s) = s / (1 + s / delta^2)`: redescending, bounded by `delta^2`.
+
+    Example: a residual as large as the width counts a quarter.
+        >>> float(vg.GemanMcClure(delta=1.5).weight(jax.numpy.asarray(1.5**2)))
+        0.25
+
+    """
 
     delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
 
@@ -109,6 +133,12 @@ class Barron(AbstractKernel):
 
     `rho(s) = (2 b delta^2 / alpha) ((s / (delta^2 b) + 1)^(alpha / 2) - 1)` with `b = 2 - alpha`
     (Barron 2019, eq. 8, times 2, for `rho'(0) = 1`).
+
+    Example: a shape of -2 is Geman-McClure's kernel.
+        >>> s = jax.numpy.asarray(4.0)
+        >>> round(float(vg.Barron(alpha=-2.0).weight(s) / vg.GemanMcClure(delta=3.0).weight(s)), 12)
+        1.0
+
     """
 
     delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)

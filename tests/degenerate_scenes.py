@@ -7,10 +7,12 @@ are free with a prior of 5 pixels unless said otherwise. Noise-free; the guess l
 from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import scenes
 from scenes import SIGMA, Scene, make_scene
 from scipy.spatial.transform import Rotation
+from vggtgeo.solvers.kernels import Huber
 
 from vggtgeo.packing import Observations, PaddedSize
 from vggtgeo.problem import Problem, State
@@ -149,7 +151,8 @@ def behind_the_camera() -> Scene:
 
 
 def packed(scene: Scene, at_truth: bool = False, **options: Any) -> tuple[Problem, State]:
-    """Problem and guess (or truth) of `SIZE`."""
+    """Problem and guess (or truth) of `SIZE`, with Huber's kernel, whose pull reaches everywhere."""
     pack = scene.at_truth if at_truth else scene.pack
+    options = {"kernel": Huber(jnp.asarray(1.5, options.get("dtype", np.float64))), **options}
     problem, state, _ = pack(size=SIZE, **options)
     return problem, state

@@ -8,6 +8,7 @@ import jaxlie
 import numpy as np
 import pytest
 from scenes import Scene, make_scene, matrix
+from vggtgeo.solvers.kernels import Huber
 
 from vggtgeo.bundle_adjustment import BundleAdjustment
 from vggtgeo.objective import EnergyTerms, energy_terms
@@ -61,7 +62,7 @@ class Evaluated:
 
 def evaluate(scene: Scene, size: PaddedSize | None) -> Evaluated:
     """Energies and the gradient of the readable form, per keyframe and per landmark."""
-    problem, state, index = scene.pack(size=size)
+    problem, state, index = scene.pack(size=size, kernel=Huber())
     intrinsics = jnp.asarray(scene.intrinsics)
 
     def total(poses: jax.Array, depth: jax.Array) -> tuple[jax.Array, EnergyTerms]:

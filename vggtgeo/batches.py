@@ -34,6 +34,13 @@ def pack_batch(
     Raises:
         InputError: no window, or what `pack` finds wrong with one; the message names it.
 
+    Example:
+        >>> seen = [vg.simulate_window(keyframes) for keyframes in (2, 3)]
+        >>> windows = [(w.observations, w.start, w.intrinsics, w.observations.depth_mean) for w in seen]
+        >>> problems, states, indices = vg.pack_batch(windows, fixed_intrinsics=True)
+        >>> states.intrinsics.shape, len(indices)
+        ((2, 4), 2)
+
     """
     if not windows:
         raise InputError("`windows` is empty; give at least one")
@@ -78,6 +85,12 @@ def solve_batch(
 
     Raises:
         InputError: the batch cannot be shared out equally.
+
+    Example:
+        >>> twice = jax.tree.map(lambda leaf: jax.numpy.stack([leaf, leaf]), (problem, initial))
+        >>> solutions = jax.jit(vg.solve_batch)(*twice)
+        >>> solutions.energy.shape
+        (2,)
 
     """
     count = len(initials.intrinsics)

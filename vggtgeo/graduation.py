@@ -19,7 +19,14 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 
 class Graduation(eqx.Module):
-    """A few iterations at each of these kernel widths before the solve proper."""
+    """A few iterations at each of these kernel widths before the solve proper.
+
+    Example:
+        >>> graduated = vg.solve(problem, initial, graduation=vg.Graduation(factors=(4.0, 2.0)))
+        >>> bool(abs(graduated.energy / solution.energy - 1) < 1e-3)
+        True
+
+    """
 
     factors: tuple[float, ...] = eqx.field(static=True, default=(16.0, 8.0, 4.0, 2.0))
     """Widths, in units of the kernel's own."""

@@ -26,6 +26,11 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
 
     Args:
         problem: concrete arrays (not traced); the choice holds for every problem with the same graph.
+
+    Example: a window is small.
+        >>> vg.choose_reduced_solver(problem)
+        DenseCholesky()
+
     """
     if problem.num_keyframes <= DENSE_LIMIT or problem.marginal is not None:
         return DenseCholesky()

@@ -40,7 +40,7 @@ class Batch(NamedTuple):
     saliency: Float[Array, "b e p"]
     right: Bool[Array, "b e p"]
 
-    def select(self, rows: np.ndarray | int) -> Batch:
+    def select(self, rows: np.ndarray | np.integer | int) -> Batch:
         """Some of the windows, or one, without the first axis."""
         chosen: Batch = jax.tree.map(lambda leaf: leaf[rows], self)
         return chosen
