@@ -21,10 +21,9 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 class Graduation(eqx.Module):
     """A few iterations at each of these kernel widths before the solve proper.
 
-    Example:
-        >>> graduated = vg.solve(problem, initial, graduation=vg.Graduation(factors=(4.0, 2.0)))
-        >>> bool(abs(graduated.energy / solution.energy - 1) < 1e-3)
-        True
+    Example: `vg.solve(problem, initial, graduation=vg.Graduation())`, from 16 times the kernel's width to twice.
+        >>> vg.Graduation().factors
+        (16.0, 8.0, 4.0, 2.0)
 
     """
 

@@ -57,7 +57,7 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
         >>> window = vg.simulate_window(noise=0.5)
         >>> problem, initial, _ = window.pack()
         >>> print(jax.jit(vg.residual_sizes)(problem, window.truth()))
-        points 0.69 px (240), lines 0.46 px (144), depth 0.84 sigma (128)
+        points 0.65 px (240), lines 0.43 px (144), depth 0.71 sigma (128)
 
     """
     host, p = problem.edges.source, problem.num_points
