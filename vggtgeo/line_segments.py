@@ -7,6 +7,7 @@ unknowns instead of having one each (see `solvers/segments.py`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,8 @@ def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
         raise InputError(
             f"`segment` is {segment[first]} for a line sample; give every sample a segment, from 0, or none"
         )
-    _, first, inverse = np.unique(segment, return_index=True, return_inverse=True)
+    found: Any = np.unique(segment, return_index=True, return_inverse=True)
+    _, first, inverse = found
     wrong = host != host[first][inverse]
     if np.any(wrong):
         raise InputError(
