@@ -7,7 +7,7 @@ Ceres counts its iterations. Damping follows the gain ratio (Nielsen 1999; the r
 Reweighting takes the curvature of a robust kernel along a residual for the larger one across it, so where outliers
 lead, steps keep twice what they promise and the energy creeps down. The whole second-order correction (Triggs et al.
 1999, section 4.3) promises too much far from the optimum. So the part of it that is applied follows the gain ratio too:
-it grows while steps keep their promise and is halved when one does not. `benchmarks/convergence.py` compares the three.
+it grows while steps keep their promise and is halved when one does not. `benchmarks/robustness.py` compares the three.
 """
 
 from __future__ import annotations
