@@ -7,7 +7,7 @@ import pytest
 
 from vggtgeo.errors import InputError
 from vggtgeo.slam.adjustment import _prior_trust
-from vggtgeo.slam.line_support import supported
+from vggtgeo.slam.line_support import sample_shares, spread_samples, supported
 from vggtgeo.slam.settings import SlamSettings
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
@@ -57,3 +57,16 @@ def test_the_depth_prior_follows_the_chosen_confidence() -> None:
         np.testing.assert_array_equal(_prior_trust(own, saliency, without), 1.0)
     with pytest.raises(InputError, match="`depth_trust` is 'omega'"):
         SlamSettings(depth_trust="omega")
+
+
+def test_spread_samples_are_even_and_hold_both_ends() -> None:
+    """At most so many samples of a segment, its first and last among them, and shares that add up to all of them.
+
+    Oracle: counted by hand.
+    """
+    segment = np.repeat(np.arange(5), [1, 2, 5, 7, 23])
+    taken = spread_samples(segment, 6)
+    ranks = [np.nonzero(taken[segment == number])[0].tolist() for number in range(5)]
+    assert ranks == [[0], [0, 1], [0, 1, 2, 3, 4], [0, 1, 2, 4, 5, 6], [0, 4, 9, 13, 18, 22]]
+    total = np.bincount(segment[taken], sample_shares(segment, 6)[taken])
+    np.testing.assert_allclose(total, [1, 2, 5, 7, 23])

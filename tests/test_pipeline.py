@@ -51,6 +51,23 @@ def test_rgbd_recovers_the_truth(room, tracked: Slam) -> None:
     assert error < 0.015, f"ATE {error:.4f} m"
 
 
+def test_single_precision_of_the_caller_changes_nothing(room, tracked: Slam) -> None:
+    """A caller who has not switched 64-bit types on gets the same path; oracle: the run with them, bit for bit."""
+    frames, camera, _ = room
+    with jax.enable_x64(False):
+        again = _run(frames, camera)
+    np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
+
+
+def test_two_ends_lines_recover_the_truth(room) -> None:
+    """ATE below 1.5 cm where each segment has two unknowns; oracle: the renderer's poses."""
+    frames, camera, truth = room
+    slam = _run(frames, camera, settings=replace(SETTINGS, two_ends_lines=True))
+    assert slam.solved is not None
+    assert slam.solved[0].problem.fraction is not None
+    assert evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse < 0.015
+
+
 def test_no_recompilation_after_the_first_window(room, tracked: Slam) -> None:
     """A second pass compiles nothing; oracle: JAX's own events of compilation."""
     frames, camera, _ = room

@@ -13,7 +13,7 @@ from vggtgeo.problem import MarginalPrior, Problem, State
 from vggtgeo.slam import rigid
 from vggtgeo.slam.covisibility import Directed
 from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.line_support import supported
+from vggtgeo.slam.line_support import sample_shares, spread_samples, supported
 from vggtgeo.slam.settings import SlamSettings
 
 LEAST_INVERSE_DEPTH = 1e-3
@@ -75,6 +75,7 @@ def build(
         depth_sigma=np.where(has_prior, sigma, 1.0),
         depth_weight=weight if settings.depth_weight > 0 else np.zeros_like(weight),
         alpha=settings.depth_weight,
+        segment=_segments(keyframes, points, lines) if settings.two_ends_lines else None,
     )
     problem, initial, index = pack(
         observations,
@@ -162,12 +163,24 @@ class _Selection:
         chosen = []
         for keyframe, count in zip(keyframes, counts, strict=True):
             known = np.isfinite(keyframe.samples.prior)
-            length = np.bincount(keyframe.sample_segment, minlength=len(count))
+            taken = np.ones(len(known), bool)
+            if settings.two_ends_lines:
+                taken = spread_samples(keyframe.sample_segment, settings.segment_samples)
+            length = np.bincount(keyframe.sample_segment[taken], minlength=len(count))
+            if settings.two_ends_lines:
+                length = np.full_like(length, settings.segment_samples)
             order = np.argsort(-count, kind="stable")
             order = order[count[order] > 0]
             order = order[np.cumsum(length[order]) <= settings.line_slots]
-            chosen.append(np.nonzero(np.isin(keyframe.sample_segment, order) & known)[0])
+            chosen.append(np.nonzero(np.isin(keyframe.sample_segment, order) & known & taken)[0])
         return cls.of(chosen, [len(keyframe.sample_segment) for keyframe in keyframes])
+
+
+def _segments(keyframes: Sequence[Keyframe], points: _Selection, lines: _Selection) -> np.ndarray:
+    """Segment of each landmark, numbered over all keyframes; -1 for points."""
+    first = np.cumsum([0, *(len(keyframe.lines) for keyframe in keyframes)])
+    own = [first[h] + keyframes[h].sample_segment[s] for h, s in zip(lines.host, lines.slot, strict=True)]
+    return np.concatenate([np.full(len(points.host), -1), np.array(own, int)])
 
 
 def _point_rows(
@@ -233,6 +246,8 @@ def _line_rows(
         landmarks.append(offset + lines.table[host][chosen])
         coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
         weight = _weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen], settings)
+        if settings.two_ends_lines:
+            weight = weight * sample_shares(keyframes[host].sample_segment, settings.segment_samples)[chosen]
         weights.append(np.where(near, weight * settings.line_weight, 0.0))
     return {
         "line_edge": np.concatenate(edge_ids),

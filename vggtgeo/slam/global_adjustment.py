@@ -10,7 +10,6 @@ import numpy as np
 
 from vggtgeo.marginalisation import no_prior
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
-from vggtgeo.packing import PaddedSize
 from vggtgeo.problem import MarginalPrior
 from vggtgeo.slam import rigid
 from vggtgeo.slam.adjustment import build, write_back
@@ -19,7 +18,7 @@ from vggtgeo.slam.depth_alignment import Surface, depth_prior
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import solve_jit
+from vggtgeo.slam.window import solve_jit, window_size
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 
@@ -42,7 +41,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
     edges = _thin(edges, len(slam.keyframes), settings)
     ranks = max(np.bincount([edge.host for edge in edges]))
-    size = PaddedSize(len(slam.keyframes), settings.point_slots, settings.line_slots, int(ranks), len(edges))
+    size = replace(window_size(settings), keyframes=len(slam.keyframes), ranks=int(ranks), edges=len(edges))
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
     solver = SchurLevenbergMarquardt(max_iterations=settings.global_iterations, rtol=1e-5)

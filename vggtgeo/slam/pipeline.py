@@ -13,6 +13,7 @@ from vggtgeo.slam import rigid
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
+from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import start_without_depth
 from vggtgeo.slam.state import FramePose, Slam
@@ -31,6 +32,7 @@ def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
     return Slam(intrinsics, intrinsics, sigma, roles.metric)
 
 
+@in_double_precision
 def step(
     slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock | None = None
 ) -> Slam:

@@ -19,6 +19,7 @@ from vggtgeo.slam import rigid
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_adjustment import adjust_all, close_loops
 from vggtgeo.slam.pipeline import begin, step
+from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.trajectory import Trajectory
@@ -82,6 +83,7 @@ def run_frames(
         yield slam
 
 
+@in_double_precision
 def finish(
     slam: Slam, roles: Roles | None = None, settings: SlamSettings | None = None, clock: Clock | None = None
 ) -> Slam:

@@ -81,6 +81,10 @@ class SlamSettings:
     use_lines: bool = True
     line_weight: float = 0.25
     """Weight of one line sample against one point: neighbouring samples share their segment's error."""
+    two_ends_lines: bool = False
+    """Give a segment two unknowns, the inverse depths of its ends, instead of one for each of its samples."""
+    segment_samples: int = 6
+    """Samples of a segment, at most, where it has two unknowns; `line_slots` is a multiple of it."""
     manhattan: bool = False
     """Measure each keyframe's rotation from lines along three perpendicular directions, where they agree on them."""
     use_confidence: bool = True
@@ -109,12 +113,22 @@ class SlamSettings:
     global_adjustment: bool = True
     """Adjust all keyframes together at the end, with edges between those that saw the same place."""
 
+    @property
+    def padded_samples(self) -> int | None:
+        """Samples of a segment in a problem's padded size; None where samples stand alone."""
+        return self.segment_samples if self.two_ends_lines else None
+
     def __post_init__(self) -> None:
         for name in ("keyframe_distance", "keyframe_angle", "line_spacing", "known_intrinsics_sigma"):
             if not getattr(self, name) > 0:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
         if self.depth_trust not in ("own", "saliency", "complement"):
             raise InputError(f"`depth_trust` is {self.depth_trust!r}; it must be own, saliency or complement")
+        if self.segment_samples < 2 or self.line_slots % self.segment_samples:
+            raise InputError(
+                f"`segment_samples` is {self.segment_samples} and `line_slots` {self.line_slots}; a segment needs at "
+                "least 2 samples, and the slots must be a multiple of them"
+            )
         if self.window < 3:
             raise InputError(f"`window` is {self.window}; it must hold at least 3 keyframes")
         if self.depth_weight < 0 or self.confidence_floor < 0:

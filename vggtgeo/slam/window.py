@@ -15,6 +15,7 @@ from vggtgeo.slam import rigid
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.solution import solve
@@ -25,9 +26,16 @@ solve_jit = eqx.filter_jit(solve)
 
 def window_size(settings: SlamSettings) -> PaddedSize:
     """The one padded shape that all windows of a run share."""
-    return PaddedSize(settings.window, settings.point_slots, settings.line_slots, settings.window - 1)
+    return PaddedSize(
+        settings.window,
+        settings.point_slots,
+        settings.line_slots,
+        settings.window - 1,
+        samples=settings.padded_samples,
+    )
 
 
+@in_double_precision
 def warm_up(settings: SlamSettings) -> tuple[Problem, State]:
     """Compile what every window needs, on a problem of the right shape that holds one observation.
 
@@ -41,6 +49,7 @@ def warm_up(settings: SlamSettings) -> tuple[Problem, State]:
         point_landmark=np.zeros(1, int),
         point_target=np.zeros((1, 2)),
         point_weight=np.ones(1),
+        segment=np.full(1, -1) if settings.two_ends_lines else None,
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
     intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
