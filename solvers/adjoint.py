@@ -77,7 +77,8 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
 
     def stationarity(moving: Any) -> ArrowVector:
         shifted, start = eqx.combine(moving, fixed)
-        return _free(_restricted(system, shifted.gradient(shifted.hold(point, start))), system)
+        gradient = shifted.gradient(shifted.hold(point, start))
+        return _free(_restricted(_along(system, shifted), gradient), system)
 
     _, right_hand_side = jax.jvp(stationarity, (moving,), (input_tangents,))
     step = jax.lax.custom_linear_solve(
@@ -163,12 +164,20 @@ def _chord_steps(problem: AbstractArrowProblem, model: ExactModel, point: Point,
     return polished
 
 
+def _along(system: ArrowSystem, problem: AbstractArrowProblem) -> ArrowSystem:
+    """`system` with the fractions of `problem`, the same numbers, which carry their derivative."""
+    fractions = problem.fractions()
+    if system.segments is None or fractions is None:
+        return system
+    return eqx.tree_at(lambda s: s.segments.fraction, system, fractions)
+
+
 def _expanded(system: ArrowSystem, step: ArrowVector) -> ArrowVector:
-    return ArrowVector(step.dense, expand(system, step.landmarks))
+    return ArrowVector(step.dense, expand(system.segments, step.landmarks))
 
 
 def _restricted(system: ArrowSystem, gradient: ArrowVector) -> ArrowVector:
-    return ArrowVector(gradient.dense, restrict(system, gradient.landmarks))
+    return ArrowVector(gradient.dense, restrict(system.segments, gradient.landmarks))
 
 
 def _free(vector: ArrowVector, system: ArrowSystem) -> ArrowVector:

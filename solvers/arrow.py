@@ -49,6 +49,24 @@ class ArrowVector(eqx.Module):
     landmarks: Float[Array, "n s"]
 
 
+class Segments(eqx.Module):
+    """Landmarks that lie on straight lines: the coordinates `(y_a, y_b)` of `segments.py`."""
+
+    fraction: Float[Array, "n g q"]
+    """Position of each sample along its segment."""
+    ratio: Float[Array, "n g"]
+    """`l`, which makes the landmark block diagonal."""
+    determined: Bool[Array, "n g"]
+    """Whether the samples determine `y_b` at all."""
+
+    @property
+    def basis(self) -> Float[Array, "n g q 2"]:
+        """Samples by `(y_a, y_b)`."""
+        first = 1 - self.fraction
+        second = self.fraction - self.ratio[..., None] * first
+        return jnp.stack([first, jnp.where(self.determined[..., None], second, 0.0)], -1)
+
+
 class ArrowSystem(eqx.Module):
     """Second-order model of the energy at one point; `b` coordinates a node, `q` shared ones."""
 
@@ -70,8 +88,8 @@ class ArrowSystem(eqx.Module):
     """False for coordinates that are held."""
     gauge: Float[Array, "c g"]
     """Directions along which the energy may be flat for a known reason (a free scale): unit columns, or zero."""
-    segments: Float[Array, "n g q 2"] | None = None
-    """Where the last `2 g` landmarks are coordinates of segments of `q` samples: see `segments.py`."""
+    segments: Segments | None = None
+    """Where the last `2 g` landmarks are coordinates of segments of `q` samples."""
 
     @property
     def landmark_gradient(self) -> Float[Array, "n s"]:

@@ -54,12 +54,12 @@ def covariance(system: ArrowSystem) -> ArrowCovariance:
     inverse = _invert(system, reduced)
     hessian_inverse, cross = inverse_landmark_hessian(system), system.cross[:, :-2]
     # In this order: the square of a large inverse overflows, its product with the coupling does not.
-    pulled = expand(system, hessian_inverse[:, None] * cross)
+    pulled = expand(system.segments, hessian_inverse[:, None] * cross)
     spread = lambda matrix, rows: jnp.einsum("nrs,nrt,nts->ns", rows, to_relative_matrix(system, matrix), rows)
-    variance = expand_variance(system, hessian_inverse) + spread(inverse.covariance, pulled)
+    variance = expand_variance(system.segments, hessian_inverse) + spread(inverse.covariance, pulled)
     lost = hessian_inverse * spread(inverse.null, cross) > _visible(cross.dtype)
     unknown = (system.landmark_hessian == 0) | lost
-    known = (expand_variance(system, unknown.astype(cross.dtype)) == 0) & jnp.isfinite(variance)
+    known = (expand_variance(system.segments, unknown.astype(cross.dtype)) == 0) & jnp.isfinite(variance)
     undetermined = inverse.undetermined
     either = undetermined[:, None] | undetermined[None, :]
     dense = jnp.where(either, 0.0, inverse.covariance)

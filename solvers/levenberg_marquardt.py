@@ -210,7 +210,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ) -> _Try:
         """Take the step if it keeps its promise, else shrink the trust region."""
         energy = state.energy
-        candidate = problem.retract(point, ArrowVector(step.dense, expand(system, step.landmarks)))
+        candidate = problem.retract(point, ArrowVector(step.dense, expand(system.segments, step.landmarks)))
         new_energy = problem.energy(candidate)
         gain = (energy - new_energy) / jnp.where(predicted > 0, predicted, 1.0)
         accepted = jnp.isfinite(new_energy) & (predicted > 0) & (gain > 1e-3)

@@ -41,7 +41,14 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
 
     @abc.abstractmethod
     def hold(self, point: Point, initial: Point) -> Point:
-        """`point` with every held coordinate taken from `initial`."""
+        """`point` with every held coordinate taken from `initial`.
+
+        Landmarks on segments stay where they are, but follow the fractions where those are differentiated.
+        """
+
+    def fractions(self) -> Float[Array, "n g q"] | None:
+        """Position of each landmark along its segment, where the last ones are joined: see `segments.py`."""
+        return None
 
     @abc.abstractmethod
     def zero_step(self, point: Point) -> ArrowVector:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from vggtgeo.solvers.arrow import ArrowSystem
+from vggtgeo.solvers.arrow import ArrowSystem, Segments
 
 
 def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> ArrowSystem:
@@ -25,52 +25,53 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
     rows = system.cross[..., alone:].reshape(*system.cross.shape[:2], segments, samples)
     curvature = rows[:, -1]
     first, second = 1 - fraction, fraction
-    total = lambda *factors: jnp.sum(_product(curvature, *factors), -1)
+    total = lambda left, right: jnp.sum(curvature * left * right, -1)
     own, mixed, other = total(first, first), total(first, second), total(second, second)
     ratio = jnp.where(own != 0, mixed / jnp.where(own != 0, own, 1.0), 0.0)
     second = second - ratio[..., None] * first
     rest = total(second, second)
     # Where one sample alone determines the segment, the second coordinate is rounding error.
     determined = jnp.abs(rest) > 1e3 * jnp.finfo(rest.dtype).eps * (jnp.abs(own) + jnp.abs(other))
-    second = jnp.where(determined[..., None], second, 0.0)
-    basis = jnp.stack([first, second], -1)
-    joined = jnp.einsum("nrms,nmsk->nrkm", rows, basis)
+    joint = Segments(fraction, ratio, determined)
+    joined = jnp.einsum("nrms,nmsk->nrkm", rows, joint.basis)
     joined = joined.at[:, -1].set(jnp.stack([own, jnp.where(determined, rest, 0.0)], 1))
     cross = jnp.concatenate([system.cross[..., :alone], joined.reshape(*joined.shape[:2], 2 * segments)], -1)
-    return eqx.tree_at(lambda s: (s.cross, s.segments), system, (cross, basis), is_leaf=lambda leaf: leaf is None)
+    return eqx.tree_at(lambda s: (s.cross, s.segments), system, (cross, joint), is_leaf=lambda leaf: leaf is None)
 
 
-def expand(system: ArrowSystem, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
+def expand(segments: Segments | None, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
     """From the system's landmarks to those of the problem: the samples of the segments."""
-    if system.segments is None:
-        return landmarks
-    _, segments, samples, _ = system.segments.shape
-    alone = landmarks.shape[-1] - 2 * segments
-    pairs = landmarks[..., alone:].reshape(*landmarks.shape[:-1], 2, segments)
-    values = jnp.einsum("n...km,nmsk->n...ms", pairs, system.segments)
-    flat = values.reshape(*landmarks.shape[:-1], segments * samples)
-    return jnp.concatenate([landmarks[..., :alone], flat], -1)
+    return landmarks if segments is None else _expanded(segments.basis, landmarks)
 
 
-def restrict(system: ArrowSystem, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:
-    """The transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
-    if system.segments is None:
-        return landmarks
-    hosts, segments, samples, _ = system.segments.shape
-    alone = landmarks.shape[-1] - segments * samples
-    values = landmarks[:, alone:].reshape(hosts, segments, samples)
-    pairs = jnp.einsum("nms,nmsk->nkm", values, system.segments)
-    return jnp.concatenate([landmarks[:, :alone], pairs.reshape(hosts, 2 * segments)], -1)
-
-
-def expand_variance(system: ArrowSystem, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
+def expand_variance(segments: Segments | None, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
     """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
-    squared = eqx.tree_at(lambda s: s.segments, system, None if system.segments is None else system.segments**2)
-    return expand(squared, variance)
+    return variance if segments is None else _expanded(segments.basis**2, variance)
 
 
-def _product(*factors: Array) -> Array:
-    product = factors[0]
-    for factor in factors[1:]:
-        product = product * factor
-    return product
+def restrict(segments: Segments | None, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:
+    """The transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
+    if segments is None:
+        return landmarks
+    hosts, count, samples = segments.fraction.shape
+    alone = landmarks.shape[-1] - count * samples
+    values = landmarks[:, alone:].reshape(hosts, count, samples)
+    pairs = jnp.einsum("nms,nmsk->nkm", values, segments.basis)
+    return jnp.concatenate([landmarks[:, :alone], pairs.reshape(hosts, 2 * count)], -1)
+
+
+def slopes(landmarks: Float[Array, "n z"], fraction: Float[Array, "n m q"]) -> Float[Array, "n m 1"]:
+    """Change of the last `m q` landmarks, straight along their segments, from fraction 0 to 1."""
+    lines = landmarks[:, landmarks.shape[-1] - fraction.shape[1] * fraction.shape[2] :].reshape(fraction.shape)
+    offset = fraction - jnp.mean(fraction, -1, keepdims=True)
+    spread = jnp.sum(offset**2, -1, keepdims=True)
+    return jnp.sum(offset * lines, -1, keepdims=True) / jnp.where(spread > 0, spread, 1.0)
+
+
+def _expanded(basis: Float[Array, "n m q 2"], landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
+    _, count, samples, _ = basis.shape
+    alone = landmarks.shape[-1] - 2 * count
+    pairs = landmarks[..., alone:].reshape(*landmarks.shape[:-1], 2, count)
+    values = jnp.einsum("n...km,nmsk->n...ms", pairs, basis)
+    flat = values.reshape(*landmarks.shape[:-1], count * samples)
+    return jnp.concatenate([landmarks[..., :alone], flat], -1)

@@ -82,7 +82,7 @@ def reduced_to_ends(problem: Problem, state: State) -> tuple[np.ndarray, np.ndar
 def newton(problem: Problem, state: State) -> ArrowVector:
     system, solver = BundleAdjustment(problem).linearise(state), DenseCholesky()
     step, _ = solver.step(system, solver.prepare(system), jnp.asarray(0.0))
-    return ArrowVector(step.dense, expand(system, step.landmarks))
+    return ArrowVector(step.dense, expand(system.segments, step.landmarks))
 
 
 def test_the_step_is_the_constrained_dense_step() -> None:
@@ -103,7 +103,7 @@ def test_restrict_is_the_transpose_of_expand() -> None:
     rng = np.random.default_rng(0)
     inner = jnp.asarray(rng.normal(size=system.landmark_hessian.shape))
     outer = jnp.asarray(rng.normal(size=state.inverse_depth.shape))
-    left, right = jnp.sum(expand(system, inner) * outer), jnp.sum(inner * restrict(system, outer))
+    left, right = jnp.sum(expand(system.segments, inner) * outer), jnp.sum(inner * restrict(system.segments, outer))
     assert float(left) == pytest.approx(float(right), rel=1e-12)
 
 
@@ -155,15 +155,15 @@ def test_gradients_are_those_of_central_differences() -> None:
     rng = np.random.default_rng(1)
     target = jnp.asarray(rng.normal(size=state.inverse_depth.shape))
 
-    def loss(weights: tuple[jax.Array, jax.Array]) -> jax.Array:
-        changed = eqx.tree_at(lambda p: (p.lines.weight, p.depth.mean), problem, weights)
+    def loss(leaves: tuple[jax.Array, ...]) -> jax.Array:
+        changed = eqx.tree_at(lambda p: (p.lines.weight, p.depth.mean, p.fraction), problem, leaves)
         solved = solve(changed, state, solver=SOLVER).state
         return jnp.sum(solved.inverse_depth * target) + jnp.sum(solved.poses.wxyz_xyz**3)
 
     both = jax.jit(jax.value_and_grad(loss))  # its value is that of the polished optimum
-    at = (problem.lines.weight, problem.depth.mean)
-    value, (_, found) = lambda weights: both(weights)[0], both(at)
-    for number in range(2):
+    at = (problem.lines.weight, problem.depth.mean, problem.fraction)
+    value, (_, found) = lambda leaves: both(leaves)[0], both(at)
+    for number in range(3):
         direction = jnp.asarray(rng.normal(size=at[number].shape)) * (at[number] > 0)
         shifted = lambda h, n=number, d=direction: tuple(x + h * d if i == n else x for i, x in enumerate(at))
         expected = (value(shifted(1e-5)) - value(shifted(-1e-5))) / 2e-5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
@@ -12,6 +13,7 @@ from vggtgeo.linearise import EdgeObservations, edge_observations, fast_energy, 
 from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
 from vggtgeo.solvers.problem import AbstractArrowProblem
+from vggtgeo.solvers.segments import slopes
 
 MIN_SHRINK = 0.1
 """An inverse depth falls at most to this fraction in one step, so it stays positive."""
@@ -61,7 +63,33 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         fixed_pose = self.problem.fixed_pose[:, None]
         poses = jnp.where(fixed_pose, initial.poses.wxyz_xyz, point.poses.wxyz_xyz)
         intrinsics = jnp.where(self.problem.fixed_intrinsics, initial.intrinsics, point.intrinsics)
-        return State(jaxlie.SE3(poses), intrinsics, point.inverse_depth)
+        return State(jaxlie.SE3(poses), intrinsics, self._along_segments(point.inverse_depth))
+
+    def straightened(self, point: State) -> State:
+        """`point` with the inverse depths of each segment on the straight line nearest to them (or at their mean, where
+        that line is not positive), which is where the iteration keeps them.
+        """
+        fraction = self.problem.fraction
+        if fraction is None:
+            return point
+        lines = point.inverse_depth[:, self.problem.num_points :].reshape(fraction.shape)
+        centre, level = (jnp.mean(values, -1, keepdims=True) for values in (fraction, lines))
+        straight = level + slopes(point.inverse_depth, fraction) * (fraction - centre)
+        straight = jnp.where(jnp.min(straight, -1, keepdims=True) > 0, straight, level)
+        depth = point.inverse_depth.at[:, self.problem.num_points :].set(straight.reshape(len(lines), -1))
+        return State(point.poses, point.intrinsics, depth)
+
+    def _along_segments(self, depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
+        """The same depths, with their derivative by the fractions: a line stays where it is, its samples move on it."""
+        fraction = self.problem.fraction
+        if fraction is None:
+            return depth
+        moved = fraction - jax.lax.stop_gradient(fraction)
+        change = slopes(depth, jax.lax.stop_gradient(fraction)) * moved
+        return depth.at[:, self.problem.num_points :].add(change.reshape(len(depth), -1))
+
+    def fractions(self) -> Float[Array, "n g q"] | None:
+        return self.problem.fraction
 
     def zero_step(self, point: State) -> ArrowVector:
         return ArrowVector(

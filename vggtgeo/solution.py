@@ -105,7 +105,7 @@ def solve(
 
     Args:
         problem: observations and priors, `vggtgeo.pack` makes one from flat lists.
-        initial: starting state, world -> camera poses, pixels, 1/m.
+        initial: starting state, world -> camera poses, pixels, 1/m; lines of two ends start straight along them.
         solver: iteration and linear algebra; default `SchurLevenbergMarquardt()`.
         adjoint: how to differentiate; default `ArrowAdjoint()`. `optimistix.RecursiveCheckpointAdjoint()` with
             `SchurLevenbergMarquardt(differentiable_loop=True)` differentiates through the iterates instead.
@@ -122,6 +122,7 @@ def solve(
     """
     solver = SchurLevenbergMarquardt() if solver is None else solver
     adjoint = ArrowAdjoint() if adjoint is None else adjoint
+    initial = BundleAdjustment(problem).straightened(initial)
     if graduation is not None:
         initial = graduation.start(problem, initial, solver)
     found: optx.Solution = optx.least_squares(

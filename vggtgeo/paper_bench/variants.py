@@ -94,6 +94,6 @@ VARIANTS: dict[str, Variant] = {
         Variant("formula", "depth prior x Omega (the paper's formula)", lambda s: replace(s, depth_trust="saliency")),
         Variant("text", "depth prior x (1 - Omega) (its text)", lambda s: replace(s, depth_trust="complement")),
         Variant("global", "one adjustment of the whole map at the end", _adjusted_at_the_end),
-        # A line carried by two inverse depths instead of one for each sample belongs here once `SlamSettings` has it.
+        Variant("two-ends", "two unknowns a segment", lambda s: replace(s, two_ends_lines=True)),
     )
 }
