@@ -1,4 +1,6 @@
-"""Every combination of reduced solver, precision and kernel ends at the same optimum of the same small problem."""
+"""Every combination of reduced solver, precision, kernel and line parametrisation ends at the same optimum of the same
+small problem.
+"""
 
 from functools import cache
 
@@ -31,10 +33,12 @@ KERNELS: dict[str, AbstractKernel] = {
     "Geman-McClure": GemanMcClure(),
     "Barron": Barron(alpha=0.5),
 }
-ALL = [(s, k, d) for s in SOLVERS for k in KERNELS for d in ("float64", "float32")]
+LINES = ("samples", "two ends")
+ALL = [(s, k, d, p) for s in SOLVERS for k in KERNELS for d in ("float64", "float32") for p in LINES]
 COVERING = [
-    *(("band", "Huber", "float32"), ("matrix-free", "Huber", "float64")),
-    *(("matrix-free, band", "Huber", "float64"), ("dense", "Huber", "float32")),
+    *(("band", "Huber", "float32", "samples"), ("matrix-free", "Huber", "float64", "samples")),
+    *(("matrix-free, band", "Huber", "float64", "samples"), ("dense", "Huber", "float32", "samples")),
+    ("band", "Huber", "float64", "two ends"),
 ]
 """One kernel with each solver; `make test-slow` runs them all."""
 
@@ -44,31 +48,40 @@ def run(problem: Problem, state: State, solver: SchurLevenbergMarquardt) -> Solu
     return solve(problem, state, solver=solver)
 
 
-def problem_of(kernel: str, dtype: str) -> tuple[Problem, State]:
+def problem_of(kernel: str, dtype: str, lines: str) -> tuple[Problem, State]:
     in_precision = lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf
     cast = jax.tree.map(in_precision, KERNELS[kernel])
-    problem, state, _ = SCENE.pack(kernel=cast, dtype=np.dtype(dtype))
+    scene = SCENE if lines == "samples" else SCENE.with_observations(segment=segments())
+    problem, state, _ = scene.pack(kernel=cast, dtype=np.dtype(dtype))
     return problem, state
 
 
+def segments() -> np.ndarray:
+    """Three line samples a segment; -1 for points."""
+    samples = np.unique(SCENE.observations.line_landmark)
+    number = np.full(len(SCENE.observations.host), -1)
+    number[samples] = np.arange(len(samples)) // 3
+    return number
+
+
 @cache
-def expected(kernel: str) -> Solution:
+def expected(kernel: str, lines: str) -> Solution:
     """Dense Cholesky in double precision."""
-    return run(*problem_of(kernel, "float64"), SchurLevenbergMarquardt(rtol=1e-13, max_iterations=100))
+    return run(*problem_of(kernel, "float64", lines), SchurLevenbergMarquardt(rtol=1e-13, max_iterations=100))
 
 
 @pytest.mark.parametrize(
-    ("solver", "kernel", "dtype"),
+    ("solver", "kernel", "dtype", "lines"),
     [pytest.param(*case, marks=() if case in COVERING else pytest.mark.slow, id="-".join(case)) for case in ALL],
 )
-def test_all_combinations_agree(solver: str, kernel: str, dtype: str) -> None:
-    # Proves energy and state of a combination. Oracle: dense Cholesky in double precision with the same kernel.
-    problem, state = problem_of(kernel, dtype)
+def test_all_combinations_agree(solver: str, kernel: str, dtype: str, lines: str) -> None:
+    # Proves energy and state of a combination. Oracle: dense Cholesky in double precision, same kernel and lines.
+    problem, state = problem_of(kernel, dtype, lines)
     double = dtype == "float64"
     settings = SchurLevenbergMarquardt(
         rtol=1e-13 if double else 1e-7, max_iterations=100, reduced_solver=SOLVERS[solver]
     )
-    found, reference = run(problem, state, settings), expected(kernel)
+    found, reference = run(problem, state, settings), expected(kernel, lines)
     assert float(found.energy) == pytest.approx(float(reference.energy), rel=1e-9 if double else 1e-4)
     difference = jnp.abs(found.state.poses.wxyz_xyz - reference.state.poses.wxyz_xyz).max()
     assert float(difference) < (1e-6 if double else 5e-3), float(difference)
