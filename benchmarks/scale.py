@@ -7,7 +7,8 @@ The problems are those of the generator's size `global` (128 points and 8 lines 
 keyframes before and after), made once and kept in the output folder. Each row is a process of its own, in float64:
 a whole jitted `solve` of so many iterations, run four times. Wall time is the median of the last three, processor time
 their least (the one to read where the core is shared). With `--ceres`, Ceres solves the same files (SPARSE_SCHUR,
-analytic, cached edges, one thread). Prints Markdown and writes `scale.png` beside the problems.
+analytic, cached edges, one thread). Prints Markdown, and writes it to `scale.md` and the plot to `scale.png` beside
+the problems.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ def main() -> None:
     rows = json.loads(options.table.read_text()) if options.table else _all_rows(options)
     (options.out / "scale.json").write_text(json.dumps(rows, indent=1))
     _draw(rows, options.out / "scale.png")
-    print("\n".join([HEADER, *(_markdown(row) for row in rows)]))
+    table = "\n".join([HEADER, *(_markdown(row) for row in rows)])
+    (options.out / "scale.md").write_text(table + "\n")
+    print(table)
 
 
 def _options() -> argparse.Namespace:

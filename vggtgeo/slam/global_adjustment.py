@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from vggtgeo.marginalisation import no_prior
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
 from vggtgeo.problem import MarginalPrior
 from vggtgeo.slam import rigid
@@ -19,6 +18,7 @@ from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window import solve_jit, window_size
+from vggtgeo.solver_choice import choose_reduced_solver
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 
@@ -44,7 +44,6 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     size = replace(window_size(settings), keyframes=len(slam.keyframes), ranks=int(ranks), edges=len(edges))
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
-    solver = SchurLevenbergMarquardt(max_iterations=settings.global_iterations, rtol=1e-5)
     for _ in range(settings.global_rounds):
         adjustment = build(
             slam.keyframes,
@@ -57,6 +56,11 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             fixed_pose=fixed,
             marginal=_surface_prior(slam, surfaces, settings),
         )
+        solver = SchurLevenbergMarquardt(
+            max_iterations=settings.global_iterations,
+            rtol=1e-5,
+            reduced_solver=choose_reduced_solver(adjustment.problem),
+        )
         solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
@@ -65,9 +69,9 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     return slam
 
 
-def _surface_prior(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> MarginalPrior:
+def _surface_prior(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> MarginalPrior | None:
     if not surfaces or settings.surface_points <= 0:
-        return no_prior(len(slam.keyframes))
+        return None  # an empty prior would still fill the matrix
     pairs = [pair.key for pair in slam.pairs]
     return depth_prior(slam.keyframes, pairs, surfaces, slam.intrinsics, settings.surface_points)
 
