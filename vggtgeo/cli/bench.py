@@ -23,6 +23,7 @@ def bench(
     variants: Annotated[str | None, typer.Option(help="Some variants of the plan, with commas.")] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the plan's.")] = None,
     first_seed: Annotated[int | None, typer.Option(min=0, help="First seed.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes, of up to 4 GB each.")] = 2,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print the tables only.")] = False,
 ) -> None:
     """Run the comparisons of the paper with simulated roles in rendered worlds, and print their tables."""
@@ -40,7 +41,14 @@ def bench(
             )
 
     report = run_bench(
-        output, plan, scenes=_list(scenes), variants=_list(variants), seeds=seeds, first_seed=first_seed, progress=say
+        output,
+        plan,
+        scenes=_list(scenes),
+        variants=_list(variants),
+        seeds=seeds,
+        first_seed=first_seed,
+        progress=say,
+        workers=workers,
     )
     typer.echo(report.markdown())
     typer.echo(f"in {output}: tables.md runs.csv ablations.png", err=True)

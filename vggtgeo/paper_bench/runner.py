@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -12,6 +15,7 @@ from matplotlib.figure import Figure
 from vggtgeo.errors import InputError
 from vggtgeo.files import write_text
 from vggtgeo.paper_bench import tables
+from vggtgeo.paper_bench.courses import Course
 from vggtgeo.paper_bench.figure import ablation_figure, write_figure
 from vggtgeo.paper_bench.measure import measure
 from vggtgeo.paper_bench.plan import PLANS, Job, Plan
@@ -58,6 +62,7 @@ def bench(
     seeds: int | None = None,
     first_seed: int | None = None,
     progress: Progress | None = None,
+    workers: int = 1,
 ) -> BenchReport:
     """Run the paper's comparisons in simulation and write their tables into the folder `output`.
 
@@ -65,7 +70,8 @@ def bench(
     made. One walk is rendered at a time and serves all variants of its seed.
 
     plan: "small" (a minute), "quick" or "full". scenes, variants: the part of the plan to run. seeds: how many, in
-    place of the plan's own; first_seed: the first of them. Raises InputError for names that are not there.
+    place of the plan's own; first_seed: the first of them. workers: processes, each of which takes up to 4 GB with the
+    plan "quick". Raises InputError for names that are not there.
     """
     if plan not in PLANS:
         raise InputError(f"`plan` is {plan!r}; it must be one of {', '.join(PLANS)}")
@@ -73,23 +79,74 @@ def bench(
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"`output` is {folder}, which is a file; give a folder")
-    report = BenchReport(chosen, tuple(run_jobs(chosen.jobs(), Store(folder), progress)))
+    if workers < 1:
+        raise InputError(f"`workers` is {workers}; it must be at least 1")
+    report = BenchReport(chosen, tuple(run_jobs(chosen.jobs(), Store(folder), progress, workers)))
     report.write(folder)
     return report
 
 
-def run_jobs(jobs: list[Job], store: Store, progress: Progress | None = None) -> list[Result]:
-    """The results of `jobs` in their order, from the store or by running them."""
-    results: list[Result] = []
-    stage: Stage | None = None
-    for number, job in enumerate(jobs, 1):
-        result = store.load(job)
-        if result is None:
-            if stage is None or (stage.course, stage.seed) != (job.course, job.seed):
-                stage = None  # before the next is rendered: two would need twice the memory
-                stage = Stage.set(job.course, job.seed)
-            result = store.save(job, measure(stage, VARIANTS[job.variant]))
-        results.append(result)
+def run_jobs(jobs: list[Job], store: Store, progress: Progress | None = None, workers: int = 1) -> list[Result]:
+    """The results of `jobs` in their order, from the store or by running them, one walk to a process at a time."""
+    found = {job: result for job in jobs if (result := store.load(job)) is not None}
+    say = _counted(jobs, progress)
+    for job, result in found.items():
+        say(job, result)
+    walks = _by_walk([job for job in jobs if job not in found])
+    if workers == 1 or len(walks) < 2:
+        for walk in walks:
+            for job, result in _run_walk(walk, store):
+                found[job] = result
+                say(job, result)
+    else:
+        for job, result in _run_in_processes(walks, store, workers):
+            found[job] = result
+            say(job, result)
+    return [found[job] for job in jobs]
+
+
+def _by_walk(jobs: list[Job]) -> list[list[Job]]:
+    walks: dict[tuple[Course, int], list[Job]] = {}
+    for job in jobs:
+        walks.setdefault((job.course, job.seed), []).append(job)
+    return list(walks.values())
+
+
+def _run_walk(jobs: list[Job], store: Store) -> Iterator[tuple[Job, Result]]:
+    """Jobs of one course and seed: the walk is rendered once."""
+    stage = Stage.set(jobs[0].course, jobs[0].seed)
+    for job in jobs:
+        yield job, store.save(job, measure(stage, VARIANTS[job.variant]))
+
+
+def _finish_walk(jobs: list[Job], store: Store) -> None:
+    for _ in _run_walk(jobs, store):
+        pass
+
+
+def _run_in_processes(walks: list[list[Job]], store: Store, workers: int) -> Iterator[tuple[Job, Result]]:
+    """Results as they appear in the store. New processes, not forks: JAX has threads."""
+    waiting = [job for walk in walks for job in walk]
+    with ProcessPoolExecutor(min(workers, len(walks)), get_context("spawn")) as pool:
+        try:
+            running = {pool.submit(_finish_walk, walk, store) for walk in walks}
+            while waiting:
+                done, running = wait(running, timeout=1.0, return_when=FIRST_EXCEPTION)
+                for future in done:
+                    future.result()
+                arrived = {job: result for job in waiting if (result := store.load(job)) is not None}
+                waiting = [job for job in waiting if job not in arrived]
+                yield from arrived.items()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _counted(jobs: list[Job], progress: Progress | None) -> Callable[[Job, Result], None]:
+    numbers = itertools.count(1)
+
+    def say(job: Job, result: Result) -> None:
         if progress is not None:
-            progress(number, len(jobs), job, result)
-    return results
+            progress(next(numbers), len(jobs), job, result)
+
+    return say
