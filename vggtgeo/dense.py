@@ -1,70 +1,18 @@
-"""Dense depth of a keyframe after optimisation, and the point cloud of all keyframes.
-
-The depth prior of a pixel touches that pixel alone, so a pixel that carries no slot has its optimum at its prior: the
-dense problem is solved by the slots. What the slots learnt (`log z_optimised - log z_prior`) is then spread to their
-neighbours by a bilateral grid (Chen, Paris, Durand 2007) over image position and log depth: it follows surfaces and
-stops at depth edges.
-"""
+"""The map: one point cloud of all keyframes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
 
+from vggtgeo.keyframe_depth import fused_depths
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam import rigid
 from vggtgeo.slam.keyframe import Keyframe
 
 _Weighted = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Points, colours, weights."""
-CELL = 24.0
-"""Pixels a grid cell."""
-DEPTH_CELL = 0.08
-"""Log depth a grid cell."""
-LARGEST_CORRECTION = 0.2
-"""Of log depth: what differs more is a mismatch, not a correction."""
-
-
-def optimised_depth(keyframe: Keyframe) -> np.ndarray:
-    """Depth of every pixel that has a metric prior, corrected by the slots; float32 `[H, W]` metres, NaN = none."""
-    prior = keyframe.depth.astype(np.float32)
-    pixels, correction, weight = _corrections(keyframe)
-    if not len(pixels):
-        return prior
-    height, width = prior.shape
-    log_depth = np.log(prior)
-    low = float(np.nanmin(log_depth))
-    shape = (
-        int(height / CELL) + 3,
-        int(width / CELL) + 3,
-        int((float(np.nanmax(log_depth)) - low) / DEPTH_CELL) + 3,
-    )
-    columns, rows = np.rint(pixels).astype(int).T
-    at = np.stack([pixels[:, 1] / CELL, pixels[:, 0] / CELL, (log_depth[rows, columns] - low) / DEPTH_CELL])
-    cell = tuple(np.rint(at).astype(int) + 1)
-    mass, moment = np.zeros(shape), np.zeros(shape)
-    np.add.at(mass, cell, weight)
-    np.add.at(moment, cell, weight * correction)
-    mass, moment = (gaussian_filter(grid, 1.0, mode="constant") for grid in (mass, moment))
-    # A weak pull towards no correction: far from any slot the prior stands.
-    field = moment / (mass + 0.02)
-    known = np.isfinite(log_depth)
-    y, x = np.nonzero(known)
-    place = np.stack([y / CELL + 1, x / CELL + 1, (log_depth[known] - low) / DEPTH_CELL + 1])
-    result = prior
-    result[known] = prior[known] * np.exp(map_coordinates(field, place, order=1, mode="nearest"))
-    return result
-
-
-def _corrections(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels, log depth corrections and weights of the slots that have both an estimate and a prior."""
-    slots = keyframe.points
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correction = np.log(slots.prior) - np.log(slots.inverse_depth)
-    good = np.isfinite(correction) & (correction != 0) & (np.abs(correction) < LARGEST_CORRECTION)
-    return slots.pixels[good], correction[good], slots.confidence[good] * slots.prior_confidence[good]
 
 
 def map_points(
@@ -76,7 +24,7 @@ def map_points(
     another keyframe confirms to 4 %; else the adjusted points alone. Points of one cell of `voxel` metres are averaged.
     """
     metric = [bool(np.isfinite(keyframe.depth).any()) for keyframe in keyframes]
-    depths = [optimised_depth(keyframe) if known else None for keyframe, known in zip(keyframes, metric, strict=True)]
+    depths = fused_depths(keyframes, intrinsics)
     parts = []
     for i, keyframe in enumerate(keyframes):
         if not metric[i]:

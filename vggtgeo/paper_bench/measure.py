@@ -10,8 +10,8 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from vggtgeo.dense import optimised_depth
 from vggtgeo.evaluation import depth_error, evaluate_trajectory
+from vggtgeo.keyframe_depth import fused_depths
 from vggtgeo.paper_bench.stage import Stage
 from vggtgeo.paper_bench.variants import Variant
 from vggtgeo.slam.run import finish, frame_trajectory, run
@@ -92,11 +92,14 @@ def errors_of(slam: Slam, stage: Stage, seconds: float) -> Errors:
 def _depth_errors(slam: Slam, stage: Stage) -> tuple[float, float]:
     """Pooled RMSE of the keyframes' dense depth, metres: after the adjustment, and of the prior alone."""
     chosen = np.unique(np.linspace(0, len(slam.keyframes) - 1, _DEPTH_MAPS).round().astype(int))
+    fused = fused_depths(slam.keyframes, slam.intrinsics)
     squares, counts = np.zeros(2), np.zeros(2)
     for number in chosen:
         keyframe = slam.keyframes[number]
         truth = stage.oracle.depth(keyframe.frame)
-        for kind, depth in enumerate((optimised_depth(keyframe), keyframe.depth)):
+        for kind, depth in enumerate((fused[number], keyframe.depth)):
+            if depth is None:
+                continue
             found = depth_error(depth.astype(np.float64), truth)
             if found.count:
                 squares[kind] += found.rmse**2 * found.count

@@ -11,8 +11,8 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from vggtgeo.dense import optimised_depth
 from vggtgeo.files import write_text
+from vggtgeo.keyframe_depth import optimised_depth
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.report import figures, map_view
 from vggtgeo.slam.keyframe import Keyframe

@@ -13,10 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vggtgeo.dense import map_points, optimised_depth
+from vggtgeo.dense import map_points
 from vggtgeo.errors import InputError
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.files import atomic_path, write_json
+from vggtgeo.keyframe_depth import fused_depths
 from vggtgeo.plots import plot_trajectory
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -42,9 +43,9 @@ def write_map(folder: Path, slam: Slam) -> PointCloud:
 
 def write_depth(folder: Path, slam: Slam) -> None:
     """`depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none) and `depth/NNNNNN.confidence.png` (8 bit) a keyframe."""
-    for keyframe in slam.keyframes:
-        depth = optimised_depth(keyframe)
-        counts = np.clip(np.nan_to_num(depth) * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
+    for keyframe, depth in zip(slam.keyframes, fused_depths(slam.keyframes, slam.intrinsics), strict=True):
+        metres = np.zeros(keyframe.depth.shape) if depth is None else np.nan_to_num(depth)
+        counts = np.clip(metres * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
         for name, image in (("depth", counts), ("confidence", keyframe.depth_confidence)):
             with atomic_path(folder / "depth" / f"{keyframe.frame:06d}.{name}.png") as temporary:
                 cv2.imwrite(os.fspath(temporary), image)

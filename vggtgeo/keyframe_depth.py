@@ -1,0 +1,159 @@
+"""Dense depth of the keyframes after optimisation: what the slots learnt, and what other keyframes saw.
+
+The depth prior of a pixel touches that pixel alone, so a pixel that carries no slot has its optimum at its prior: the
+dense problem is solved by the slots. What the slots learnt (`log z_optimised - log z_prior`) is spread to their
+neighbours by a bilateral grid (Chen, Paris, Durand 2007) over image position and log depth: it follows surfaces and
+stops at depth edges.
+
+The depth of a network errs smoothly over a picture and differently a second later, and so does what no slot reaches.
+The other keyframes' views of a surface have errors of their own, and the poses between neighbours are known far better:
+so each depth is averaged with its neighbours' in its own view, the slots corrected once more against that mean, and the
+result averaged again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from vggtgeo.slam import rigid
+from vggtgeo.slam.keyframe import Keyframe
+
+CELL = 24.0
+"""Pixels a grid cell."""
+DEPTH_CELL = 0.08
+"""Log depth a grid cell."""
+LARGEST_CORRECTION = 0.2
+"""Of log depth: what differs more is a mismatch, not a correction."""
+OFFSETS = (1, 2, 3, 4, 6, 8, 10, 12)
+"""Neighbours before and after, in keyframes: some near, which see the same, and some far, which err differently."""
+STEP = 4
+"""Pixels between the points that a neighbour contributes, and of a cell in which their corrections are collected."""
+SPREAD = 1.0
+"""Standard deviation of the smoothing over cells."""
+GATE = 0.15
+"""Largest difference of log depth: what differs more is another surface."""
+LEAST_MASS = 0.35
+"""Smoothed number of points in a cell below which a neighbour says nothing there."""
+ROUNDS = 2
+"""Of correction by slots and averaging over views."""
+
+
+def optimised_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> np.ndarray:
+    """Depth of every pixel that has a metric prior, corrected by the slots; float32 `[H, W]` metres, NaN = none.
+
+    depth: what is corrected, float32 `[H, W]`; by default the prior.
+    """
+    depth = keyframe.depth.astype(np.float32) if depth is None else depth
+    log_depth = np.log(depth)
+    pixels, correction, weight = _corrections(keyframe, log_depth)
+    if not len(pixels):
+        return depth
+    height, width = depth.shape
+    low = float(np.nanmin(log_depth))
+    shape = (
+        int(height / CELL) + 3,
+        int(width / CELL) + 3,
+        int((float(np.nanmax(log_depth)) - low) / DEPTH_CELL) + 3,
+    )
+    columns, rows = np.rint(pixels).astype(int).T
+    at = np.stack([pixels[:, 1] / CELL, pixels[:, 0] / CELL, (log_depth[rows, columns] - low) / DEPTH_CELL])
+    cell = tuple(np.rint(at).astype(int) + 1)
+    mass, moment = np.zeros(shape), np.zeros(shape)
+    np.add.at(mass, cell, weight)
+    np.add.at(moment, cell, weight * correction)
+    mass, moment = (gaussian_filter(grid, 1.0, mode="constant") for grid in (mass, moment))
+    # A weak pull towards no correction: far from any slot the prior stands.
+    field = moment / (mass + 0.02)
+    known = np.isfinite(log_depth)
+    y, x = np.nonzero(known)
+    place = np.stack([y / CELL + 1, x / CELL + 1, (log_depth[known] - low) / DEPTH_CELL + 1])
+    result = depth.copy()
+    result[known] = depth[known] * np.exp(map_coordinates(field, place, order=1, mode="nearest"))
+    return result
+
+
+def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels, log depth corrections and weights of the slots that have both an estimate and a prior."""
+    slots = keyframe.points
+    height, width = log_depth.shape
+    columns, rows = np.rint(slots.pixels).astype(int).T
+    here = log_depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        estimate = -np.log(slots.inverse_depth)
+        correction = estimate - here
+        # A slot that stands at its prior has taken no part in an adjustment.
+        adjusted = estimate != -np.log(slots.prior)
+    good = np.isfinite(correction) & adjusted & (np.abs(correction) < LARGEST_CORRECTION)
+    return slots.pixels[good], correction[good], slots.confidence[good] * slots.prior_confidence[good]
+
+
+def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[np.ndarray | None]:
+    """Dense depth of each keyframe, corrected by its slots and averaged with its neighbours' views.
+
+    Args:
+        keyframes: in the order of time; poses world -> camera.
+        intrinsics: float64 [4], pixels.
+
+    Returns:
+        float32 [H, W] metres for each keyframe, NaN where it has no depth; None where it has none at all.
+
+    """
+    depths: list[np.ndarray | None] = [
+        keyframe.depth.astype(np.float32) if np.any(np.isfinite(keyframe.depth)) else None for keyframe in keyframes
+    ]
+    for _ in range(ROUNDS):
+        pairs = list(zip(keyframes, depths, strict=True))
+        corrected = [None if depth is None else optimised_depth(keyframe, depth) for keyframe, depth in pairs]
+        pairs = list(zip(keyframes, corrected, strict=True))
+        clouds = [None if depth is None else _world_points(depth, keyframe, intrinsics) for keyframe, depth in pairs]
+        depths = [
+            None if depth is None else _averaged(depth, keyframe, _around(clouds, i), intrinsics)
+            for i, (keyframe, depth) in enumerate(pairs)
+        ]
+    return depths
+
+
+def _around(clouds: Sequence[np.ndarray | None], i: int) -> list[np.ndarray]:
+    """The neighbours' points, of those that have any."""
+    numbers = [i + sign * offset for offset in OFFSETS for sign in (-1, 1)]
+    return [cloud for j in numbers if 0 <= j < len(clouds) and (cloud := clouds[j]) is not None]
+
+
+def _world_points(depth: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> np.ndarray:
+    rows, columns = np.mgrid[STEP // 2 : depth.shape[0] : STEP, STEP // 2 : depth.shape[1] : STEP].reshape(2, -1)
+    z = depth[rows, columns].astype(np.float64)
+    known = np.isfinite(z)
+    pixels = np.column_stack([columns[known], rows[known]]).astype(np.float64)
+    return rigid.unproject(pixels, 1.0 / z[known], keyframe.pose, intrinsics)
+
+
+def _averaged(depth: np.ndarray, keyframe: Keyframe, others: list[np.ndarray], intrinsics: np.ndarray) -> np.ndarray:
+    height, width = depth.shape
+    cells = (-(-height // STEP), -(-width // STEP))
+    total, views = np.zeros(cells), np.ones(cells)  # the keyframe's own view, with no correction, counts as one
+    for points in others:
+        local = points @ keyframe.pose[:3, :3].T + keyframe.pose[:3, 3]
+        local = local[local[:, 2] > 0.1]
+        z = local[:, 2]
+        columns = np.rint(intrinsics[0] * local[:, 0] / z + intrinsics[2]).astype(int)
+        rows = np.rint(intrinsics[1] * local[:, 1] / z + intrinsics[3]).astype(int)
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        rows, columns = rows[inside], columns[inside]
+        difference = np.log(z[inside] / depth[rows, columns])
+        same = np.abs(difference) < GATE  # false where the depth is NaN
+        cell = (rows[same] // STEP) * cells[1] + columns[same] // STEP
+        mass, moment = (_smoothed(cell, weights, cells) for weights in (np.ones(len(cell)), difference[same]))
+        seen = mass > LEAST_MASS
+        total[seen] += moment[seen] / mass[seen]
+        views[seen] += 1
+    correction = cv2.resize((total / views).astype(np.float32), (cells[1] * STEP, cells[0] * STEP))
+    return depth * np.exp(correction[:height, :width])
+
+
+def _smoothed(cell: np.ndarray, weights: np.ndarray, cells: tuple[int, int]) -> np.ndarray:
+    grid = np.bincount(cell, weights, cells[0] * cells[1]).reshape(cells).astype(np.float32)
+    return cv2.GaussianBlur(grid, (0, 0), SPREAD, borderType=cv2.BORDER_CONSTANT)
