@@ -359,7 +359,7 @@ class StartGuess:
     """The geometry of the first two views, with the first camera as the world and a baseline of length 1.
 
     pose: float64 [4, 4], first camera -> second camera. points: float64 [n, 3] in the first camera, NaN where not
-    triangulated. inliers: bool [n]. parallax: median angle of the inliers' rays, radians.
+    known. inliers: bool [n]. parallax: median angle of the inliers' rays, radians.
     """
 
     pose: np.ndarray
@@ -382,8 +382,17 @@ class InitialGeometry(Protocol):
         """The pose of the query's frame in the world its points live in. Failure is a result code."""
         ...
 
-    def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
-        """Motion and structure from the matches of two views, float [n, 2] each, up to scale."""
+    def start(
+        self,
+        pixels_i: np.ndarray,
+        pixels_j: np.ndarray,
+        intrinsics: np.ndarray,
+        images: Sequence[np.ndarray] = (),
+    ) -> StartGuess:
+        """Motion and structure from the matches of two views, float [n, 2] each, up to scale.
+
+        images: the two views, uint8 [H, W, 3], for an implementation that looks at them; may be empty.
+        """
         ...
 
 

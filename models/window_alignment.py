@@ -16,9 +16,9 @@ _ENOUGH_PIXELS = 5000
 def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray] = ()) -> WindowGuess | None:
     """The window in the world in which `poses` are, with metric translations and depths; None if that is undetermined.
 
-    Its scale s is the confidence-weighted median of `depths` / window depth, where depths are given; else, unless the
-    window is metric, the ratio of the spreads of the camera centres. Then X_window = R X_world + t is the rotation
-    closest to all G_k^-1 P_k (chordal mean) and the translation that makes the mean centres coincide.
+    Its scale s is the confidence-weighted median of `depths` / window depth, where both are known somewhere; else,
+    unless the window is metric, the ratio of the spreads of the camera centres. Then X_window = R X_world + t is the
+    rotation closest to all G_k^-1 P_k (chordal mean) and the translation that makes the mean centres coincide.
 
     poses: float [k, 4, 4], world -> camera, of the first k views of the window. depths: of those views, float [H, W]
     in metres, NaN = none.
@@ -42,8 +42,9 @@ def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndar
 
 
 def _scale(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray], use: np.ndarray) -> float | None:
-    if depths:
-        return _depth_scale(guess, depths, use)
+    by_depth = _depth_scale(guess, depths, use)
+    if by_depth is not None:
+        return by_depth
     if guess.metric:
         return 1.0
     spreads = [np.linalg.norm(centres - centres.mean(axis=0)) for centres in _two_centres(guess.poses, poses, use)]

@@ -58,6 +58,14 @@ def test_what_is_undetermined_is_none() -> None:
     assert align_window(_guess(), np.stack([POSES[0]] * 3)) is None
 
 
+def test_a_window_without_any_known_depth_takes_its_scale_from_the_cameras() -> None:
+    # Proves that depth which failed on every view does not cost the window. Oracle: the world it was taken from.
+    nothing = [np.full_like(depth, np.nan) for depth in DEPTHS[:3]]
+    aligned = align_window(_guess(), POSES[:3], nothing)
+    assert aligned is not None
+    np.testing.assert_allclose(aligned.poses, POSES, atol=1e-6)
+
+
 def _query(points: np.ndarray, window: int = 3) -> roles.PoseQuery:
     return roles.PoseQuery(
         image=IMAGES[3],
@@ -87,6 +95,60 @@ def test_matches_have_the_last_word(found: bool) -> None:
     located = WindowLocator(_Model(guess), PnpGeometry()).locate(_query(views.cloud(80)))
     assert located.result is GeometryResult.SUCCESS
     np.testing.assert_allclose(located.pose, POSES[3], atol=1e-6)
+
+
+FAR = views.pose((0.0, 1.0, 0.0), (-0.1, 0.0, 0.0))
+NEAR = views.pose((0.0, 1.0, 0.0), (-0.02, 0.0, 0.0))
+
+
+def _first_two(motion: np.ndarray, factor: float = 1.0) -> tuple[_Model, np.ndarray, np.ndarray, np.ndarray]:
+    """A model of two views in another frame and scale, its depth known at matched pixels alone; these and the points.
+
+    factor: of the depth of every other match, so that 1 is a model that is right.
+    """
+    points = views.cloud(200)
+    pixels_i, pixels_j = views.project(points, np.eye(4)), views.project(points, motion)
+    depth = np.full((2, *views.SIZE[::-1]), np.nan, np.float32)
+    columns, rows = np.rint(pixels_i).astype(int).T
+    depth[0, rows, columns] = SCALE * points[:, 2]
+    depth[0, rows[::2], columns[::2]] *= np.float32(factor)
+    poses = np.stack([ELSEWHERE, motion @ ELSEWHERE])
+    poses[:, :3, 3] *= SCALE
+    guess = roles.WindowGuess(poses, views.INTRINSICS, depth, 1.0 * (depth > 0), np.ones(2, bool))
+    return _Model(guess), pixels_i, pixels_j, points
+
+
+def test_the_model_starts_a_map_that_two_views_cannot() -> None:
+    # Proves that the first two views start from the model's depth where they have too little parallax to triangulate,
+    # the unit being the baseline. Oracle: the true motion and points; and two views alone, which must refuse.
+    motion = views.pose((0.0, 1.0, 0.0), (-0.08, 0.0, 0.0))
+    model, pixels_i, pixels_j, points = _first_two(motion)
+    judge = PnpGeometry()
+    alone = judge.start(pixels_i, pixels_j, views.INTRINSICS)
+    assert alone.result is GeometryResult.LOW_PARALLAX
+    guess = WindowLocator(model, judge).start(pixels_i, pixels_j, views.INTRINSICS, IMAGES[:2])
+    assert guess.result is GeometryResult.SUCCESS
+    assert guess.inliers.all()
+    np.testing.assert_allclose(guess.pose[:3, :3], motion[:3, :3], atol=1e-5)
+    np.testing.assert_allclose(guess.pose[:3, 3], [-1.0, 0.0, 0.0], atol=1e-4)
+    np.testing.assert_allclose(0.08 * guess.points, points, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("motion", "factor", "images"),
+    [(FAR, 40.0, IMAGES[:2]), (NEAR, 1.0, IMAGES[:2]), (FAR, 1.0, ())],
+    ids=["wrong depth", "no parallax", "no images"],
+)
+def test_matches_alone_start_a_map_where_the_model_cannot(
+    motion: np.ndarray, factor: float, images: tuple[np.ndarray, ...]
+) -> None:
+    # Proves that a model which the matches contradict, a baseline too short to hold the scale, and missing images all
+    # leave the start to the judge. Oracle: the judge's own answer.
+    model, pixels_i, pixels_j, _ = _first_two(motion, factor)
+    alone = PnpGeometry().start(pixels_i, pixels_j, views.INTRINSICS)
+    guess = WindowLocator(model, PnpGeometry(), least=120).start(pixels_i, pixels_j, views.INTRINSICS, images)
+    assert guess.result is alone.result
+    np.testing.assert_array_equal(guess.pose, alone.pose)
 
 
 def test_without_keyframes_the_judge_works_alone() -> None:

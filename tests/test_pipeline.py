@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
 import pytest
 from vggtgeo.models.classical import ConstantVelocity, NoDepth, SiftMatcher
+from vggtgeo.models.roles import Features, PointMatcher, PointMatches
 
 from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame
@@ -105,6 +106,66 @@ def test_rgb_recovers_the_shape(room) -> None:
     error = evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse
     assert not slam.metric
     assert len(slam.frames) == len(frames)
+    assert error < 0.03, f"ATE after Sim(3) {error:.4f} m"
+
+
+@dataclass(frozen=True)
+class _Dense:
+    """A matcher whose targets are no key points, as MASt3R's are."""
+
+    own: SiftMatcher = field(default_factory=lambda: SiftMatcher(count=500))
+
+    def describe(self, image: np.ndarray) -> Features:
+        return self.own.describe(image)
+
+    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
+        found = self.own.match(features_i, features_j, predicted)
+        return replace(found, index_j=np.full(len(found), -1))
+
+
+def _blind(frames: list[Frame], numbers: Iterable[int]) -> list[Frame]:
+    """The frames, those of `numbers` without a valid depth."""
+    nothing = np.full((SIZE[1], SIZE[0]), np.nan, np.float32)
+    return [replace(frame, depth=nothing) if frame.index in numbers else frame for frame in frames]
+
+
+def test_a_map_begins_where_depth_does(room) -> None:
+    """Depth that fails on the first three frames costs neither the scale nor their poses; oracle: the true poses."""
+    frames, camera, truth = room
+    slam = _run(_blind(frames, range(3)), camera)
+    error = evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
+    assert slam.metric
+    assert all(record.tracked for record in slam.frames)
+    assert any("the map begins at frame 3" in note for note in slam.notes), slam.notes
+    assert error < 0.015, f"ATE {error:.4f} m"
+
+
+@pytest.mark.parametrize("points", [ROLES.points, _Dense()], ids=["key points", "dense"])
+def test_depth_that_fails_on_keyframes_leaves_map_and_scale(room, tracked: Slam, points: PointMatcher) -> None:
+    """Keyframes without depth, also where matches end at no key point, neither start a new map nor change the scale.
+
+    Oracle: the renderer's poses.
+    """
+    frames, camera, truth = room
+    blind = [keyframe.frame for keyframe in tracked.keyframes[1:]][::3]
+    slam = _run(_blind(frames, blind), camera, replace(ROLES, points=points))
+    assert len(blind) >= 2
+    assert any(keyframe.frame in blind for keyframe in slam.keyframes), "no keyframe was without depth"
+    error = evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
+    assert slam.metric
+    assert len(slam.origins) == 1
+    assert error < 0.02, f"ATE {error:.4f} m"
+
+
+def test_metric_depth_that_never_comes_frees_the_scale(room) -> None:
+    """Where the depth role knows nothing at first, the map starts with a free scale, says so, and ignores later depth,
+    which would contradict it; oracle: the renderer's poses up to scale."""
+    frames, camera, truth = room
+    slam = _run(_blind(frames, range(20)), camera)
+    error = evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse
+    assert not slam.metric
+    assert any("the scale is free from here on" in note for note in slam.notes), slam.notes
+    assert not any(np.isfinite(keyframe.depth).any() for keyframe in slam.keyframes)
     assert error < 0.03, f"ATE after Sim(3) {error:.4f} m"
 
 

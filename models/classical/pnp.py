@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -55,8 +56,14 @@ class PnpGeometry:
             return failed_guess(query, GeometryResult.TOO_FEW_INLIERS)
         return PoseGuess(pose, inliers, float(np.median(error)), GeometryResult.SUCCESS)
 
-    def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
-        """Motion and structure of the first two views; see `InitialGeometry.start`."""
+    def start(
+        self,
+        pixels_i: np.ndarray,
+        pixels_j: np.ndarray,
+        intrinsics: np.ndarray,
+        images: Sequence[np.ndarray] = (),
+    ) -> StartGuess:
+        """Motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
         return self.two_view.start(pixels_i, pixels_j, intrinsics)
 
     def _sample(self, query: PoseQuery) -> np.ndarray | None:
@@ -106,8 +113,14 @@ class ConstantVelocity:
         error = float(np.median(errors[inliers])) if inliers.any() else float("nan")
         return PoseGuess(query.predicted, inliers, error, GeometryResult.SUCCESS)
 
-    def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
-        """Motion and structure of the first two views; see `InitialGeometry.start`."""
+    def start(
+        self,
+        pixels_i: np.ndarray,
+        pixels_j: np.ndarray,
+        intrinsics: np.ndarray,
+        images: Sequence[np.ndarray] = (),
+    ) -> StartGuess:
+        """Motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
         return self.two_view.start(pixels_i, pixels_j, intrinsics)
 
 

@@ -42,7 +42,7 @@ class TwoViewStart:
             turned = self._only_turned(rays_i[agrees], rays_j[agrees], intrinsics)
             reason = GeometryResult.LOW_PARALLAX if turned else GeometryResult.TOO_FEW_INLIERS
             return _failed(len(pixels_i), reason)
-        parallax = float(np.median(_angles(points[inliers], pose)))
+        parallax = median_parallax(points[inliers], pose)
         if parallax < self.parallax or self._only_turned(rays_i[inliers], rays_j[inliers], intrinsics):
             return StartGuess(pose, points, inliers, parallax, GeometryResult.LOW_PARALLAX)
         return StartGuess(pose, points, inliers, parallax, GeometryResult.SUCCESS)
@@ -117,10 +117,11 @@ def _triangulate(
     return np.where(good[:, None], midpoint, np.nan), good
 
 
-def _angles(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def median_parallax(points: np.ndarray, pose: np.ndarray) -> float:
+    """Median angle, radians, between the rays to points [n, 3] (first camera) from the first and the second camera."""
     second = points - (-pose[:3, :3].T @ pose[:3, 3])
     cosine = (points * second).sum(axis=1) / (np.linalg.norm(points, axis=1) * np.linalg.norm(second, axis=1))
-    return np.arccos(np.clip(cosine, -1.0, 1.0))
+    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def _rotation_between(rays_i: np.ndarray, rays_j: np.ndarray) -> np.ndarray:

@@ -66,9 +66,16 @@ def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> f
 def match_keyframes(
     first: Keyframe, second: Keyframe, roles: Roles, settings: SlamSettings, intrinsics: np.ndarray
 ) -> Pair | None:
-    """Match two keyframes whose poses are known well enough to predict; None if they share too little."""
-    if overlap(some_points(first, intrinsics), second, intrinsics) < settings.least_overlap:
-        return None
+    """Match two keyframes whose poses are known well enough to predict; None if they share too little.
+
+    Where no depth is known in the first, that of the second tells what they share; without any, the matches do.
+    """
+    for one, other in ((first, second), (second, first)):
+        seen = some_points(one, intrinsics)
+        if len(seen):
+            if overlap(seen, other, intrinsics) < settings.least_overlap:
+                return None
+            break
     relative = second.pose @ rigid.invert(first.pose)
     points = roles.points.match(first.features, second.features, None)
     points = points.select(_consistent(points, first, relative, intrinsics, settings))

@@ -15,7 +15,7 @@ from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.start import start_without_depth
+from vggtgeo.slam.start import begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
 from vggtgeo.slam.tracking import Track, track_any
 from vggtgeo.slam.window import adjust, enter
@@ -38,12 +38,20 @@ def step(
 ) -> Slam:
     """Take one frame (undistorted) with its described key points into the state."""
     clock = clock or Clock()
+    if not slam.metric:
+        roles = without_depth(roles)
     if not slam.keyframes:
         return _first(slam, frame, features, roles, settings)
-    if not np.any(np.isfinite(slam.keyframes[slam.window[-1]].points.inverse_depth)):
+    if not _started(slam):
         with clock.measure("start"):
-            return start_without_depth(slam, frame, features, roles, settings)
+            begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
+            return begun or start_without_depth(slam, frame, features, roles, settings)
     return _follow(slam, frame, features, roles, settings, clock)
+
+
+def _started(slam: Slam) -> bool:
+    """Whether there is a map to track in. A later keyframe may well be without depth: its neighbours have some."""
+    return len(slam.window) > 1 or bool(np.any(np.isfinite(slam.keyframes[slam.window[-1]].points.inverse_depth)))
 
 
 def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:

@@ -1,4 +1,4 @@
-"""The start of a sequence without depth: two views with parallax give the first map, of nominal scale."""
+"""The start where the first keyframe has no depth: a later frame may have some, or two views give a first map."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, GeometryResult, PoseQuery
 from vggtgeo.slam import rigid
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
@@ -19,13 +20,54 @@ NOMINAL_DEPTH = 2.5
 MOST_WAITING = 90
 
 
+def without_depth(roles: Roles) -> Roles:
+    """The same roles, but nobody asks for metric depth: that of a map whose scale is free would contradict it."""
+    return replace(roles, depth=NoDepth()) if roles.metric else roles
+
+
+def begin_again_with_depth(
+    slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings
+) -> Slam | None:
+    """The map begins at this frame in place of the first keyframe, whose depth is not known.
+
+    None where this frame's depth is known at fewer than `least_inliers` key points.
+    """
+    depth = roles.depth.estimate(frame.image, frame.depth, tuple(slam.intrinsics))
+    if not np.any(np.isfinite(depth.depth)):
+        return None
+    blind = slam.keyframes[slam.window[-1]]
+    keyframe = make_keyframe(blind.number, frame, blind.pose, features, roles, settings, slam.intrinsics)
+    if np.count_nonzero(np.isfinite(keyframe.points.inverse_depth)) < settings.least_inliers:
+        return None
+    note = f"the depth of frame {blind.frame} is not known; the map begins at frame {frame.index} ({frame.name})"
+    before = tuple(
+        replace(record, tracked=False, inliers=0) if record.frame == blind.frame else record for record in slam.frames
+    )
+    record = FramePose(frame.index, frame.timestamp, blind.number, np.eye(4), True, len(features))
+    waiting = (Waiting(blind.frame, blind.timestamp, blind.image, blind.features), *slam.waiting)
+    slam = replace(
+        slam,
+        keyframes=(*slam.keyframes[:-1], keyframe),
+        frames=(*before, record),
+        waiting=waiting,
+        notes=(*slam.notes, note),
+    )
+    return replace(_place_waiting(slam, keyframe, roles), waiting=())
+
+
 def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
-    """Try to start a map from the first keyframe and this frame; until that works, the frame waits."""
+    """Try to start a map of free scale from the first keyframe and this frame; until that works, the frame waits."""
     first = slam.keyframes[slam.window[-1]]
     matches = roles.points.match(first.features, features)
-    guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics)
+    guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics, (first.image, frame.image))
     if guess.result is not GeometryResult.SUCCESS:
         return _wait(slam, frame, features)
+    if slam.metric:
+        note = (
+            f"neither frame {first.frame} nor frame {frame.index} has metric depth: "
+            "the scale is free from here on, and later depth is not used"
+        )
+        slam, roles = replace(slam, metric=False, notes=(*slam.notes, note)), without_depth(roles)
     scale = NOMINAL_DEPTH / float(np.median(guess.points[guess.inliers, 2]))
     relative = guess.pose.copy()
     relative[:3, 3] *= scale
