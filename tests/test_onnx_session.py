@@ -135,6 +135,17 @@ def test_sizes_that_a_file_leaves_open_are_accepted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found["pred_lines"], outputs["pred_lines"])
 
 
+def test_calls_are_counted_once_a_network_is_warm(tmp_path: Path) -> None:
+    # Proves that a session counts what it was asked, without its warming up. Oracle: the number of calls made here.
+    session = open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
+    session.warm_up()
+    assert (session.tally.calls, session.tally.seconds) == (0, 0.0)
+    for _ in range(3):
+        session.run({"image": np.zeros((1, 3, 48, 64), np.float32)})
+    assert session.tally.calls == 3
+    assert session.tally.seconds > 0
+
+
 def test_half_precision_goes_in_and_comes_back(tmp_path: Path) -> None:
     # Proves that a float16 file takes float32 arrays and gives them back. Oracle: values that float16 holds exactly.
     session = open_session(tiny.vggt(tmp_path / "half.onnx", dtype=np.float16), contracts.VGGT)

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,15 +81,34 @@ def test_a_run_asks_every_network_and_from_a_cache_none(
     settings = SlamSettings(global_adjustment=False)
     poses = []
     for expected in (set(NEEDED[preset]), set()):
-        roles = perception(preset, Roles(), files, tmp_path / "cache").roles
+        found = perception(preset, Roles(), files, tmp_path / "cache")
         counted.clear()
-        *_, slam = run(walk, roles, settings)
+        *_, slam = run(walk, found.roles, settings)
         assert set(counted) == expected
+        said = found.facts()["networks"]
+        assert {name: network["calls"] for name, network in said.items() if network["calls"]} == counted
+        assert all((network["seconds"] > 0) == (network["calls"] > 0) for network in said.values())
         assert len(slam.frames) == 8
         assert len(slam.keyframes) >= 2
         poses.append(frame_trajectory(slam).poses)
     assert np.isfinite(poses[0]).all()
     np.testing.assert_array_equal(poses[0], poses[1])
+
+
+def test_depth_that_knows_nothing_leaves_every_other_network_its_part(
+    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
+) -> None:
+    # Proves that a run whose depth network finds no depth at all still asks every network, VGGT among them, for each
+    # frame, and gives finite poses and a scale that is called free if there is a map. Oracle: a count.
+    folder = tmp_path / "models"
+    shutil.copytree(files, folder)
+    tiny.moge2(folder / "moge2.onnx", SIZE, mask=0.1)
+    found = perception("paper", Roles(), folder)
+    *_, slam = run(walk, found.roles, SlamSettings(global_adjustment=False), end=4)
+    assert set(counted) == set(NEEDED["paper"])
+    assert counted["vggt"] >= 3
+    assert np.isfinite(frame_trajectory(slam).poses).all()
+    assert slam.waiting or not slam.metric
 
 
 def test_an_interrupted_run_goes_on(
@@ -113,8 +133,10 @@ def called(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     """What `vggtgeo run` would do: the run itself is left out."""
     given: dict[str, object] = {}
 
-    def stand_in(sequence: object, roles: Roles, *_: object, facts: object, **__: object) -> SimpleNamespace:
-        given.update(roles=roles, facts=facts)
+    def stand_in(
+        sequence: object, roles: Roles, *_: object, facts: Callable[[], dict], **__: object
+    ) -> SimpleNamespace:
+        given.update(roles=roles, facts=facts())
         return SimpleNamespace(interrupted=False)
 
     module = importlib.import_module(RUN_AND_WRITE)
@@ -222,6 +244,7 @@ def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
     # Proves that `vggtgeo run --preset paper` writes every output, and the warning into its summary and its page.
     summary = _whole_run(tmp_path, files, SIZE[::-1])
     assert summary["frames"] == 10
+    assert all(network["calls"] > 0 for network in summary["networks"].values()), summary["networks"]
     assert "this result means nothing" in summary["meaningless"]
     assert "this result means nothing" in (tmp_path / "run" / "report.html").read_text()
 
@@ -264,4 +287,6 @@ def test_real_exports_keep_their_contracts_and_run(tmp_path: Path) -> None:
         result = CliRunner().invoke(make_app(), ["models", "verify", str(file), "--runs", "1", "--json"])
         assert result.exit_code == 0, result.output
         assert json.loads(result.output)["network"] == NETWORKS[name].contract_name
-    assert _whole_run(tmp_path, folder, (640, 480))["frames"] == 10
+    summary = _whole_run(tmp_path, folder, (640, 480))
+    assert summary["frames"] == 10
+    assert all(network["calls"] > 0 for network in summary["networks"].values()), summary["networks"]

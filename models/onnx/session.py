@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -74,6 +75,14 @@ class DeviceArray:
 Input = np.ndarray | DeviceArray
 
 
+@dataclass
+class Tally:
+    """How often a network ran since it was warm, and the seconds of that. Nothing is computed from it."""
+
+    calls: int = 0
+    seconds: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Session:
     """A network's file that keeps its contract, ready to run. Made by `open_session`."""
@@ -85,6 +94,7 @@ class Session:
     outputs: Signatures
     metadata: Mapping[str, str]
     session: onnxruntime.InferenceSession = field(repr=False)
+    tally: Tally = field(default_factory=Tally, repr=False)
 
     @property
     def random_weights(self) -> bool:
@@ -114,6 +124,7 @@ class Session:
     def run_on_device(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, DeviceArray]:
         """The same, left on the device in the file's own element type; nothing is checked."""
         names = list(self.outputs if wanted is None else wanted)
+        began = time.perf_counter()
         binding = self.session.io_binding()
         for name, value in inputs.items():
             binding.bind_ortvalue_input(name, self._on_device(name, value))
@@ -123,6 +134,8 @@ class Session:
             self.session.run_with_iobinding(binding)
         except _RUNTIME_ERRORS as error:
             raise NetworkRunError(f"`{self.path}` failed on {self.provider}: {error}") from None
+        self.tally.calls += 1
+        self.tally.seconds += time.perf_counter() - began
         return dict(zip(names, map(DeviceArray, binding.get_outputs()), strict=True))
 
     def warm_up(self, seed: int = 0) -> None:
@@ -138,6 +151,7 @@ class Session:
         if set(fixed) == set(self.inputs):
             noise = np.random.default_rng(seed)
             self.run({name: noise.uniform(size=shape) for name, shape in fixed.items()})
+            self.tally.calls, self.tally.seconds = 0, 0.0
 
     def _on_device(self, name: str, value: Input) -> onnxruntime.OrtValue:
         if isinstance(value, DeviceArray):
@@ -158,7 +172,7 @@ def open_session(
     """Open `path` and check it against `contract`; raises `NetworkFileError` for any file that is not that network.
 
     provider: "auto" takes CUDA where onnxruntime offers it. memory_limit_gb: most memory the network may take on
-    CUDA. threads: of one operator on the CPU, None for onnxruntime's own choice.
+    CUDA, weights included, or it fails. threads: of one operator on the CPU, None for onnxruntime's own choice.
     """
     path = Path(path)
     check_looks_like_onnx(path)

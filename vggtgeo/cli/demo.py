@@ -46,7 +46,7 @@ def demo(
         quiet=quiet,
         label=f"simulated {scene}",
         rerun=rerun,
-        facts={"simulated": True},
+        facts=lambda: {"simulated": True},
     )
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))

@@ -54,7 +54,7 @@ class Perception:
         return [name for name, session in self.networks.items() if session.random_weights]
 
     def facts(self) -> dict[str, Any]:
-        """For the summary: each network's file, its hash, its weights and where it runs; and a warning, if any."""
+        """For the summary: each network's file, hash, weights, device, calls so far; and a warning, if any."""
         if not self.networks:
             return {}
         described = {
@@ -63,6 +63,8 @@ class Perception:
                 "sha256": session.digest,
                 "weights": session.metadata.get("vggtgeo.weights", "as published"),
                 "runs_on": session.provider,
+                "calls": session.tally.calls,
+                "seconds": round(session.tally.seconds, 3),
             }
             for name, session in self.networks.items()
         }
@@ -80,11 +82,13 @@ def perception(
     folder: Path | None = None,
     cache: Path | None = None,
     provider: Provider = "auto",
+    memory_limit_gb: float | None = None,
 ) -> Perception:
     """The role objects of a preset; those it has no network for are taken from `classical`.
 
-    folder: of the networks' files, see `networks_folder`. cache: folder for what they answer, or None. Every file is
-    opened, checked and warmed up here. Raises `InputError` for an unknown preset, a missing file, or a wrong one.
+    folder: of the networks' files, see `networks_folder`. cache: folder for what they answer, or None. provider,
+    memory_limit_gb: of each network, see `open_session`. Every file is opened, checked and warmed up here. Raises
+    `InputError` for an unknown preset, a missing file, or a wrong one.
     """
     if preset not in NEEDED:
         raise InputError(f"`--preset` is {preset!r}; it must be one of {', '.join(NEEDED)}")
@@ -94,7 +98,12 @@ def perception(
     _check_present(preset, place)
     with as_input_errors():
         networks = {
-            name: open_session(place / NETWORKS[name].file, NETWORKS[name].contract, provider=provider)
+            name: open_session(
+                place / NETWORKS[name].file,
+                NETWORKS[name].contract,
+                provider=provider,
+                memory_limit_gb=memory_limit_gb,
+            )
             for name in NEEDED[preset]
         }
         build = _paper if preset == "paper" else _light

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Init = Literal["pnp", "constant-velocity"]
 Features = Literal["sift", "orb"]
 Preset = Literal["classical", "light", "paper"]
+Provider = Literal["auto", "cuda", "cpu"]
 RerunOption = Annotated[
     str | None,
     typer.Option("--rerun", metavar="TARGET", help="Log to Rerun: spawn, serve, or a file ending with .rrd."),
@@ -55,6 +56,10 @@ def run(
     ] = "classical",
     models: Annotated[Path | None, typer.Option("--models", help="Folder of the networks' files.")] = None,
     cache: Annotated[Path | None, typer.Option("--cache", help="Folder to keep what the networks answer.")] = None,
+    provider: Annotated[Provider, typer.Option(help="Where networks run.")] = "auto",
+    memory_limit_gb: Annotated[
+        float | None, typer.Option(help="Most GPU memory of each network, GB; has no effect on the CPU.")
+    ] = None,
     save_depth: Annotated[bool, typer.Option("--save-depth", help="Write each keyframe's dense depth.")] = False,
     rerun: RerunOption = None,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
@@ -85,7 +90,9 @@ def run(
     )
     if preset == "paper" and features != "sift":
         raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
-    perceived = make_perception(preset, make_roles(sequence, init, features), models, cache)
+    if memory_limit_gb is not None and not memory_limit_gb > 0:
+        raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be positive")
+    perceived = make_perception(preset, make_roles(sequence, init, features), models, cache, provider, memory_limit_gb)
     with as_input_errors():
         finished = run_and_write(
             sequence,
@@ -97,7 +104,7 @@ def run(
             save_depth=save_depth,
             rerun=rerun,
             quiet=quiet or as_json,
-            facts=perceived.facts(),
+            facts=perceived.facts,
         )
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
@@ -107,11 +114,18 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED)
 
 
-def make_perception(preset: str, classical: Roles, models: Path | None, cache: Path | None) -> Perception:
+def make_perception(
+    preset: str,
+    classical: Roles,
+    models: Path | None,
+    cache: Path | None,
+    provider: Provider,
+    memory_limit_gb: float | None,
+) -> Perception:
     """The roles of a preset; warns of networks whose weights are random."""
     from vggtgeo.cli.presets import perception
 
-    perceived = perception(preset, classical, models, cache)
+    perceived = perception(preset, classical, models, cache, provider, memory_limit_gb)
     if perceived.random:
         warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
     return perceived

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from rich.console import Console
@@ -48,13 +47,14 @@ def run_and_write(
     save_depth: bool = False,
     quiet: bool = False,
     label: str = "",
-    facts: Mapping[str, Any] = MappingProxyType({}),
+    facts: Callable[[], Mapping[str, Any]] = dict,
     rerun: str | None = None,
 ) -> Finished:
     """Run a sequence with a progress bar, write every output into `folder`, and print the report.
 
     flags: the effective settings, by the names of the flags; `settings.toml` and `summary.json` hold them.
-    facts: what else the summary shall say. rerun: where to log the run, see `vggtgeo/viewing/target.py`.
+    facts: what else the summary shall say, asked for at the end. rerun: where to log the run, see
+    `vggtgeo/viewing/target.py`.
     """
     console = Console(stderr=False, quiet=quiet)
     watchers = () if rerun is None else (_rerun_watcher(rerun, label or sequence.name),)
@@ -83,13 +83,14 @@ def run_and_write(
         for watcher in watchers:
             watcher.finish(slam, cloud)
     report = outputs.compare(slam, truth)
+    told = facts()
     summary = outputs.write_summary(
         folder,
         slam,
         {name.replace("-", "_"): value for name, value in flags.items()},
         {**clock.seconds, "all": time.perf_counter() - began},
         report,
-        **facts,
+        **told,
         map_points=len(cloud),
         frames_per_second=round(fold.frames_per_second, 2),
         interrupted=fold.interrupted,
@@ -102,7 +103,7 @@ def run_and_write(
         cloud=cloud,
         records=recorder.records,
         summary={**summary, "settings": flags},
-        warnings=[*([facts["meaningless"]] if "meaningless" in facts else []), *said],
+        warnings=[*([told["meaningless"]] if "meaningless" in told else []), *said],
     )
     _print_report(console, slam, report, folder, fold.frames_per_second, len(cloud))
     return Finished(slam, fold.interrupted)
