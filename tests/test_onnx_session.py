@@ -74,13 +74,16 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "missing": (Path.unlink, "is not there, expected an ONNX file"),
     "folder": (_folder, "is a folder, expected an ONNX file"),
     "empty": (lambda path: path.write_bytes(b""), "is empty, expected an ONNX file"),
-    "truncated": (_truncated, "truncated or something else"),
-    "picture": (lambda path: path.write_bytes(b"\xff\xd8\xff\xe0" + bytes(100)), "truncated or something else"),
+    "truncated": (_truncated, "bytes that are cut off or something else"),
+    "picture": (
+        lambda path: path.write_bytes(b"\xff\xd8\xff\xe0" + bytes(100)),
+        "bytes that are cut off or something else",
+    ),
     "checkpoint": (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)), "PyTorch checkpoint: export it first"),
     "lfs": (lambda path: path.write_bytes(b"version https://git-lfs.github.com/spec/v1\n"), "git lfs pull"),
     "page": (lambda path: path.write_bytes(b"<!DOCTYPE html><html>"), "a web page"),
-    "no external data": (_without_data, "lacks its external data"),
-    "half its external data": (_with_half_its_data, "lacks its external data or has too little of it"),
+    "no external data": (_without_data, r"in `vggt\.onnx\.data`, which is not there"),
+    "half its external data": (_with_half_its_data, r"are cut off: found \d+ bytes, expected \d+ or more"),
 }
 
 

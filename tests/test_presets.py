@@ -215,6 +215,17 @@ def test_missing_and_wrong_files_end_the_run_before_any_frame(
     assert result.exit_code == 2
     assert "letr.onnx` is not a file of `letr`: expected outputs `pred_logits" in result.output
     assert "it looks like a file of `dinov3`" in result.output
+    shutil.copy(files / "letr.onnx", folder / "letr.onnx")
+    tiny.vggt(folder / "vggt.onnx", views=1)
+    result = _run(tmp_path, "--preset", "paper", "--models", folder)
+    assert result.exit_code == 2
+    assert "vggt.onnx` takes 1 image at a time, expected at least 2" in result.output
+    (folder / "mast3r_decoder.onnx").write_bytes(b"version https://git-lfs.github.com/spec/v1")
+    result = _run(tmp_path, "--preset", "paper", "--models", folder, "--memory-limit-gb", "0")
+    assert "`--memory-limit-gb` is 0; it must be positive" in result.output
+    result = _run(tmp_path, "--preset", "paper", "--models", folder)
+    assert result.exit_code == 2
+    assert "mast3r_decoder.onnx` is no ONNX file but a Git LFS pointer" in result.output
     assert called == {}
     assert not (tmp_path / "run").exists()
 

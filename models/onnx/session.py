@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import re
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -238,6 +239,19 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
 
 
 def _why_not_opened(path: Path, said: str) -> str:
+    absent = re.search(r'data path does not exist: "([^"]+)"', said)
+    if absent:
+        return (
+            f"`{path}` expects its weights beside it in `{Path(absent[1]).name}`, which is not there; copy that file "
+            "too, under this name, or export it again"
+        )
+    short = re.search(r"offset: (\d+) size to read: (\d+) given file_length: (\d+)", said)
+    if short:
+        offset, size, found = map(int, short.groups())
+        return (
+            f"the weights beside `{path}` are cut off: found {found} bytes, expected {offset + size} or more; "
+            "copy them again, or export it again"
+        )
     reason = " ".join(said.split())
     reason = f"onnxruntime: {reason if len(reason) < 200 else '... ' + reason[-200:]}"
     if "xternal" in said and ("data" in said or "initializer" in said):
@@ -246,8 +260,8 @@ def _why_not_opened(path: Path, said: str) -> str:
             f"exported; copy both, or export it again ({reason})"
         )
     return (
-        f"`{path}` is not an ONNX file that can be read, expected a whole one; it is truncated or something else: "
-        f"export or fetch it again ({reason})"
+        f"`{path}` is not an ONNX file that can be read: expected a whole one, found {path.stat().st_size} bytes that "
+        f"are cut off or something else; export or fetch it again ({reason})"
     )
 
 

@@ -21,6 +21,7 @@ from vggtgeo.cli.network_errors import as_input_errors
 from vggtgeo.errors import InputError
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
+from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
 from vggtgeo.models.onnx.letr import LetrDetector
 from vggtgeo.models.onnx.line_matcher import DenseLineMatcher
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
@@ -97,6 +98,8 @@ def perception(
     place = networks_folder(folder)
     _check_present(preset, place)
     with as_input_errors():
+        for name in NEEDED[preset]:
+            check_looks_like_onnx(place / NETWORKS[name].file)  # before gigabytes of others are read
         networks = {
             name: open_session(
                 place / NETWORKS[name].file,
@@ -126,7 +129,7 @@ def _light(classical: Roles, networks: Mapping[str, Session], cache: Path | None
 
 def _paper(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Roles:
     features = DinoFeatures(networks["dinov3"], _cache(cache))
-    window = VggtWindow(networks["vggt"], _cache(cache))
+    window = _check_views(VggtWindow(networks["vggt"], _cache(cache)))
     return Roles(
         points=Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache)),
         lines=LetrDetector(networks["letr"], _cache(cache)),
@@ -145,6 +148,15 @@ def _check_present(preset: str, place: Path) -> None:
     missing = [NETWORKS[name].file for name in NEEDED[preset] if not (place / NETWORKS[name].file).is_file()]
     if missing:
         raise InputError(
-            f"`--preset {preset}` needs {', '.join(missing)} in `{place}`, which are not there; "
-            "`vggtgeo models list` tells how to get each"
+            f"`--preset {preset}` needs {', '.join(missing)} in `{place}`, found no such "
+            f"{'files' if len(missing) > 1 else 'file'}; `vggtgeo models list` tells how to get each"
         )
+
+
+def _check_views(window: VggtWindow) -> VggtWindow:
+    if window.views is not None and window.views < 2:
+        raise NetworkFileError(
+            f"`{window.session.path}` takes {window.views} image at a time, expected at least 2, a keyframe and the "
+            "frame; export it again with `--views 4`"
+        )
+    return window
