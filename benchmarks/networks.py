@@ -1,27 +1,43 @@
 """Every network, exported with random weights (M-LSD with its own) and run: the table of docs/exporting.md.
 
     .venv/bin/python benchmarks/networks.py --checkouts FOLDER [--out runs/networks] [--only dinov3] [--threads 1]
+    .venv/bin/python benchmarks/networks.py --checkouts FOLDER --out runs/gpu --provider cuda --views 10 [--half]
 
 FOLDER holds checkouts of the networks' code, one folder each, under any name. Files that exist are not exported
 again. Each export and each measurement is a process of its own; memory is the largest resident memory of it.
 Printed as Markdown. Disk needed: 13 GB; memory: 8 GB (VGGT).
+
+With `--provider cuda` a call is timed by the clock, the memory is the GPU's, as nvidia-smi sees it rise (so nothing
+else may use that GPU), and the line after the table is the whole front end: all networks of the paper's preset
+loaded together, every role asked once a frame of a simulated walk. `--front-end` prints that line alone, on any
+provider.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import statistics
 import subprocess
 import sys
+import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vggtgeo.models.exporters.recipes import RECIPES
+from vggtgeo.models.onnx.file_checks import NetworkFileError
+from vggtgeo.models.onnx.session import choose_provider
+
+from vggtgeo.cli.presets import NEEDED
 
 CALLS = 3
+FRONT_END_FRAMES = 20
+PAPER_GB = 21.2
+"""GPU memory of the whole system in the paper."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +59,12 @@ ROWS = (
     Row("moge2-small", "moge2", ("--variant", "vits"), "480 x 640, 1800 patches"),
     Row("mast3r_encoder", "mast3r_encoder", (), "384 x 512"),
     Row("mast3r_decoder", "mast3r_decoder", (), "384 x 512, a pair"),
-    Row("vggt", "vggt", ("--views", "2"), "392 x 518, 2 views"),
+    Row("vggt", "vggt", (), "392 x 518"),
 )
+PROVIDERS = {
+    "cpu": ["CPUExecutionProvider"],
+    "cuda": [("CUDAExecutionProvider", {"arena_extend_strategy": "kSameAsRequested"})],
+}
 HEADINGS = (
     "file",
     "input",
@@ -66,16 +86,46 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/networks"))
     parser.add_argument("--only", help="one file's name")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--provider", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--views", type=int, default=2, help="images a window of VGGT")
+    parser.add_argument("--half", action="store_true", help="half precision where a network has it")
+    parser.add_argument(
+        "--front-end", type=int, metavar="FRAMES", help="only time all roles together on so many frames"
+    )
     parser.add_argument("--measure", type=Path, help=argparse.SUPPRESS)  # the process that measures one file
     arguments = parser.parse_args()
+    try:
+        choose_provider(arguments.provider)
+    except NetworkFileError as error:
+        raise SystemExit(str(error)) from None
     if arguments.measure:
-        print(json.dumps(measure(arguments.measure, arguments.threads)))
+        print(json.dumps(measure(arguments.measure, arguments.threads, arguments.provider)))
+        return
+    if arguments.front_end:
+        print(json.dumps(front_end(arguments.out, arguments.front_end, arguments.provider)))
         return
     print("| " + " | ".join(HEADINGS) + " |\n" + "|---" * len(HEADINGS) + "|")
-    for row in ROWS:
+    gigabytes = 0.0
+    for row in rows(arguments.views, arguments.half):
         if arguments.only in (None, row.name):
             report = exported(row, arguments.checkouts, arguments.out, arguments.threads)
-            print(line(row, report, measured(arguments.out / f"{row.name}.onnx", arguments.threads)), flush=True)
+            run = in_own_process(arguments, "--measure", str(arguments.out / f"{row.name}.onnx"))
+            gigabytes += run["gigabytes"] if row.name in NEEDED["paper"] else 0.0
+            print(line(row, report, run), flush=True)
+    if arguments.provider == "cuda" and arguments.only is None:
+        print(f"\nThe paper's preset: {gigabytes:.1f} GB one by one; the paper's system took {PAPER_GB} GB.")
+        print(f"Front end: {json.dumps(in_own_process(arguments, '--front-end', str(FRONT_END_FRAMES)))}")
+
+
+def rows(views: int, half: bool) -> Iterator[Row]:
+    """The rows with these views in VGGT's window and, where there is such an export, in half precision."""
+    for row in ROWS:
+        options, size = row.options, row.size
+        if row.network == "vggt":
+            options, size = ("--views", str(views)), f"392 x 518, {views} views"
+        if half and RECIPES[row.network].half:
+            options, size = (*options, "--half"), f"{size}, half"
+        yield replace(row, options=options, size=size)
 
 
 def exported(row: Row, checkouts: Path, out: Path, threads: int) -> dict:
@@ -98,35 +148,97 @@ def exported(row: Row, checkouts: Path, out: Path, threads: int) -> dict:
     return json.loads(text)
 
 
-def measured(file: Path, threads: int) -> dict:
-    """`measure` in a process of its own, with its memory."""
-    command = [sys.executable, __file__, "--measure", file, "--threads", str(threads)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+def in_own_process(arguments: argparse.Namespace, what: str, value: str) -> dict:
+    """What `--measure FILE` or `--front-end FRAMES` prints; memory is the process's, unless it is the GPU's."""
+    common = ["--threads", str(arguments.threads), "--provider", arguments.provider, "--out", str(arguments.out)]
+    process = subprocess.Popen([sys.executable, __file__, what, value, *common], stdout=subprocess.PIPE)
     assert process.stdout is not None
     text = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
     if status:
-        raise SystemExit(f"measuring {file} ended with status {status}")
-    return json.loads(text) | {"gigabytes": usage.ru_maxrss / 2**20}
+        raise SystemExit(f"{what} {value} ended with status {status}")
+    return {"gigabytes": usage.ru_maxrss / 2**20} | json.loads(text)
 
 
-def measure(file: Path, threads: int) -> dict:
-    """Median processor seconds of a call, after a first one: on an idle machine with one thread, its latency."""
+def measure(file: Path, threads: int, provider: str) -> dict:
+    """Median seconds of a call after a first one; on the CPU those of the processor, on an idle machine its latency."""
     import numpy as np
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    with np.load(f"{file}.parity.npz") as parity:
-        inputs = {value.name: parity[f"input.{value.name}"] for value in session.get_inputs()}
-    session.run(None, inputs)
-    seconds = []
-    for _ in range(CALLS):
-        started = time.process_time()
+    with gpu_memory(provider) as memory:
+        session = onnxruntime.InferenceSession(str(file), options, providers=PROVIDERS[provider])
+        with np.load(f"{file}.parity.npz") as parity:
+            inputs = {value.name: parity[f"input.{value.name}"] for value in session.get_inputs()}
         session.run(None, inputs)
-        seconds.append(time.process_time() - started)
-    return {"seconds": statistics.median(seconds)}
+        clock = time.process_time if provider == "cpu" else time.perf_counter
+        seconds = []
+        for _ in range(CALLS if provider == "cpu" else 10 * CALLS):
+            started = clock()
+            session.run(None, inputs)
+            seconds.append(clock() - started)
+    return {"seconds": statistics.median(seconds), **memory}
+
+
+def front_end(folder: Path, frames: int, provider: str) -> dict:
+    """Frames a second with every role of the paper's preset asked once a frame; seconds and calls of each network."""
+    import numpy as np
+    from vggtgeo.models.roles import PoseQuery
+
+    from vggtgeo.cli.presets import perception
+    from vggtgeo.simulation.sequence import simulate
+    from vggtgeo.slam.settings import Roles
+
+    walk = list(simulate("room", frames + 1, 0, (640, 480), rate=10.0).frames())
+    camera, nothing = np.array([532.5, 532.5, 319.5, 239.5]), (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))
+    with gpu_memory(provider) as memory:
+        found = perception("paper", Roles(), folder, provider=provider)
+        roles, before, began = found.roles, None, 0.0
+        for frame in walk:
+            points = roles.points.describe(frame.image)
+            lines = roles.line_matches.describe(frame.image, roles.lines.detect(frame.image))
+            depth = roles.depth.estimate(frame.image, None, tuple(camera)).depth
+            roles.confidence.confidence(frame.image)
+            if before is None:  # the first frame has nothing to be matched with
+                began = time.perf_counter()
+            else:
+                roles.points.match(before[1], points)
+                roles.line_matches.match(before[2], lines)
+                window = {"window_images": (before[0],), "window_poses": (np.eye(4),), "window_depths": (before[3],)}
+                roles.geometry.locate(PoseQuery(frame.image, camera, *nothing, **window))
+            before = frame.image, points, lines, depth
+        seconds = time.perf_counter() - began
+    networks = {name: [net.tally.calls, round(net.tally.seconds, 3)] for name, net in found.networks.items()}
+    return {"frames_per_second": round(frames / seconds, 4), "calls_and_seconds": networks, **memory}
+
+
+@contextlib.contextmanager
+def gpu_memory(provider: str) -> Iterator[dict[str, float]]:
+    """While the block runs, how far the GPU's memory rises, as `gigabytes`; nothing on the CPU."""
+    risen: dict[str, float] = {}
+    if provider == "cpu":
+        yield risen
+        return
+    at_first, done = gpu_megabytes(), threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.05):
+            risen["gigabytes"] = max(risen.get("gigabytes", 0.0), (gpu_megabytes() - at_first) / 1024)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield risen
+    finally:
+        done.set()
+        watcher.join()
+
+
+def gpu_megabytes() -> float:
+    """Memory in use on the first GPU."""
+    command = ["nvidia-smi", "--id=0", "--query-gpu=memory.used", "--format=csv,noheader,nounits"]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
 def line(row: Row, report: dict, run: dict) -> str:
@@ -138,7 +250,7 @@ def line(row: Row, report: dict, run: dict) -> str:
         f"{report['megabytes']:.0f}",
         f"{report['seconds']:.0f}",
         f"{report['gigabytes']:.1f}",
-        f"{run['seconds']:.2f}",
+        f"{run['seconds']:.3g}",
         f"{run['gigabytes']:.1f}",
         f"{report['rewrite']:.0e}",
         f"{report['parity']:.0e}",

@@ -99,7 +99,7 @@ class Recipe:
 RECIPES = {
     recipe.network: recipe
     for recipe in (
-        Recipe("vggt", "vggt", ("1b", "test"), (392, 518), multiple=14, fixed_width=518, views=10),
+        Recipe("vggt", "vggt", ("1b", "test"), (392, 518), multiple=14, fixed_width=518, views=4),
         Recipe("dinov3", "dinov3", ("vitl16", "vitb16", "vits16"), (480, 640), multiple=16),
         Recipe("moge2", "moge2", ("vitl", "vitb", "vits"), (480, 640), tokens=1800),
         Recipe("letr", "letr", ("resnet50", "resnet101", "test"), (480, 640), half=False),
