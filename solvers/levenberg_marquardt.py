@@ -13,14 +13,14 @@ it grows while steps keep their promise and is halved when one does not. `benchm
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_gradient
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
@@ -65,6 +65,29 @@ def termination_name(termination: Termination) -> str:
     return next(name for name, code in Termination._name_to_item.items() if termination == code)
 
 
+class IterationRecord(eqx.Module):
+    """What each try did, row i try i; row 0 is the start, and rows beyond the last try hold NaN."""
+
+    damping: Float[Array, " h"]
+    """With which it was solved."""
+    gain: Float[Array, " h"]
+    """Decrease of the energy over the promised one; the step was taken where it is above 1e-3."""
+    gradient_norm: Float[Array, " h"]
+    """Of the linearisation that it started from, as in `Solution.gradient_norm`."""
+    moved: PyTree[Float[Array, "h ..."]]
+    """`problem.recorded(point)` after it; of bundle adjustment the poses, world -> camera, [h, n, 7]."""
+
+    def with_try(self, i: Int[Array, ""], damping: Array, gain: Array, gradient_norm: Array, moved: PyTree) -> Self:
+        """The record with row `i`."""
+        write = lambda column, row: column.at[i].set(row)
+        return type(self)(
+            write(self.damping, damping),
+            write(self.gain, gain),
+            write(self.gradient_norm, gradient_norm),
+            jax.tree.map(write, self.moved, moved),
+        )
+
+
 class LevenbergMarquardtState(eqx.Module):
     """Loop state; `history[i]` is the energy after try i (NaN beyond the last)."""
 
@@ -78,6 +101,7 @@ class LevenbergMarquardtState(eqx.Module):
     gradient_norm: Float[Array, ""]
     history: Float[Array, " h"]
     termination: Termination
+    record: IterationRecord | None = None
 
 
 class _Try(eqx.Module):
@@ -95,6 +119,7 @@ class _Try(eqx.Module):
     """Not accepted, and the correction may be why: linearise again with less of it before the damping rises."""
     finite: Bool[Array, ""]
     """Whether the step was."""
+    record: IterationRecord | None
 
 
 class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -121,6 +146,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     reduced_solver: AbstractReducedSolver = DenseCholesky()
     differentiable_loop: bool = False
     """Make the inner loop reverse-differentiable (bounded, slower), for unrolled differentiation."""
+    record_iterations: bool = False
+    """Keep an `IterationRecord`, for pictures of the iteration; without it nothing of it is compiled."""
 
     def init(
         self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, f_struct: Any, aux_struct: Any, tags: Any
@@ -138,6 +165,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gradient_norm=jnp.asarray(jnp.inf, energy.dtype),
             history=history,
             termination=_CODES.where(finite, _CODES.running, _CODES.nonfinite_input),
+            record=self._start_record(args.recorded(y), history) if self.record_iterations else None,
         )
 
     def step(
@@ -145,10 +173,15 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ) -> tuple[Any, LevenbergMarquardtState, None]:
         system = args.linearise(y, state.correction if self.max_correction > 0 else None)
         prepared = self.reduced_solver.prepare(system)
+        gradient_norm = _gradient_norm(system)
 
         def attempt(trial: _Try) -> _Try:
             step, predicted = self.reduced_solver.step(system, prepared, trial.damping)
-            return self._judge(args, y, state, system, trial, step, predicted)
+            judged = self._judge(args, y, state, system, trial, step, predicted)
+            if trial.record is None:
+                return judged
+            done = (judged.iterations, trial.damping, judged.gain, gradient_norm, args.recorded(judged.point))
+            return eqx.tree_at(lambda t: t.record, judged, trial.record.with_try(*done))
 
         first = _Try(
             point=y,
@@ -162,9 +195,9 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             stuck=jnp.asarray(False),
             overbold=jnp.asarray(False),
             finite=jnp.asarray(True),
+            record=state.record,
         )
         last = self._loop(attempt, first)
-        gradient_norm = _gradient_norm(system)
         new = LevenbergMarquardtState(
             energy=last.energy,
             damping=last.damping,
@@ -175,6 +208,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gradient_norm=gradient_norm,
             history=last.history,
             termination=self._terminate(state.energy, last, gradient_norm),
+            record=last.record,
         )
         return last.point, new, None
 
@@ -188,6 +222,12 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
     ) -> tuple[Any, Any, dict[str, Any]]:
         return y, aux, {}
+
+    def _start_record(self, start: PyTree, history: Float[Array, " h"]) -> IterationRecord:
+        """Nothing but the start."""
+        nothing = jnp.full_like(history, jnp.nan)
+        unmoved = lambda leaf: jnp.full((len(history), *leaf.shape), jnp.nan, leaf.dtype).at[0].set(leaf)
+        return IterationRecord(nothing, nothing, nothing, jax.tree.map(unmoved, start))
 
     def _loop(self, attempt: Callable[[_Try], _Try], first: _Try) -> _Try:
         go_on: Callable[[_Try], Any] = lambda trial: (
@@ -235,6 +275,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             overbold=overbold,
             stuck=~accepted & ~overbold & (_negligible(predicted, energy) | (damping > self.max_damping)),
             finite=jnp.isfinite(predicted),
+            record=trial.record,
         )
 
     def _next_correction(self, state: LevenbergMarquardtState, last: _Try) -> Float[Array, ""]:

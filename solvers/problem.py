@@ -6,7 +6,7 @@ import abc
 from typing import Generic, TypeVar
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
 
 Point = TypeVar("Point")
@@ -49,6 +49,10 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
     def fractions(self) -> Float[Array, "n g q"] | None:
         """Position of each landmark along its segment, where the last ones are joined: see `segments.py`."""
         return None
+
+    def recorded(self, point: Point) -> PyTree:
+        """The part of `point` that a record of the iterations keeps."""
+        return point
 
     @abc.abstractmethod
     def zero_step(self, point: Point) -> ArrowVector:

@@ -11,11 +11,12 @@ import typer
 from conftest import ROOT
 from typer.testing import CliRunner
 
-from vggtgeo.cli.main import COMMANDS, EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, make_app
+from vggtgeo.cli.main import COMMANDS, EXIT_INPUT, EXIT_INTERNAL, CommandEntry, load_command, make_app
+from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption
 from vggtgeo.cli.settings_file import SettingsOption, write_settings
 from vggtgeo.errors import InputError
 
-DEFAULTS = {"path": "clip", "count": 3, "scale": None, "rgb-only": False, "mode": "fast", "json": False}
+DEFAULTS = {"path": "clip", "count": 3, "scale": None, "rgb-only": False, "lines": True, "mode": "fast", "json": False}
 
 
 def seen_by_the_command(*arguments: str) -> dict[str, Any]:
@@ -27,9 +28,10 @@ def seen_by_the_command(*arguments: str) -> dict[str, Any]:
         settings: SettingsOption = None,
         count: int = 3,
         scale: Annotated[float | None, typer.Option()] = None,
-        rgb_only: Annotated[bool, typer.Option("--rgb-only")] = False,
+        rgb_only: Annotated[bool, typer.Option("--rgb-only/--no-rgb-only")] = False,
+        lines: Annotated[bool, typer.Option("--lines/--no-lines")] = True,
         mode: Annotated[Literal["fast", "slow"], typer.Option("-m", "--mode")] = "fast",
-        as_json: Annotated[bool, typer.Option("--json")] = False,
+        as_json: JsonOption = False,
     ) -> None:
         assert settings is not None
         found.update(settings.values())
@@ -51,9 +53,29 @@ def file_with(folder: Path, text: str) -> str:
 def test_a_file_says_what_flags_say(tmp_path: Path) -> None:
     # Proves that a file equals the flags. Oracle: the same command called with flags.
     text = 'path = "clip"\ncount = 7\nscale = 2\nrgb-only = true\nmode = "slow"\njson = true\n'
-    by_flags = seen_by_the_command("clip", "--count", "7", "--scale", "2", "--rgb-only", "--mode", "slow", "--json")
-    assert seen_by_the_command("--settings", file_with(tmp_path, text)) == by_flags
-    assert by_flags == {"path": "clip", "count": 7, "scale": 2.0, "rgb-only": True, "mode": "slow", "json": True}
+    flags = ("--count", "7", "--scale", "2", "--rgb-only", "--no-lines", "--mode", "slow", "--json")
+    by_flags = seen_by_the_command("clip", *flags)
+    for negation in ("lines = false\n", "no-lines = true\n"):
+        assert seen_by_the_command("--settings", file_with(tmp_path, text + negation)) == by_flags
+    expected = {"path": "clip", "count": 7, "scale": 2.0, "rgb-only": True, "lines": False, "mode": "slow"}
+    assert by_flags == {**expected, "json": True}
+
+
+def test_a_flag_takes_back_what_the_file_says(tmp_path: Path) -> None:
+    # Proves that each switch of a file can be turned over by a flag, either way. Oracle: the defaults.
+    path = file_with(tmp_path, "rgb-only = true\nlines = false\njson = true\n")
+    assert seen_by_the_command("clip", "--settings", path, "--no-rgb-only", "--lines", "--no-json") == DEFAULTS
+    path = file_with(tmp_path, "no-lines = true\n")
+    assert seen_by_the_command("clip", "--lines", "--settings", path) == DEFAULTS
+
+
+@pytest.mark.parametrize("entry", COMMANDS, ids=lambda entry: entry.name)
+def test_every_switch_has_its_opposite(entry: CommandEntry) -> None:
+    # Proves that no command has a switch that cannot be taken back. Oracle: the parameters of the command itself.
+    command = load_command(entry)
+    for each in getattr(command, "commands", {entry.name: command}).values():
+        switches = [p for p in each.params if getattr(p, "is_flag", False) and p.name != "help"]
+        assert [p.name for p in switches if not p.secondary_opts] == []
 
 
 def test_a_flag_wins_over_the_file(tmp_path: Path) -> None:
@@ -84,6 +106,7 @@ def test_what_is_written_gives_the_same_again(tmp_path: Path) -> None:
         ("count = 1.5", "`count` is 1.5; it must be a whole number"),
         ("scale = true", "`scale` is True; it must be a number"),
         ("rgb-only = 1", "`rgb-only` is 1; it must be true or false"),
+        ("lines = true\nno-lines = true", "`lines` and `no-lines` are one setting; give one of them"),
         ("mode = 3", "`mode` is 3; it must be text in quotes"),
         ("count = ", "is no TOML file"),
     ],

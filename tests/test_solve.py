@@ -1,6 +1,7 @@
 """`solve`: it finds the truth, says how it ended, and is a pure function under JAX's transformations."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -72,6 +73,26 @@ def test_what_the_solution_reports(solved: Solve) -> None:
     assert np.all(np.diff(history[: steps + 1]) <= 0)
     assert history[steps] == float(solution.energy)
     assert 0 < float(solution.gradient_norm) < 1e-3
+
+
+def test_a_record_of_the_iterations_changes_nothing(solved: Solve) -> None:
+    # Proves that a record starts at the start, ends at the solution, moves only where a step was taken, and that the
+    # solution is the same without it. Oracle: the solve that keeps no record, and the rule of acceptance.
+    problem, start, _ = NOISY.pack(**OPTIONS)
+    recording = replace(SOLVER, record_iterations=True)
+    kept, plain = jax.jit(lambda p, s: solve(p, s, solver=recording))(problem, start), solved(problem, start)
+    record, steps = kept.record, int(kept.iterations)
+    assert plain.record is None
+    assert record is not None
+    assert steps == int(plain.iterations)
+    np.testing.assert_allclose(kept.state.poses.wxyz_xyz, plain.state.poses.wxyz_xyz, atol=1e-10)
+    np.testing.assert_array_equal(record.moved[0], start.poses.wxyz_xyz)
+    np.testing.assert_array_equal(record.moved[steps], kept.state.poses.wxyz_xyz)
+    assert float(record.damping[1]) == recording.initial_damping
+    assert float(record.gradient_norm[steps]) == float(kept.gradient_norm)
+    moved = np.any(np.asarray(record.moved[1:] != record.moved[:-1]), axis=(1, 2))[:steps]
+    np.testing.assert_array_equal(moved, np.asarray(record.gain[1 : steps + 1]) > 1e-3)
+    assert np.isnan(np.asarray(record.gain[steps + 1 :])).all()
 
 
 def test_held_coordinates_stay(solved: Solve) -> None:

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import subprocess
 import sys
+import sysconfig
+import time
+import urllib.request
+import warnings
+from dataclasses import replace
 from pathlib import Path
+from urllib.parse import unquote
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import ROOT
 from recorded_run import RecordedRun, recorded_run
 from typer.testing import CliRunner
+from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.errors import InputError
+from vggtgeo.errors import InputError, InputWarning
 from vggtgeo.slam import rigid
 from vggtgeo.slam.outputs import write_depth, write_map, write_trajectories
-from vggtgeo.viewing.target import check_target
+from vggtgeo.slam.state import Slam
+from vggtgeo.viewing.target import check_target, has_screen
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +45,16 @@ def entities_of(path: Path) -> dict[str, set[str]]:
     return found
 
 
+def iterations_of(slam: Slam) -> IterationRecord | None:
+    """A record as the solver makes it (tests/test_solve.py): the cameras go to their places along a line."""
+    if slam.solved is None or slam.energies is None:
+        return None
+    ends = [np.asarray(state.poses.wxyz_xyz) for state in (slam.solved[0].initial, slam.solved[1])]
+    rows = np.linspace(0, 1, len(slam.energies))
+    moved = np.stack([(1 - share) * ends[0] + share * ends[1] for share in rows])
+    return IterationRecord(*(jnp.asarray(column) for column in (1e-3 * rows, rows, 1 + rows, moved)))
+
+
 @pytest.fixture(scope="module")
 def recording(run: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recorded run, logged frame by frame as the program does it."""
@@ -41,10 +62,10 @@ def recording(run: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Pat
     from vggtgeo.viewing.watcher import RerunWatcher
 
     path = tmp_path_factory.mktemp("recording") / "deep" / "run.rrd"
-    stream = open_target(str(path), "test")
+    stream = open_target(str(path), "test", path).stream
     watcher = RerunWatcher(stream)
     for slam in run.states:
-        watcher.see(slam, run.frames[slam.frames[-1].frame])
+        watcher.see(replace(slam, iterations=iterations_of(slam)), run.frames[slam.frames[-1].frame])
     watcher.finish(run.slam, run.cloud)
     stream.disconnect()
     return path
@@ -58,7 +79,8 @@ def test_the_recording_holds_every_entity(recording: Path) -> None:
     assert set(ENTITIES) - set(found) == set()
     for path in ("/world/camera", "/world/trajectory", "/keyframe/image/matches", "/plots/residuals/points"):
         assert {"frame", "time"} <= found[path], path
-    assert "iteration" in found["/plots/solver/energy"]
+    for path in ("/plots/solver/energy", "/plots/convergence/step", "/world/iteration", "/world/covariance"):
+        assert "iteration" in found[path], path
 
 
 def test_the_blueprint_shows_what_is_logged(recording: Path) -> None:
@@ -129,6 +151,115 @@ def test_a_target_is_checked() -> None:
     assert [check_target(target) for target in ("spawn", "serve", "a/b.rrd")] == ["spawn", "serve", "a/b.rrd"]
     with pytest.raises(InputError, match=r"ending with `\.rrd`"):
         check_target("a.rrd.txt")
+
+
+def test_a_machine_without_a_screen_gets_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`spawn` without a display warns in one line that names the file, and the file holds what was logged; oracle:
+    rerun's own reader.
+    """
+    import rerun as rr
+
+    from vggtgeo.viewing.target import flush, open_target
+
+    monkeypatch.setattr("vggtgeo.viewing.target.has_screen", lambda: False)
+    path = tmp_path / "runs" / "run.rrd"
+    with pytest.warns(InputWarning, match=r"there is no screen, so the recording goes to `.*run\.rrd`"):
+        opened = open_target("spawn", "test", path)
+    opened.stream.log("notes", rr.TextLog("here"))
+    flush(opened.stream)
+    opened.stream.disconnect()
+    assert "/notes" in entities_of(path)
+
+
+@pytest.mark.parametrize(("name", "expected"), [("DISPLAY", True), ("WAYLAND_DISPLAY", True), ("SHELL", False)])
+def test_a_screen_is_known_by_the_environment(name: str, expected: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """X11 and Wayland are seen, another variable is no screen."""
+    monkeypatch.setattr(sys, "platform", "linux")
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv(name, ":0")
+    assert has_screen() is expected
+
+
+def test_a_viewer_that_closes_at_once_gives_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a window does not open in spite of a screen, the file is written all the same."""
+    from vggtgeo.viewing import target
+
+    monkeypatch.setattr(target, "has_screen", lambda: True)
+    monkeypatch.setattr(target, "_start_viewer", lambda stream: "the viewer closed at once")
+    with pytest.warns(InputWarning, match="the viewer closed at once, so the recording goes to"):
+        opened = target.open_target("spawn", "test", tmp_path / "run.rrd")
+    opened.stream.disconnect()
+    assert (tmp_path / "run.rrd").is_file()
+
+
+def test_view_names_the_recording_where_there_is_no_screen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder with a recording is not recorded again: the message says what to open."""
+    monkeypatch.setattr("vggtgeo.viewing.target.has_screen", lambda: False)
+    (tmp_path / "run.rrd").write_bytes(b"")
+    result = CliRunner().invoke(make_app(), ["view", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "look at it with `rerun" in result.stderr
+
+
+SERVE = """
+import sys, rerun as rr
+from vggtgeo.viewing.target import flush, open_target
+opened = open_target("serve", "test", None)
+opened.stream.log("notes", rr.TextLog("served"))
+flush(opened.stream)
+print(opened.url, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_served_recording_can_be_had(tmp_path: Path) -> None:
+    """The address that is printed gives Rerun's page, and the source it names gives the recording; oracle: HTTP on the
+    loopback, and rerun's own program as the client.
+    """
+    viewer = Path(sysconfig.get_path("scripts")) / "rerun"
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", SERVE], cwd=ROOT, stdin=pipe, stdout=pipe, text=True) as server:
+        try:
+            assert server.stdout is not None
+            url = server.stdout.readline().strip()
+            assert url.startswith("http://localhost:"), url
+            page, source = url.split("?url=")
+            with urllib.request.urlopen(page, timeout=20) as answer:
+                assert b"rerun" in answer.read().lower()
+            saved = tmp_path / "got.rrd"
+            command = [viewer, unquote(source), "--port", "auto", "--save", saved]
+            with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as client:
+                try:
+                    assert arrives(saved, "/notes")
+                finally:
+                    client.kill()
+        finally:
+            server.communicate("", timeout=20)
+
+
+def arrives(file: Path, entity: str, patience: float = 30.0) -> bool:
+    """Whether the recording `file`, which is being written, comes to hold `entity`."""
+    end = time.monotonic() + patience
+    while time.monotonic() < end:
+        time.sleep(0.2)
+        with contextlib.suppress(OSError, ValueError, RuntimeError), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a file without its end
+            if entity in entities_of(file):
+                return True
+    return False
+
+
+def test_a_port_in_use_is_gone_round() -> None:
+    """A second served run takes a free port."""
+    from vggtgeo.viewing.target import _port
+
+    with socket.socket() as taken:
+        taken.bind(("", 0))
+        taken.listen()
+        usual = taken.getsockname()[1]
+        assert _port(usual) not in (0, usual)
+    assert _port(usual) == usual
 
 
 def test_without_the_flag_rerun_is_not_imported(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from vggtgeo import _source_tree as _source_tree  # first: in a source tree it finds `solvers` and `models`
 
 if TYPE_CHECKING:
+    from vggtgeo import learning as learning
     from vggtgeo.batches import pack_batch as pack_batch
     from vggtgeo.batches import solve_batch as solve_batch
     from vggtgeo.camera import Camera as Camera
@@ -34,8 +35,10 @@ if TYPE_CHECKING:
     from vggtgeo.problem import Problem as Problem
     from vggtgeo.problem import State as State
     from vggtgeo.problem_file import load_problem as load_problem
+    from vggtgeo.residual_rms import Residuals as Residuals
     from vggtgeo.residual_rms import ResidualSizes as ResidualSizes
     from vggtgeo.residual_rms import residual_sizes as residual_sizes
+    from vggtgeo.residual_rms import residuals_at as residuals_at
     from vggtgeo.results import Result as Result
     from vggtgeo.results import evaluate as evaluate
     from vggtgeo.results import read as read
@@ -75,7 +78,7 @@ _HOME = {
     "paper_bench.runner": ("BenchReport", "bench"),
     "problem": ("Problem", "State"),
     "problem_file": ("load_problem",),
-    "residual_rms": ("ResidualSizes", "residual_sizes"),
+    "residual_rms": ("ResidualSizes", "Residuals", "residual_sizes", "residuals_at"),
     "results": ("Result", "evaluate", "read"),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
     "slam.run": ("finish", "frame_trajectory", "run"),
@@ -90,14 +93,19 @@ _HOME = {
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
+_PACKAGES = ("learning",)
+"""Reached as `vggtgeo.learning.train`, say: what is research on top of the library."""
+
 __all__ = sorted(_MODULE_OF)  # noqa: PLE0605
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return importlib.import_module(f"vggtgeo.{name}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module `vggtgeo` has no attribute `{name}`")
     return getattr(importlib.import_module(f"vggtgeo.{_MODULE_OF[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, *_PACKAGES]

@@ -91,6 +91,10 @@ class BundleAdjustment(AbstractArrowProblem[State]):
     def fractions(self) -> Float[Array, "n g q"] | None:
         return self.problem.fraction
 
+    def recorded(self, point: State) -> Float[Array, "n 7"]:
+        """The poses."""
+        return point.poses.wxyz_xyz
+
     def zero_step(self, point: State) -> ArrowVector:
         return ArrowVector(
             jnp.zeros(free_coordinates(self.problem).shape, point.inverse_depth.dtype),

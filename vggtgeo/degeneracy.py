@@ -18,6 +18,7 @@ linearisations, nine Schur complements and symmetric eigenvalue problems of size
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -31,6 +32,9 @@ from vggtgeo.problem import Problem, State
 from vggtgeo.solvers.arrow import ArrowSystem, reduce
 from vggtgeo.solvers.covariance import balance, rank_tolerance
 from vggtgeo.solvers.segments import join_segments
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 KINDS = ("points", "lines", "depth", "priors")
 """Factor kinds; `priors` are those on the intrinsics and the one that marginalisation left."""
@@ -57,6 +61,8 @@ class Observability(eqx.Module):
         >>> found = jax.eval_shape(vg.observability, problem, solution.state)
         >>> found.without.values.shape  # one row a kind: points, lines, depth, priors
         (4, 28)
+        >>> vg.observability(problem, solution.state)
+        Observability(18 coordinates free, 10 held, weak: none)
 
     """
 
@@ -80,8 +86,31 @@ class Observability(eqx.Module):
 
         return report(self)
 
+    def to_dict(self) -> dict[str, Any]:
+        """The findings as plain values (outside `jit`, for one problem): counts, eigenvalues, names of the weak
+        directions with all factors and without each kind, and the share of the information about each named direction
+        that would be lost without each kind.
+        """
+        from vggtgeo.degeneracy_report import as_dict
+
+        return as_dict(self)
+
+    def plot(self) -> Figure:
+        """The eigenvalues, and what would be lost without each kind (outside `jit`, for one problem)."""
+        from vggtgeo.uncertainty_plots import observability_figure
+
+        return observability_figure(self)
+
     def __str__(self) -> str:
         return self.report()
+
+    def __repr__(self) -> str:
+        try:
+            known = self.to_dict()
+        except TypeError:  # inside `jit`, or of a batch
+            return eqx.Module.__repr__(self)
+        weak = "; ".join(known["weak"][:3]) + f" and {len(known['weak']) - 3} more" * (len(known["weak"]) > 3)
+        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak or 'none'})"
 
 
 def observability(problem: Problem, state: State) -> Observability:

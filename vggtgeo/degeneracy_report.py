@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -87,17 +88,41 @@ def report(found: Observability) -> str:
     return "\n".join([*lines, "", *_table(found)])
 
 
-def _table(found: Observability) -> list[str]:
-    """Information along each free named direction, and the share of it that would be lost without each kind."""
+def as_dict(found: Observability) -> dict[str, Any]:
+    """All findings as plain values."""
+    free, size = int(np.sum(found.free)), len(found.free)
+    lost, used = undetermined_landmarks(found)
+    return {
+        "keyframes": size // 6,
+        "free": free,
+        "held": size - free,
+        "eigenvalues": [float(value) for value in np.asarray(found.whole.values[0])[:free]],
+        "weak": [str(direction) for direction in weak_directions(found)],
+        "weak_without": {kind: [str(direction) for direction in weak_directions(found, kind)] for kind in KINDS},
+        "inverse_depths": used,
+        "inverse_depths_undetermined": lost,
+        "lost_without": lost_shares(found),
+    }
+
+
+def lost_shares(found: Observability) -> dict[str, dict[str, float]]:
+    """Of the information along each free named direction, the share in [0, 1] that would be lost without each kind."""
     names = direction_names(len(found.free) // 6)
     along, without = np.asarray(found.whole.along[0], float), np.asarray(found.without.along, float)
     shares = 1 - without / np.where(along > 0, along, 1.0)
     shares = np.where(along > 0, np.clip(shares, 0.0, 1.0), 0.0)
-    present = np.any(np.asarray(found.named) != 0, 1)
+    present = np.nonzero(np.any(np.asarray(found.named) != 0, 1))[0]
+    return {names[i]: dict(zip(KINDS, map(float, shares[:, i]), strict=True)) for i in present}
+
+
+def _table(found: Observability) -> list[str]:
+    """Information along each free named direction, and the share of it that would be lost without each kind."""
+    names = direction_names(len(found.free) // 6)
+    along = dict(zip(names, np.asarray(found.whole.along[0], float), strict=True))
     width = max(len(name) for name in names)
     lines = [f"{'information along':{width}}  {'all':>9}   lost without {'  '.join(f'{kind:>7}' for kind in KINDS)}"]
-    for i in np.nonzero(present)[0]:
-        lines.append(f"{names[i]:{width}}  {along[i]:9.2e}   {'':12} {'  '.join(f'{s:7.0%}' for s in shares[:, i])}")
+    for name, shares in lost_shares(found).items():
+        lines.append(f"{name:{width}}  {along[name]:9.2e}   {'':12} {'  '.join(f'{s:7.0%}' for s in shares.values())}")
     return lines
 
 

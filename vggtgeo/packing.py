@@ -128,14 +128,19 @@ class PaddedSize:
 
 @dataclass(frozen=True)
 class SlotIndex:
-    """Where each landmark went: `inverse_depth[host[i], slot[i]]`."""
+    """Where each landmark went: `inverse_depth[host[i], slot[i]]`; and each edge: row `edge[e]`."""
 
     host: np.ndarray
     slot: np.ndarray
+    edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     def gather(self, per_slot: np.ndarray | Array) -> np.ndarray:
         """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`."""
         return np.asarray(per_slot)[self.host, self.slot]
+
+    def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> np.ndarray:
+        """Values of the point matches, `[A, ...]`, as `observations` lists them, from an array `[e, p, ...]`."""
+        return np.asarray(per_match)[self.edge[observations.point_edge], self.slot[observations.point_landmark]]
 
 
 def pack(
@@ -192,11 +197,10 @@ def pack(
     size = size or needed
     _check_size(size, needed)
     lines = slots.where.slot >= slots.points
-    index = SlotIndex(
-        slots.where.host, np.where(lines, slots.where.slot - slots.points + size.points, slots.where.slot)
-    )
     graph, position = _pad_edges(edges, size)
     row = position[order]
+    slot = np.where(lines, slots.where.slot - slots.points + size.points, slots.where.slot)
+    index = SlotIndex(slots.where.host, slot, row)
 
     def per_slot(values: np.ndarray, empty: float) -> Array:
         array = np.full((size.keyframes, size.points + size.lines, *np.shape(values)[1:]), empty, dtype)

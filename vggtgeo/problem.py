@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtgeo import lie
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 
@@ -23,6 +24,19 @@ class State(eqx.Module):
     """`fx, fy, cx, cy` in pixels, shared by all keyframes."""
     inverse_depth: Float[Array, "n s"]
     """1/m, along the optical axis of the host keyframe, one a slot."""
+
+    def moved(self, step: Float[Array, " t"]) -> State:
+        """The state that a step leads to, in the coordinates of every Hessian and covariance of this package.
+
+        step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), four of the intrinsics (pixels), then the
+        inverse depths (1/m), keyframe by keyframe. Pure; the derivative at a zero step is the tangent map.
+        """
+        poses = 6 * len(self.inverse_depth)
+        return State(
+            lie.move(self.poses, step[:poses].reshape(-1, 6)),
+            self.intrinsics + step[poses : poses + 4],
+            self.inverse_depth + step[poses + 4 :].reshape(self.inverse_depth.shape),
+        )
 
 
 class Edges(eqx.Module):

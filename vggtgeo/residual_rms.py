@@ -11,10 +11,11 @@ from jaxtyping import Array, Float, Int
 
 from vggtgeo.objective import relative_poses
 from vggtgeo.problem import Problem, State
+from vggtgeo.readable import Readable
 from vggtgeo.residuals import depth_residual, line_residual, point_residual
 
 
-class ResidualSizes(eqx.Module):
+class ResidualSizes(Readable):
     """Root mean square of each kind's residuals, weighted as the robust kernel weighs them; NaN for an absent kind.
 
     points, lines: pixels. depth: standard deviations of the prior. The counts are of observations with a weight.
@@ -60,6 +61,44 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
         points 0.65 px (240), lines 0.43 px (144), depth 0.71 sigma (128)
 
     """
+    found = residuals_at(problem, state)
+    depth_weight = problem.depth.alpha * problem.depth.weight
+    points = _size(problem, problem.points.weight, jnp.sum(found.points**2, -1))
+    lines = _size(problem, problem.lines.weight, found.lines**2)
+    priors = _size(problem, depth_weight, found.depth**2)
+    return ResidualSizes(points[0], lines[0], priors[0], points[1], lines[1], priors[1])
+
+
+class Residuals(eqx.Module):
+    """The residuals themselves, before weights and kernel; any finite number where an observation is absent.
+
+    Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
+        >>> jax.eval_shape(vg.residuals_at, problem, solution.state).points.shape
+        (12, 20, 2)
+
+    """
+
+    points: Float[Array, "e p 2"]
+    """Predicted pixel minus match; in the order of the matches by `index.gather_points`."""
+    lines: Float[Array, "e l"]
+    """Distance of the predicted sample from its line, pixels."""
+    depth: Float[Array, "n s"]
+    """Standard deviations from the prior; in the order of the landmarks by `index.gather`."""
+
+
+def residuals_at(problem: Problem, state: State) -> Residuals:
+    """Every residual of `problem` at `state`. Pure: works under `jit` and `vmap`.
+
+    Example:
+        >>> import jax, numpy as np, vggtgeo as vg
+        >>> window = vg.simulate_window(noise=0.5)
+        >>> problem, _, index = window.pack()
+        >>> found = jax.jit(vg.residuals_at)(problem, window.truth())
+        >>> matches = index.gather_points(found.points, window.observations)
+        >>> matches.shape, round(float(np.std(matches)), 1)
+        ((240, 2), 0.5)
+
+    """
     host, p = problem.edges.source, problem.num_points
     relative = relative_poses(problem, state)
     pixels, depths = problem.pixels[host], state.inverse_depth[host]
@@ -73,11 +112,7 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
     line = along_edges(line_residual, slice(p, None), problem.lines.coefficients, problem.lines.weight)
     depth_weight = problem.depth.alpha * problem.depth.weight
     mean, sigma = (jnp.where(depth_weight > 0, x, 1.0) for x in (problem.depth.mean, problem.depth.sigma))
-    depth = jax.vmap(jax.vmap(depth_residual))(state.inverse_depth, mean, sigma)
-    points = _size(problem, problem.points.weight, jnp.sum(point**2, -1))
-    lines = _size(problem, problem.lines.weight, line**2)
-    priors = _size(problem, depth_weight, depth**2)
-    return ResidualSizes(points[0], lines[0], priors[0], points[1], lines[1], priors[1])
+    return Residuals(point, line, jax.vmap(jax.vmap(depth_residual))(state.inverse_depth, mean, sigma))
 
 
 def _size(problem: Problem, weight: Array, squared: Array) -> tuple[Float[Array, ""], Int[Array, ""]]:

@@ -13,9 +13,11 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.bundle_adjustment import BundleAdjustment
 from vggtgeo.graduation import Graduation
 from vggtgeo.problem import Problem, State
+from vggtgeo.readable import Readable
 from vggtgeo.solvers.adjoint import ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import (
     CONVERGED,
+    IterationRecord,
     SchurLevenbergMarquardt,
     Termination,
     termination_message,
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Solution(eqx.Module):
+class Solution(Readable):
     """The outcome of `solve`; a pytree, so it passes through `jit` and `vmap`.
 
     Example (of `solve`'s):
@@ -46,6 +48,8 @@ class Solution(eqx.Module):
     gradient_norm: Float[Array, ""]
     """Largest gradient entry of the last linearisation, scaled by its curvature (unit of the root of the energy)."""
     termination: Termination
+    record: IterationRecord | None = None
+    """What each iteration did, with `SchurLevenbergMarquardt(record_iterations=True)`."""
 
     def to_dict(self) -> dict[str, Any]:
         """Result, energies and counts as plain values (outside `jit`, for one solution)."""
@@ -144,4 +148,5 @@ def solve(
         linearisations=last.linearisations,
         gradient_norm=last.gradient_norm,
         termination=last.termination,
+        record=last.record,
     )

@@ -10,17 +10,24 @@ variance of the M-estimator, Huber 1964, against `1 / E[rho']`).
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from vggtgeo.linearise import SHARED, edge_observations, linearise
 from vggtgeo.objective import energy
 from vggtgeo.problem import Problem, State
+from vggtgeo.readable import Readable
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-class Covariances(eqx.Module):
+
+class Covariances(Readable):
     """Marginal covariances at a solution; no entry is NaN.
 
     What nothing determines has infinite variance (and zero covariance with the rest); what is held has zero. Without
@@ -30,6 +37,8 @@ class Covariances(eqx.Module):
         >>> found = jax.eval_shape(vg.covariances, problem, solution.state)
         >>> found.poses.shape, found.intrinsics.shape
         ((4, 6, 6), (4, 4))
+        >>> vg.covariances(problem, solution.state)
+        Covariances(4 keyframes, centres known to 5.1 mm at worst, variance factor 0.77)
 
     """
 
@@ -48,6 +57,47 @@ class Covariances(eqx.Module):
         times = lambda values: jnp.where(jnp.isfinite(values), values * self.variance_factor, values)
         return Covariances(
             times(self.poses), times(self.intrinsics), times(self.inverse_depth), jnp.ones_like(self.variance_factor)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Standard deviations as plain numbers (outside `jit`, for one solution): of each pose in its own camera's
+        axes, metres and radians, and of the intrinsics, pixels; None where nothing determines one.
+        """
+        poses = np.sqrt(np.diagonal(np.asarray(self.poses, np.float64), axis1=1, axis2=2))
+        intrinsics = np.sqrt(np.diagonal(np.asarray(self.intrinsics, np.float64)))
+        plain = lambda values: [float(value) if np.isfinite(value) else None for value in values]
+        return {
+            "translation_sigma_m": [plain(row[:3]) for row in poses],
+            "rotation_sigma_rad": [plain(row[3:]) for row in poses],
+            "intrinsics_sigma_px": dict(zip(("fx", "fy", "cx", "cy"), plain(intrinsics), strict=True)),
+            "inverse_depths_determined": int(np.isfinite(np.asarray(self.inverse_depth)).sum()),
+            "variance_factor": float(self.variance_factor),
+        }
+
+    def plot(
+        self, state: State, truth: Float[np.ndarray, "n 3"] | None = None, *, sigmas: float | None = None
+    ) -> Figure:
+        """The camera centres of `state` from above, in the axes of its first camera, with an ellipse each (outside
+        `jit`, for one solution).
+
+        Args:
+            state: the solution that the covariances belong to.
+            truth: camera centres in the world, metres, where they are known.
+            sigmas: standard deviations that the ellipses reach; by default as many as can be seen well.
+
+        """
+        from vggtgeo.uncertainty_plots import covariance_figure
+
+        return covariance_figure(self, state, truth, sigmas)
+
+    def __str__(self) -> str:
+        blocks = np.asarray(self.poses, np.float64)[:, :3, :3]
+        known = np.isfinite(blocks).all((1, 2))
+        worst = 1e3 * float(np.sqrt(np.linalg.eigvalsh(blocks[known]).max(initial=0.0)))
+        unknown = f", {int((~known).sum())} undetermined" if not known.all() else ""
+        return (
+            f"Covariances({len(blocks)} keyframes, centres known to {worst:.1f} mm at worst{unknown}, variance factor "
+            f"{float(self.variance_factor):.2f})"
         )
 
 

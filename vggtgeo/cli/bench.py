@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+from vggtgeo.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from vggtgeo.paper_bench.plan import Job
@@ -24,7 +27,8 @@ def bench(
     seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the plan's.")] = None,
     first_seed: Annotated[int | None, typer.Option(min=0, help="First seed.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes, of up to 4 GB each.")] = 2,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print the tables only.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet/--no-quiet", help="Print the tables only.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Run the comparisons of the paper with simulated roles in rendered worlds, and print their tables."""
     from vggtgeo.paper_bench.runner import bench as run_bench  # brings JAX, which --help does without
@@ -32,7 +36,7 @@ def bench(
     began = time.monotonic()
 
     def say(number: int, total: int, job: Job, result: Result) -> None:
-        if not quiet:
+        if not (quiet or as_json):
             errors = result.errors
             typer.echo(
                 f"{number}/{total} {job.name}: ATE {100 * errors.ate_m:.2f} cm, {errors.keyframes} keyframes, run of "
@@ -50,8 +54,9 @@ def bench(
         progress=say,
         workers=workers,
     )
-    typer.echo(report.markdown())
-    typer.echo(f"in {output}: tables.md runs.csv ablations.png", err=True)
+    typer.echo(json.dumps(report.to_dict()) if as_json else report.markdown())
+    if not (quiet or as_json):
+        typer.echo(f"in {output}: tables.md runs.csv ablations.png", err=True)
 
 
 def _list(text: str | None) -> list[str] | None:

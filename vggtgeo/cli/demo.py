@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.run import RerunOption
+from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.cli.view import serve_until_interrupted
 
@@ -20,8 +20,8 @@ def demo(
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of the scene and its noise.")] = 0,
     rerun: RerunOption = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no report.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Run on a synthetic room with exact truth, rendered on the spot."""
     from vggtgeo.cli.run import make_roles
@@ -36,7 +36,7 @@ def demo(
     roles = make_roles(sequence, "pnp", "sift")
     if not quiet:
         typer.echo(f"simulated scene `{scene}`: all numbers below are of a simulation")
-    run_and_write(
+    finished = run_and_write(
         sequence,
         roles,
         SlamSettings(),
@@ -51,4 +51,6 @@ def demo(
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
     if rerun == "serve":
-        serve_until_interrupted()
+        serve_until_interrupted(finished.url, quiet)
+    if finished.interrupted:
+        raise typer.Exit(EXIT_INTERRUPTED)

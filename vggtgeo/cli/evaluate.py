@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vggtgeo.cli.options import JsonOption
 from vggtgeo.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,8 +26,10 @@ def evaluate(
     truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM format), or a dataset folder.")],
     max_dt: Annotated[float, typer.Option(help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
     delta: Annotated[int, typer.Option(help="Poses between the two of a pair, for RPE.")] = 1,
-    all_pairs: Annotated[bool, typer.Option(help="Overlapping pairs for RPE, not consecutive ones.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    all_pairs: Annotated[
+        bool, typer.Option("--all-pairs/--no-all-pairs", help="Overlapping pairs for RPE, not consecutive ones.")
+    ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT."""
     from vggtgeo.evaluation import evaluate_trajectory

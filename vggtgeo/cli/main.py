@@ -12,11 +12,11 @@ import typer
 from typer.core import TyperGroup
 
 from vggtgeo.cli.jax_flags import set_jax_flags
+from vggtgeo.cli.options import EXIT_INTERRUPTED
 from vggtgeo.errors import InputError, InputWarning
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1
-EXIT_INTERRUPTED = 130
 
 
 class CommandEntry(NamedTuple):

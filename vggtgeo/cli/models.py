@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from vggtgeo.cli.models_export import export
+from vggtgeo.cli.options import JsonOption
 from vggtgeo.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ Folder = Annotated[
     Path | None,
     typer.Option("--models", metavar="DIR", help="Folder of the files; else VGGTGEO_MODELS, else the user's data."),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Provider = Literal["auto", "cuda", "cpu"]
 
 models = typer.Typer(
@@ -39,7 +39,7 @@ models.command("export")(export)
 
 
 @models.command("list")
-def list_networks(folder: Folder = None, as_json: AsJson = False) -> None:
+def list_networks(folder: Folder = None, as_json: JsonOption = False) -> None:
     """List the networks: role, licence, size, how to get each, and whether it is there."""
     from vggtgeo.models.onnx.registry import NETWORKS
     from vggtgeo.network_files import networks_folder
@@ -95,7 +95,7 @@ def verify(
     ] = None,
     runs: Annotated[int, typer.Option(min=1, help="Timed runs.")] = 3,
     provider: Annotated[Provider, typer.Option(help="Where it runs.")] = "auto",
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Check FILE: contract, finite outputs on an image, latency, and parity with PyTorch where it is recorded."""
     from vggtgeo.cli.verify_network import faults, print_report, verify_file

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from vggtgeo.cli.options import JsonOption, QuietOption
 from vggtgeo.errors import InputError
 
 
@@ -19,23 +20,29 @@ def export(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.onnx", help="File to write.")],
     checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None,
     random_weights: Annotated[
-        bool, typer.Option("--random-weights", help="For tests and timing: weights drawn at random.")
+        bool,
+        typer.Option("--random-weights/--no-random-weights", help="For tests and timing: random weights."),
     ] = False,
     height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None,
     width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None,
     views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None,
     tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None,
     variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None,
-    half: Annotated[bool, typer.Option("--half", help="Attention and perceptrons in float16.")] = False,
+    half: Annotated[bool, typer.Option("--half/--no-half", help="Attention and perceptrons in float16.")] = False,
     tolerance: Annotated[
         float | None,
         typer.Option(help="Largest difference from PyTorch; 0.001, or 0.03 with --half.", show_default=False),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write the network NAME as an ONNX file and compare it with PyTorch."""
     from vggtgeo.models.exporters.recipes import recipe_of
     from vggtgeo.models.exporters.request import ExportError
+
+    def say(stage: str) -> None:
+        if not quiet:
+            typer.echo(f"{stage} ...", err=True)
 
     if (checkpoint is None) != random_weights:
         found = "neither was given" if checkpoint is None else "both were given"
@@ -45,11 +52,12 @@ def export(
         request = recipe.request(source, checkpoint, height, width, views, tokens, variant, half)
         from vggtgeo.models.exporters.export import export as write
 
-        report = write(recipe, request, output, lambda stage: typer.echo(f"{stage} ...", err=True), tolerance)
+        report = write(recipe, request, output, say, tolerance)
     except ExportError as error:
         raise InputError(str(error)) from error
     if as_json:
         typer.echo(json.dumps(asdict(report) | {"path": str(report.path)}, allow_nan=False))
+    if as_json or quiet:
         return
     typer.echo(
         f"{report.path}: {report.network}, {report.parameters / 1e6:.1f} M weights ({report.weights}), "

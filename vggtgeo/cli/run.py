@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.errors import InputError, InputWarning
@@ -26,11 +27,6 @@ Init = Literal["pnp", "constant-velocity"]
 Features = Literal["sift", "orb"]
 Preset = Literal["classical", "light", "paper"]
 Provider = Literal["auto", "cuda", "cpu"]
-RerunOption = Annotated[
-    str | None,
-    typer.Option("--rerun", metavar="TARGET", help="Log to Rerun: spawn, serve, or a file ending with .rrd."),
-]
-EXIT_INTERRUPTED = 130
 
 
 def run(
@@ -42,13 +38,20 @@ def run(
     end: Annotated[int | None, typer.Option(help="Frame to stop before.")] = None,
     stride: Annotated[int, typer.Option(help="Take every n-th frame.")] = 1,
     intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels, in place of the folder's.")] = None,
-    rgb_only: Annotated[bool, typer.Option("--rgb-only", help="Ignore depth images: the scale stays free.")] = False,
-    no_lines: Annotated[bool, typer.Option("--no-lines", help="Ablation: no line residuals.")] = False,
-    no_depth_prior: Annotated[
-        bool, typer.Option("--no-depth-prior", help="Ablation: depth starts the estimate but does not hold it.")
+    rgb_only: Annotated[
+        bool, typer.Option("--rgb-only/--no-rgb-only", help="Ignore depth images: the scale stays free.")
     ] = False,
-    no_confidence: Annotated[bool, typer.Option("--no-confidence", help="Ablation: all weights are one.")] = False,
-    no_global: Annotated[bool, typer.Option("--no-global", help="Ablation: the sliding window alone.")] = False,
+    lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Ablation: no line residuals.")] = True,
+    depth_prior: Annotated[
+        bool,
+        typer.Option("--depth-prior/--no-depth-prior", help="Ablation: depth starts the estimate, does not hold it."),
+    ] = True,
+    confidence: Annotated[
+        bool, typer.Option("--confidence/--no-confidence", help="Ablation: all weights are one.")
+    ] = True,
+    global_adjustment: Annotated[
+        bool, typer.Option("--global/--no-global", help="Ablation: the sliding window alone.")
+    ] = True,
     init: Annotated[Init, typer.Option(help="How a new frame's pose starts.")] = "pnp",
     features: Annotated[Features, typer.Option(help="Key points.")] = "sift",
     preset: Annotated[
@@ -60,11 +63,13 @@ def run(
     memory_limit_gb: Annotated[
         float | None, typer.Option(help="Most GPU memory of each network, GB; has no effect on the CPU.")
     ] = None,
-    save_depth: Annotated[bool, typer.Option("--save-depth", help="Write each keyframe's dense depth.")] = False,
+    save_depth: Annotated[
+        bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
+    ] = False,
     rerun: RerunOption = None,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no report.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
     import cv2
@@ -83,10 +88,10 @@ def run(
     if rgb_only:
         sequence = without_depth(sequence)
     slam_settings = SlamSettings(
-        use_lines=not no_lines,
-        use_confidence=not no_confidence,
-        depth_weight=0.0 if no_depth_prior else SlamSettings.depth_weight,
-        global_adjustment=not no_global,
+        use_lines=lines,
+        use_confidence=confidence,
+        depth_weight=SlamSettings.depth_weight if depth_prior else 0.0,
+        global_adjustment=global_adjustment,
     )
     if preset == "paper" and features != "sift":
         raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
@@ -109,7 +114,7 @@ def run(
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
     if rerun == "serve":
-        serve_until_interrupted()
+        serve_until_interrupted(finished.url, quiet or as_json)
     if finished.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
 

@@ -6,10 +6,11 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -30,10 +31,11 @@ from vggtgeo.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """The last state of a run, and whether Ctrl-C ended it."""
+    """The last state of a run, whether Ctrl-C ended it, and the address of a served view."""
 
     slam: Slam
     interrupted: bool
+    url: str | None = None
 
 
 def run_and_write(
@@ -57,7 +59,11 @@ def run_and_write(
     `vggtgeo/viewing/target.py`.
     """
     console = Console(stderr=False, quiet=quiet)
-    watchers = () if rerun is None else (_rerun_watcher(rerun, label or sequence.name),)
+    watchers: tuple[Watcher, ...] = ()
+    url = None
+    if rerun is not None:
+        watcher, url = _rerun_watcher(rerun, label or sequence.name, folder)
+        watchers, settings = (watcher,), replace(settings, record_iterations=True)
     clock, began = Clock(), time.perf_counter()
     recorder = WindowRecorder()
     with clock.measure("compile"):
@@ -71,8 +77,13 @@ def run_and_write(
     slam = fold.slam
     write_settings(folder / "settings.toml", flags)
     outputs.write_trajectories(folder, slam)
-    if not fold.interrupted:
-        slam = finish(slam, roles, settings, clock)
+    interrupted = fold.interrupted
+    if not interrupted:
+        try:
+            slam = finish(slam, roles, settings, clock)
+        except KeyboardInterrupt:
+            console.print("interrupted: writing what there is, without the last adjustment")
+            interrupted = True
         outputs.write_trajectories(folder, slam)
     with clock.measure("write"):
         cloud = outputs.write_map(folder, slam)
@@ -93,7 +104,7 @@ def run_and_write(
         **told,
         map_points=len(cloud),
         frames_per_second=round(fold.frames_per_second, 2),
-        interrupted=fold.interrupted,
+        interrupted=interrupted,
     )
     write_page(
         folder / "report.html",
@@ -106,14 +117,18 @@ def run_and_write(
         warnings=[*([told["meaningless"]] if "meaningless" in told else []), *said],
     )
     _print_report(console, slam, report, folder, fold.frames_per_second, len(cloud))
-    return Finished(slam, fold.interrupted)
+    return Finished(slam, interrupted, url)
 
 
-def _rerun_watcher(target: str, name: str) -> Watcher:
+def _rerun_watcher(target: str, name: str, folder: Path) -> tuple[Watcher, str | None]:
+    """The watcher, and where a served run is to be seen."""
     from vggtgeo.viewing.target import open_target  # rerun is imported only when it is asked for
     from vggtgeo.viewing.watcher import RerunWatcher
 
-    return RerunWatcher(open_target(target, name))
+    opened = open_target(target, name, folder / "run.rrd")
+    if opened.url is not None:
+        typer.echo(f"follow the run in a browser: {opened.url}", err=True)
+    return RerunWatcher(opened.stream), opened.url
 
 
 def _set_apart(sequence: Sequence) -> tuple[Sequence, Trajectory | None]:

@@ -1,6 +1,7 @@
 """Settings files: a TOML file says what the flags say, and a run leaves the settings it used in its folder.
 
-A key is the long name of a flag without its dashes (`rgb-only = true`), or the name of an argument (`path = "..."`).
+A key is the long name of a flag without its dashes (`rgb-only = true`, `lines = false`, also `no-lines = true`), or the
+name of an argument (`path = "..."`).
 The file takes the place of the defaults, so a flag that is given wins over it.
 """
 
@@ -41,7 +42,7 @@ class SettingsInUse:
 def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
     """The file's values become the defaults of the command's other parameters."""
     if path is not None and not context.resilient_parsing:
-        context.default_map = _checked(path, _read(path), _keys(context), _types(context))
+        context.default_map = _checked(path, _affirmed(path, _read(path), context), _keys(context), _types(context))
     return SettingsInUse(context)
 
 
@@ -91,12 +92,27 @@ def _checked(path: Path, given: dict[str, Any], names: dict[str, str], types: di
     return {names[key]: value for key, value in given.items()}
 
 
-def _keys(context: Any) -> dict[str, str]:
-    """Name of the parameter behind each key, in the order of the help."""
+def _affirmed(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
+    """`no-lines = true` as `lines = false`: what a flag can say, a file can."""
+    said = dict(given)
+    for key, name in _keys(context, negated=True).items():
+        if key in said:
+            positive = next(k for k, n in _keys(context).items() if n == name)
+            if positive in said:
+                raise InputError(f"`{path}`: `{positive}` and `{key}` are one setting; give one of them")
+            value = said.pop(key)
+            said[positive] = not value if isinstance(value, bool) else value
+    return said
+
+
+def _keys(context: Any, negated: bool = False) -> dict[str, str]:
+    """Name of the parameter behind each key (behind each switch's opposite if `negated`), in the order of the help."""
     keys = {}
     for parameter in context.command.params:
         if parameter.name is not None and parameter.name not in _NOT_SETTINGS:
-            keys[max(parameter.opts, key=len).lstrip("-")] = parameter.name
+            names = parameter.secondary_opts if negated else parameter.opts
+            if names:
+                keys[max(names, key=len).lstrip("-")] = parameter.name
     return keys
 
 

@@ -1,12 +1,12 @@
 """`vggtgeo simulate`: a synthetic scene as a TUM RGB-D folder, with exact truth."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import track
 
+from vggtgeo.cli.options import JsonOption, QuietOption
 from vggtgeo.errors import InputError
 
 
@@ -21,18 +21,26 @@ def simulate(
     blur: Annotated[float, typer.Option(help="Motion blur: seconds the shutter is open.")] = 0.0,
     readout: Annotated[float, typer.Option(help="Rolling exposure: seconds from first to last row.")] = 0.0,
     exposure_swing: Annotated[float, typer.Option(help="Relative change of exposure over time.")] = 0.0,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Render a hand-held walk through SCENE as a TUM RGB-D folder with exact truth."""
+    from rich.console import Console
+    from rich.progress import track
+
     from vggtgeo import simulation
     from vggtgeo.simulation.tum_folder import write_tum_folder
 
     sensor = simulation.Sensor(exposure_time=blur, readout_time=readout, exposure_swing=exposure_swing)
-    console = Console()
+    console = Console(quiet=quiet or as_json)
     sequence = simulation.simulate(scene, frames, seed, parse_size(size), rate=rate, speed=speed, sensor=sensor)
     for _ in track(write_tum_folder(sequence, output), description=f"rendering {scene}", total=frames, console=console):
         pass
     length = sequence.ground_truth().length
-    console.print(f"{frames} frames over {length:.1f} m of path, simulated with seed {seed}: {output}")
+    console.print(f"{frames} frames over {length:.1f} m of path, simulated with seed {seed}: {output}", soft_wrap=True)
+    if as_json:
+        facts = {"scene": scene, "frames": frames, "seed": seed, "rate": rate, "path_length_m": length}
+        typer.echo(json.dumps({**facts, "folder": str(output), "simulated": True}))
 
 
 def parse_size(text: str) -> tuple[int, int]:

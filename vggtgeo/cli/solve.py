@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from vggtgeo.cli.options import JsonOption, QuietOption
+
 
 class Precision(enum.StrEnum):
     """Float type of a solve."""
@@ -22,10 +24,12 @@ def solve(
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations (tried steps).")] = 50,
     dtype: Annotated[Precision, typer.Option(help="Precision of the solve.")] = Precision.float64,
     repeat: Annotated[int, typer.Option(min=1, help="Runs to take the median time of.")] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Solve the bundle-adjustment problem in PROBLEM."""
     from vggtgeo.cli.timed_solve import solve_file
 
     report = solve_file(problem, output, max_steps, dtype.value, repeat)
-    typer.echo(json.dumps(asdict(report), allow_nan=False) if as_json else report.sentence)
+    if as_json or not quiet:
+        typer.echo(json.dumps(asdict(report), allow_nan=False) if as_json else report.sentence)

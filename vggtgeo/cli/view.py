@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from vggtgeo.cli.options import JsonOption, QuietOption
 
 
 def view(
@@ -15,30 +18,41 @@ def view(
     rerun: Annotated[
         str, typer.Option(metavar="TARGET", help="spawn, serve, or a new file ending with .rrd.")
     ] = "spawn",
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Show the run in DIR: path, map, and depth where it was saved."""
     from vggtgeo.errors import InputError
-    from vggtgeo.viewing.target import check_target, open_target
+    from vggtgeo.viewing.target import check_target, flush, has_screen, open_target
 
     check_target(rerun)
     if not folder.is_dir():
         raise InputError(f"`{folder}` is no folder; give the folder that `vggtgeo run -o` wrote")
-    recordings = sorted(folder.glob("*.rrd"))
-    stream = open_target(rerun, folder.resolve().name)
-    if recordings and Path(rerun).suffix != ".rrd":
-        stream.log_file_from_path(recordings[-1])
-        stream.flush()
+    recordings = sorted(folder.glob("*.rrd")) if rerun in ("spawn", "serve") else []
+    if recordings and rerun == "spawn" and not has_screen():
+        raise InputError(
+            f"there is no screen; the recording is `{recordings[-1]}`: look at it with `rerun {recordings[-1]}` where "
+            "there is one, or here with `--rerun serve` in a browser"
+        )
+    opened = open_target(rerun, folder.resolve().name, folder / "view.rrd")
+    if recordings:
+        opened.stream.log_file_from_path(recordings[-1])
     else:
         from vggtgeo.viewing.folder import log_folder
 
-        log_folder(stream, folder)
+        log_folder(opened.stream, folder)
+    flush(opened.stream)
+    if as_json:
+        shown = recordings[-1] if recordings else folder
+        typer.echo(json.dumps({"target": rerun, "shown": str(shown), "url": opened.url}))
     if rerun == "serve":
-        serve_until_interrupted()
+        serve_until_interrupted(opened.url, quiet or as_json)
 
 
-def serve_until_interrupted() -> None:
+def serve_until_interrupted(url: str | None, quiet: bool = False) -> None:
     """Waits until Ctrl-C, so that a browser may go on reading."""
-    typer.echo("serving (Ctrl-C ends it): open http://localhost:9090 in a browser", err=True)
+    if not quiet:
+        typer.echo(f"serving (Ctrl-C ends it): open {url} in a browser", err=True)
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             time.sleep(3600.0)

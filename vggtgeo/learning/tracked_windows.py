@@ -67,6 +67,13 @@ class TrackedWindow:
         """Matches that are right, bool [A]: what an oracle knows."""
         return self.error < INLIER
 
+    @property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Edge and slot of each match, int [A] each: where a batch keeps it (`batch.saliency[i][window.places]`)."""
+        seen = self.observations
+        first = np.searchsorted(seen.host, seen.host)  # hosts are in order
+        return seen.point_edge, (np.arange(len(seen.host)) - first)[seen.point_landmark]
+
 
 def tracked_windows(
     sequence: SyntheticSequence, count: int, *, keyframes: int = 4, points: int = 24, spacing: int = 5, seed: int = 0

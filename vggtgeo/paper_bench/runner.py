@@ -6,9 +6,10 @@ import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -42,7 +43,11 @@ class BenchReport:
         """Every run, one a line; SI units and degrees."""
         return tables.as_csv(self.results)
 
-    def figure(self) -> Figure:
+    def to_dict(self) -> dict[str, Any]:
+        """Plan and every run as plain values, SI units and degrees."""
+        return {"plan": self.plan.name, "simulated": True, "runs": [asdict(result) for result in self.results]}
+
+    def plot(self) -> Figure:
         """The error of every run, by scene and variant."""
         return ablation_figure(self.results, f"Simulated ablations, plan `{self.plan.name}`")
 

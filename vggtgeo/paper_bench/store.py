@@ -72,9 +72,10 @@ class Store:
 def fingerprint(job: Job) -> str:
     """Changes with the course, the settings of the system, and the version of the package."""
     settings = VARIANTS[job.variant].settings(job.course)
+    chosen = [field for field in fields(SlamSettings) if field.name != "record_iterations"]  # it changes no result
     parts = {
         "course": asdict(job.course),
-        "settings": {field.name: _plain(getattr(settings, field.name)) for field in fields(SlamSettings)},
+        "settings": {field.name: _plain(getattr(settings, field.name)) for field in chosen},
         "version": importlib.metadata.version("vggtgeo"),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

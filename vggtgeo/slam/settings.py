@@ -84,7 +84,7 @@ class SlamSettings:
     two_ends_lines: bool = False
     """Give a segment two unknowns, the inverse depths of its ends, instead of one for each of its samples."""
     segment_samples: int = 6
-    """Samples of a segment, at most, where it has two unknowns; `line_slots` is a multiple of it."""
+    """Samples of a segment, at most, where it has two unknowns; then `line_slots` is a multiple of it."""
     manhattan: bool = False
     """Measure each keyframe's rotation from lines along three perpendicular directions, where they agree on them."""
     use_confidence: bool = True
@@ -112,6 +112,8 @@ class SlamSettings:
     """Pairs that each keyframe may propose in the search for places seen before."""
     global_adjustment: bool = True
     """Adjust all keyframes together at the end, with edges between those that saw the same place."""
+    record_iterations: bool = False
+    """Keep what each iteration of the window's solver did in `Slam.iterations`, for a viewer; changes no result."""
 
     @property
     def padded_samples(self) -> int | None:
@@ -124,10 +126,10 @@ class SlamSettings:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
         if self.depth_trust not in ("own", "saliency", "complement"):
             raise InputError(f"`depth_trust` is {self.depth_trust!r}; it must be own, saliency or complement")
-        if self.segment_samples < 2 or self.line_slots % self.segment_samples:
+        if self.two_ends_lines and (self.segment_samples < 2 or self.line_slots % self.segment_samples):
             raise InputError(
-                f"`segment_samples` is {self.segment_samples} and `line_slots` {self.line_slots}; a segment needs at "
-                "least 2 samples, and the slots must be a multiple of them"
+                f"`segment_samples` is {self.segment_samples} and `line_slots` {self.line_slots}; with "
+                "`two_ends_lines` a segment needs at least 2 samples, and the slots must be a multiple of them"
             )
         if self.window < 3:
             raise InputError(f"`window` is {self.window}; it must hold at least 3 keyframes")

@@ -11,6 +11,7 @@ from vggtgeo.problem import MarginalPrior, State
 from vggtgeo.slam.adjustment import Adjustment
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,9 @@ class Slam:
     pixels. keyframes: all, by number. pairs: all matches between them. window: numbers of
     the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
     solved: the last window problem and its solution. energies: `1/2 sum rho` of that window before its first and after
-    each iteration. frames: every frame's pose. velocity: last motion from frame to
-    frame, camera -> camera. waiting: frames before the start of an RGB sequence. lost: frames since tracking was lost.
+    each iteration; iterations: what else each did, where the settings ask for it. frames: every frame's pose.
+    velocity: last motion from frame to frame, camera -> camera. waiting: frames before the start of an RGB sequence.
+    lost: frames since tracking was lost.
     metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
     world), as the first keyframes saw them. notes: what the user should know.
     """
@@ -65,6 +67,7 @@ class Slam:
     prior: MarginalPrior | None = None
     solved: tuple[Adjustment, State] | None = None
     energies: np.ndarray | None = None
+    iterations: IterationRecord | None = None
     frames: tuple[FramePose, ...] = ()
     velocity: np.ndarray = field(default_factory=lambda: np.eye(4))
     waiting: tuple[Waiting, ...] = ()

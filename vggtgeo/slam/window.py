@@ -62,7 +62,9 @@ def warm_up(settings: SlamSettings) -> tuple[Problem, State]:
 
 def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
     """The solver of every window: a tracker's start is near, and the next window goes on from here."""
-    return SchurLevenbergMarquardt(max_iterations=settings.window_iterations, rtol=1e-5)
+    return SchurLevenbergMarquardt(
+        max_iterations=settings.window_iterations, rtol=1e-5, record_iterations=settings.record_iterations
+    )
 
 
 def make_room(slam: Slam, settings: SlamSettings) -> Slam:
@@ -110,6 +112,7 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
         intrinsics=intrinsics,
         solved=(adjustment, solution.state),
         energies=history[np.isfinite(history)],
+        iterations=solution.record,
     )
 
 

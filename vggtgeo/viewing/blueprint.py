@@ -6,7 +6,7 @@ from typing import Any
 
 ORIGINS = (
     *("/world", "/world/camera/image", "/keyframe/image", "/keyframe/depth", "/keyframe/confidence", "/window"),
-    *("/plots/residuals", "/plots/solver", "/plots/tracking", "/notes"),
+    *("/plots/residuals", "/plots/solver", "/plots/convergence", "/plots/tracking", "/notes"),
 )
 """Where the views look."""
 
@@ -31,6 +31,7 @@ def blueprint() -> Any:
     curves = rrb.Tabs(
         rrb.TimeSeriesView(name="Residuals [px], depth [sigma]", origin="/plots/residuals"),
         rrb.TimeSeriesView(name="Energy by iteration", origin="/plots/solver"),
+        rrb.TimeSeriesView(name="Damping, gradient, step [m]: log10", origin="/plots/convergence"),
         rrb.TimeSeriesView(name="Tracked points", origin="/plots/tracking"),
         rrb.TextLogView(name="Notes", origin="/notes"),
     )

@@ -12,6 +12,7 @@ from vggtgeo.slam import rigid
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.watching import WindowRecord
+from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 from vggtgeo.trajectory import Trajectory
 
 ENTITIES = (
@@ -22,6 +23,7 @@ ENTITIES = (
     "/world/keyframes",
     "/world/covariance",
     "/world/covisibility",
+    "/world/iteration",
     "/world/points",
     "/world/map",
     "/keyframe/image",
@@ -35,6 +37,9 @@ ENTITIES = (
     "/plots/residuals/lines",
     "/plots/residuals/depth",
     "/plots/solver/energy",
+    "/plots/convergence/damping",
+    "/plots/convergence/gradient",
+    "/plots/convergence/step",
     "/plots/tracking/inliers",
     "/notes",
 )
@@ -169,6 +174,32 @@ def log_residuals(stream: Any, record: WindowRecord) -> None:
         value = getattr(record, name)
         if np.isfinite(value):
             stream.log(f"plots/residuals/{name}", rr.Scalars(value))
+
+
+def log_iteration(stream: Any, row: int, energy: float, record: IterationRecord | None, members: int) -> None:
+    """Energy after try `row` of the window's solver and, of a `record`, the cameras it left and how it went:
+    logarithms (base 10) of the damping, of the gradient norm, and of the largest motion of a camera's centre, metres.
+    """
+    import rerun as rr
+
+    stream.log("plots/solver/energy", rr.Scalars(energy))
+    if record is None:
+        return
+    centres = [_centres(record.moved[k][:members]) for k in (row, max(row - 1, 0))]
+    stream.log("world/iteration", rr.LineStrips3D([centres[0]], colors=[_ORANGE], radii=-1.0))
+    values = {
+        "damping": float(record.damping[row]),
+        "gradient": float(record.gradient_norm[row]),
+        "step": float(np.linalg.norm(centres[0] - centres[1], axis=1).max()),
+    }
+    for name, value in values.items():
+        if value > 0 and np.isfinite(value):
+            stream.log(f"plots/convergence/{name}", rr.Scalars(np.log10(value)))
+
+
+def _centres(poses: Any) -> np.ndarray:
+    """Camera centres, [n, 3], of poses world -> camera, [n, 7]."""
+    return rigid.invert(rigid.to_matrix(np.asarray(poses, np.float64)))[:, :3, 3]
 
 
 def log_tracking(stream: Any, inliers: int) -> None:

@@ -13,6 +13,7 @@ from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam.outputs import DEPTH_UNIT
 from vggtgeo.trajectory import Trajectory
 from vggtgeo.viewing import entities
+from vggtgeo.viewing.target import flush
 
 
 def log_folder(stream: Any, folder: Path) -> None:
@@ -34,7 +35,7 @@ def log_folder(stream: Any, folder: Path) -> None:
     entities.log_map(stream, PointCloud.load_ply(folder / "map.ply"))
     for file in sorted(folder.glob("depth/*.depth.png")):
         _log_depth(stream, file)
-    stream.flush()
+    flush(stream)
 
 
 def _log_depth(stream: Any, file: Path) -> None:

@@ -1,14 +1,36 @@
-"""Where a recording goes: a file, a viewer on this machine, or a port that a viewer elsewhere connects to."""
+"""Where a recording goes: a file, a viewer on this machine, or a port that a browser connects to."""
 
 from __future__ import annotations
 
+import os
+import socket
+import sys
+import sysconfig
+import time
+import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
-from vggtgeo.errors import InputError
+from vggtgeo.errors import InputError, InputWarning
 from vggtgeo.files import make_parent
 
 APPLICATION = "vggtgeo"
+VIEWER_PORT = 9876
+"""Where the viewer listens, and where a served recording is to be had if the port is free."""
+WEB_PORT = 9090
+"""The same of the page that shows a served recording."""
+_PATIENCE = 10.0
+"""Seconds: for a viewer to open, and for it to take what was logged last."""
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A target that is open: `stream` takes what is logged; `url` is where a browser shows a served one."""
+
+    stream: Any
+    url: str | None = None
 
 
 def check_target(target: str) -> str:
@@ -20,22 +42,116 @@ def check_target(target: str) -> str:
     return target
 
 
-def open_target(target: str, name: str) -> Any:
+def open_target(target: str, name: str, instead: Path) -> Opened:
     """A stream that sends what is logged to `target`, arranged by the blueprint of this package.
 
     A file grows while the run goes on, so that an interrupted run leaves one that opens.
+
+    Args:
+        target: `spawn`, `serve` or a file, as `check_target` takes it.
+        name: of the recording.
+        instead: the file that is written in place of a window where there is no screen, with a warning.
+
     """
+    import rerun as rr
+
+    stream = rr.RecordingStream(APPLICATION)
+    url = None
+    if check_target(target) == "spawn":
+        _spawn(stream, instead)
+    elif target == "serve":
+        url = _serve(stream)
+    else:
+        _save(stream, Path(target))
+    stream.send_recording_name(name)
+    return Opened(stream, url)
+
+
+def flush(stream: Any) -> None:
+    """Waits until everything that was logged has arrived; a viewer that is gone costs a warning, never the run."""
+    try:
+        stream.flush(timeout_sec=_PATIENCE)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        warnings.warn(f"the Rerun viewer did not take all of the recording ({reason})", InputWarning, stacklevel=2)
+
+
+def has_screen() -> bool:
+    """Whether a window can be opened, as far as the environment tells."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))
+
+
+def _save(stream: Any, path: Path) -> None:
+    from vggtgeo.viewing.blueprint import blueprint
+
+    make_parent(path)
+    stream.save(path, default_blueprint=blueprint())
+
+
+def _spawn(stream: Any, instead: Path) -> None:
+    """A window, or the file `instead` where none opens."""
+    from vggtgeo.viewing.blueprint import blueprint
+
+    reason = "there is no screen" if not has_screen() else _start_viewer(stream)
+    if reason is None:
+        stream.connect_grpc(default_blueprint=blueprint())
+        return
+    _save(stream, instead)
+    warnings.warn(
+        f"{reason}, so the recording goes to `{instead}`; look at it with `rerun {instead}` where there is one, or "
+        "with `--rerun serve` in a browser",
+        InputWarning,
+        stacklevel=2,
+    )
+
+
+def _start_viewer(stream: Any) -> str | None:
+    """Start the viewer, or find one that runs; says why where there is none in the end."""
+    path = os.environ.get("PATH", "")
+    # The viewer's program lies beside Python, which is not on the path of whoever calls it by its whole name.
+    os.environ["PATH"] = os.pathsep.join([sysconfig.get_path("scripts"), path])
+    try:
+        stream.spawn(connect=False)
+    except RuntimeError as error:
+        return f"the viewer did not start ({str(error).splitlines()[0]})"
+    finally:
+        os.environ["PATH"] = path
+    end = time.monotonic() + _PATIENCE
+    while time.monotonic() < end:
+        if _listens(VIEWER_PORT):
+            return None
+        time.sleep(0.1)
+    return "the viewer closed at once"
+
+
+def _serve(stream: Any) -> str:
+    """A page and the recording behind it, at the usual ports or at free ones."""
     import rerun as rr
 
     from vggtgeo.viewing.blueprint import blueprint
 
-    stream = rr.RecordingStream(APPLICATION)
-    if check_target(target) == "spawn":
-        stream.spawn(default_blueprint=blueprint())
-    elif target == "serve":
-        rr.serve_web_viewer(connect_to=stream.serve_grpc(default_blueprint=blueprint()), open_browser=False)
-    else:
-        make_parent(Path(target))
-        stream.save(target, default_blueprint=blueprint())
-    stream.send_recording_name(name)
-    return stream
+    source = stream.serve_grpc(grpc_port=_port(VIEWER_PORT), default_blueprint=blueprint())
+    web = _port(WEB_PORT)
+    rr.serve_web_viewer(web_port=web, open_browser=False)
+    source = source.replace("127.0.0.1", "localhost")
+    return f"http://localhost:{web}/?url={quote(source, safe=':/')}"
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(0.5)
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def _port(usual: int) -> int:
+    """`usual` if it is free, else one that is."""
+    with socket.socket() as probe:
+        if os.name == "posix":  # as the server itself does: a port that was just given up is free
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", usual))
+        except OSError:
+            probe.bind(("", 0))
+        return int(probe.getsockname()[1])

@@ -15,6 +15,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.watching import WindowRecorder
 from vggtgeo.uncertainty import covariances
 from vggtgeo.viewing import entities
+from vggtgeo.viewing.target import flush
 
 _covariances_jit = eqx.filter_jit(covariances)
 
@@ -56,7 +57,7 @@ class RerunWatcher:
         entities.log_map(self.stream, cloud)
         counts = f"{len(slam.frames)} frames, {len(slam.keyframes)} keyframes, {len(cloud)} points in the map"
         entities.log_note(self.stream, f"finished: {counts}", level="INFO")
-        self.stream.flush()
+        flush(self.stream)
 
     def _see_keyframe(self, slam: Slam) -> None:
         members = [slam.keyframes[number] for number in slam.window]
@@ -75,11 +76,9 @@ class RerunWatcher:
         self._log_iterations(slam)
 
     def _log_iterations(self, slam: Slam) -> None:
-        import rerun as rr
-
         if slam.energies is None:
             return
-        for energy in slam.energies:
+        for row, energy in enumerate(slam.energies):
             self.stream.set_time("iteration", sequence=self._iterations)
-            self.stream.log("plots/solver/energy", rr.Scalars(float(energy)))
+            entities.log_iteration(self.stream, row, float(energy), slam.iterations, len(slam.window))
             self._iterations += 1

@@ -1,0 +1,110 @@
+"""Pictures of what a problem determines: ellipses of the camera centres, and the information by kind of factor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.patches import Ellipse
+
+from vggtgeo.degeneracy import KINDS, WEAK, Observability
+from vggtgeo.degeneracy_report import lost_shares
+from vggtgeo.plots import Picture
+from vggtgeo.problem import State
+from vggtgeo.slam import rigid
+from vggtgeo.uncertainty import Covariances
+
+COLOURS = {"points": "#1f5fbf", "lines": "#e07b1a", "depth": "#3a8f5c", "priors": "#8a8f98"}
+_INK, _GRID = "#333333", "#e3e3e3"
+_FACTORS = (1, 3, 10, 30, 100, 300, 1000)
+"""Standard deviations that the ellipses may reach."""
+_SHARE = 0.2
+"""Of the picture's extent: how long the half axis of the largest ellipse may be."""
+
+
+def covariance_figure(
+    found: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, sigmas: float | None = None
+) -> Picture:
+    """The camera centres of `state` in the horizontal plane of the first camera, with ellipses of `sigmas` standard
+    deviations (by default as many as can be seen well), and the true centres (world frame) where they are given.
+    """
+    poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
+    blocks = np.asarray(found.poses, np.float64)[:, :3, :3]
+    turn = poses[0, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)  # from each camera to the first
+    known = np.all(np.isfinite(blocks), axis=(1, 2))
+    spread = (turn @ np.where(known[:, None, None], blocks, 0.0) @ turn.transpose(0, 2, 1))[:, [0, 2]][:, :, [0, 2]]
+    flat = lambda centres: (centres @ poses[0, :3, :3].T + poses[0, :3, 3])[:, [0, 2]]
+    centres = flat(rigid.invert(poses)[:, :3, 3])
+    values, vectors = np.linalg.eigh(spread)
+    half_axes = np.sqrt(np.maximum(values, 0.0))
+    extent = max(float(np.ptp(centres, axis=0).max()), 1e-6)
+    seen = [factor for factor in _FACTORS if factor * half_axes.max() <= _SHARE * extent]
+    factor = sigmas if sigmas is not None else (seen or _FACTORS)[-1 if seen else 0]
+    figure, axes = _figure(6.5, 4.4)
+    for place, sizes, directions in zip(centres, half_axes, vectors, strict=True):
+        angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
+        size = 2 * factor * sizes[::-1]
+        axes.add_patch(Ellipse(place, *size, angle=angle, color="#e07b1a", alpha=0.35, lw=0, zorder=1))
+    axes.plot(*centres.T, "o-", color="#1f5fbf", ms=5, lw=0.8, label="estimate", zorder=3)
+    if truth is not None:
+        axes.plot(*flat(np.asarray(truth)).T, "+", color="black", ms=10, label="truth", zorder=4)
+    for number, place in enumerate(centres):
+        axes.annotate(str(number), place, (0, -14), textcoords="offset points", ha="center", fontsize=8, color=_INK)
+    unknown = f"; undetermined: {', '.join(map(str, np.nonzero(~known)[0]))}" if not known.all() else ""
+    axes.set_title(f"Camera centres from above, ellipses of {factor:g} sigma{unknown}", loc="left", fontsize=10)
+    axes.set(xlabel="to the right of the first camera [m]", ylabel="ahead of it [m]")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.12)
+    axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def observability_figure(found: Observability) -> Picture:
+    """Left: the balanced eigenvalues with all factors and without each kind. Right: the share of the information about
+    each common motion and about the free intrinsics that would be lost without each kind.
+    """
+    figure = Picture(figsize=(10.0, 3.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=[2, 3])
+    free = int(np.sum(found.free))
+    floor = 0.1 * float(np.finfo(found.whole.values.dtype).eps)
+    rows = [("all", found.whole.values[0], _INK)]
+    rows += [(f"without {kind}", found.without.values[k], COLOURS[kind]) for k, kind in enumerate(KINDS)]
+    for name, values, colour in rows:
+        style = {"lw": 2.2, "zorder": 3} if name == "all" else {"lw": 1.2}
+        left.semilogy(np.maximum(np.asarray(values)[:free], floor), ".-", ms=4, color=colour, label=name, **style)
+    left.axhline(WEAK, color="#c0392b", lw=0.9, ls="--")
+    left.annotate("weak below", (free - 1, WEAK), (0, 3), textcoords="offset points", ha="right", fontsize=8)
+    left.set(xlabel="direction, the weakest first", ylabel="eigenvalue, balanced")
+    left.set_title("How well it is determined", loc="left", fontsize=10)
+    left.legend(frameon=False, fontsize=8)
+    shares = lost_shares(found)
+    names = [name for name in shares if not name.startswith("keyframe")]
+    for k, kind in enumerate(KINDS):
+        heights = [100 * shares[name][kind] for name in names]
+        right.bar(np.arange(len(names)) + 0.2 * (k - 1.5), heights, 0.2, color=COLOURS[kind], label=kind)
+    right.set_xticks(range(len(names)), [name.replace("translation ", "") for name in names], rotation=30, ha="right")
+    right.set_ylabel("information lost [%]")
+    right.set_title("Without a kind of observation", loc="left", fontsize=10)
+    right.legend(frameon=False, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.0))
+    right.set_ylim(0, 118)
+    right.set_yticks([0, 25, 50, 75, 100])
+    for axes in (left, right):
+        _tidy(axes)
+    return figure
+
+
+def _figure(width: float, height: float) -> tuple[Picture, Any]:
+    figure = Picture(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    _tidy(axes)
+    return figure, axes
+
+
+def _tidy(axes: Any) -> None:
+    axes.grid(color=_GRID, lw=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=_INK, labelsize=9)
