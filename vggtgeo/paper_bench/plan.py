@@ -101,7 +101,7 @@ def _paper(name: str, office: Course, hall: Course, corridor: Course, seeds: int
         Group(hall, (FULL,), seeds),
         Group(corridor, TABLE_6, seeds),
         Group(office, (FULL, *OURS), ours),
-        Group(corridor, (FULL, "manhattan"), ours),
+        Group(corridor, (FULL, "manhattan", "accurate-depth"), ours),
     )
     assert all(key in VARIANTS for group in groups for key in group.variants)
     return Plan(name, groups)

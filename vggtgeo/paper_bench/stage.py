@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame, check_selection
@@ -55,12 +55,13 @@ class Stage:
         return self.oracle.ground_truth()
 
     def roles(self, variant: Variant) -> Roles:
-        """The five stubs with their standard error models, the same for every variant."""
+        """The five stubs with their standard error models; the depth's errors times what the variant says."""
         oracle, seed = self.oracle, self.seed
+        moge, factor = SimulatedMoge(oracle, seed), variant.depth_errors
         return Roles(
             points=SimulatedMast3r(oracle, seed, count=self.course.key_points),
             lines=SimulatedLetr(oracle, seed),
-            depth=SimulatedMoge(oracle, seed),
+            depth=replace(moge, error=factor * moge.error, wobble=factor * moge.wobble),
             confidence=SimulatedDino(oracle, seed),
             geometry=variant.start(SimulatedVggt(oracle, seed)),
         )

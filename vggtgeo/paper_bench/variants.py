@@ -46,12 +46,15 @@ def _adjusted_at_the_end(settings: SlamSettings) -> SlamSettings:
 
 @dataclass(frozen=True)
 class Variant:
-    """One row of a table. change: of the settings. start: how a new frame's pose starts, given the simulated VGGT."""
+    """One row of a table. change: of the settings. start: how a new frame's pose starts, given the simulated VGGT.
+    depth_errors: factor on those of the simulated MoGe-2.
+    """
 
     key: str
     title: str
     change: _Change = _same
     start: _Start = _window_start
+    depth_errors: float = 1.0
 
     def settings(self, course: Course) -> SlamSettings:
         """The settings of a run on `course`: the paper's sliding window, nothing adjusted after the end."""
@@ -94,6 +97,7 @@ VARIANTS: dict[str, Variant] = {
         Variant("formula", "depth prior x Omega (the paper's formula)", lambda s: replace(s, depth_trust="saliency")),
         Variant("text", "depth prior x (1 - Omega) (its text)", lambda s: replace(s, depth_trust="complement")),
         Variant("global", "one adjustment of the whole map at the end", _adjusted_at_the_end),
+        Variant("accurate-depth", "a tenth of the depth errors", depth_errors=0.1),
         Variant("two-ends", "two unknowns a segment", lambda s: replace(s, two_ends_lines=True)),
     )
 }
