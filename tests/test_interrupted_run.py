@@ -8,16 +8,40 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from vggtgeo.cli.main import make_app
 from vggtgeo.simulation import simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.trajectory import Trajectory
 
 FRAMES = 120
 PROGRAM = "from vggtgeo.cli import main; main()"
+
+
+def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that is interrupted before it has anything ends with code 130 too, and leaves what an earlier run wrote;
+    oracle: the code, and a file that was there.
+    """
+
+    def interrupted(*_: object) -> Iterator[object]:
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr("vggtgeo.cli.run_sequence.warm_up", lambda settings: ())
+    monkeypatch.setattr("vggtgeo.slam.watching.WindowRecorder.warm_up", lambda self: None)
+    monkeypatch.setattr("vggtgeo.cli.run_sequence.run_frames", interrupted)
+    (tmp_path / "trajectory.txt").write_text("of an earlier run")
+    result = CliRunner().invoke(make_app(), ["demo", "--frames", "3", "-o", str(tmp_path), "--json"])
+    assert result.exit_code == 130, result.output
+    assert result.stderr.strip() == "interrupted"
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("trajectory.txt", "of an earlier run")]
 
 
 @pytest.mark.slow  # a process of its own, which compiles the window's solver

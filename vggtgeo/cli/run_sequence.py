@@ -175,10 +175,13 @@ def _fold(
                     with clock.measure("record and draw"):
                         watcher.see(slam, frame)
         except KeyboardInterrupt:
-            console.print("interrupted: writing what there is")
             interrupted = True
     if slam is None or not slam.frames:
+        if interrupted:
+            raise KeyboardInterrupt
         raise InputError(f"`{sequence.name}` gave no frame that could be used; nothing was written")
+    if interrupted:
+        console.print("interrupted: writing what there is")
     return _Fold(slam, interrupted, len(slam.frames) / (time.perf_counter() - began))
 
 
