@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from typer.testing import CliRunner
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.cli.main import make_app
+from vggtgeo.cli.settings_file import write_settings
 from vggtgeo.errors import InputError, InputWarning
 from vggtgeo.slam import rigid
 from vggtgeo.slam.outputs import write_depth, write_map, write_trajectories
@@ -131,6 +133,7 @@ def test_a_run_folder_becomes_a_recording(run: RecordedRun, tmp_path: Path) -> N
     [
         (("view", "nowhere", "--rerun", "a.rrd"), "`nowhere` is no folder"),
         (("view", ".", "--rerun", "a.rrd"), "has no `trajectory.txt`"),
+        (("view", ".", "--rerun", "spawn"), "has no `trajectory.txt`"),
         (("view", ".", "--rerun", "picture.png"), "it must be `spawn`"),
         (("run", "nowhere", "--rerun", "show"), "it must be `spawn`"),
     ],
@@ -138,12 +141,13 @@ def test_a_run_folder_becomes_a_recording(run: RecordedRun, tmp_path: Path) -> N
 def test_what_is_wrong_is_said_first(
     arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A wrong folder or target ends with code 2 and a line that names it."""
+    """A wrong folder or target ends with code 2 and a line that names it, and leaves no file behind."""
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(make_app(), list(arguments))
     assert result.exit_code == 2, result.stderr
     assert message in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_target_is_checked() -> None:
@@ -200,6 +204,32 @@ def test_view_names_the_recording_where_there_is_no_screen(tmp_path: Path, monke
     result = CliRunner().invoke(make_app(), ["view", str(tmp_path)])
     assert result.exit_code == 2
     assert "look at it with `rerun" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("target", "expected"),
+    [
+        (None, None),
+        ("serve", None),
+        ("spawn", "run.rrd"),
+        ("runs/x/kept.rrd", "kept.rrd"),
+        ("runs/x/gone.rrd", None),
+        ("killed", "view.rrd"),
+    ],
+)
+def test_the_recording_of_an_earlier_run_is_not_shown(tmp_path: Path, target: str | None, expected: str | None) -> None:
+    """Of the recordings in a folder, `view` takes the one that the folder's settings name, and none that another run
+    or `view` left; without settings, as after a kill, the newest. Oracle: what was put there.
+    """
+    from vggtgeo.viewing.folder import recording_of
+
+    for age, name in enumerate(("view.rrd", "run.rrd", "kept.rrd")):
+        (tmp_path / name).write_bytes(b"")
+        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
+    if target != "killed":
+        write_settings(tmp_path / "settings.toml", {"path": "clip.mp4", "rerun": target})
+    found = recording_of(tmp_path)
+    assert (found and found.name) == expected
 
 
 SERVE = """

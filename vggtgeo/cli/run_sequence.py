@@ -122,10 +122,10 @@ def run_and_write(
 
 def _rerun_watcher(target: str, name: str, folder: Path) -> tuple[Watcher, str | None]:
     """The watcher, and where a served run is to be seen."""
-    from vggtgeo.viewing.target import open_target  # rerun is imported only when it is asked for
+    from vggtgeo.viewing.target import STAND_IN, open_target  # rerun is imported only when it is asked for
     from vggtgeo.viewing.watcher import RerunWatcher
 
-    opened = open_target(target, name, folder / "run.rrd")
+    opened = open_target(target, name, folder / STAND_IN)
     if opened.url is not None:
         typer.echo(f"follow the run in a browser: {opened.url}", err=True)
     return RerunWatcher(opened.stream), opened.url

@@ -23,28 +23,26 @@ def view(
 ) -> None:
     """Show the run in DIR: path, map, and depth where it was saved."""
     from vggtgeo.errors import InputError
+    from vggtgeo.viewing.folder import check_folder, log_folder, recording_of
     from vggtgeo.viewing.target import check_target, flush, has_screen, open_target
 
     check_target(rerun)
-    if not folder.is_dir():
-        raise InputError(f"`{folder}` is no folder; give the folder that `vggtgeo run -o` wrote")
-    recordings = sorted(folder.glob("*.rrd")) if rerun in ("spawn", "serve") else []
-    if recordings and rerun == "spawn" and not has_screen():
+    recording = recording_of(folder) if rerun in ("spawn", "serve") else None
+    if recording is None:
+        check_folder(folder)
+    elif rerun == "spawn" and not has_screen():
         raise InputError(
-            f"there is no screen; the recording is `{recordings[-1]}`: look at it with `rerun {recordings[-1]}` where "
-            "there is one, or here with `--rerun serve` in a browser"
+            f"there is no screen; the recording is `{recording}`: look at it with `rerun {recording}` where there is "
+            "one, or here with `--rerun serve` in a browser"
         )
     opened = open_target(rerun, folder.resolve().name, folder / "view.rrd")
-    if recordings:
-        opened.stream.log_file_from_path(recordings[-1])
-    else:
-        from vggtgeo.viewing.folder import log_folder
-
+    if recording is None:
         log_folder(opened.stream, folder)
+    else:
+        opened.stream.log_file_from_path(recording)
     flush(opened.stream)
     if as_json:
-        shown = recordings[-1] if recordings else folder
-        typer.echo(json.dumps({"target": rerun, "shown": str(shown), "url": opened.url}))
+        typer.echo(json.dumps({"target": rerun, "shown": str(recording or folder), "url": opened.url}))
     if rerun == "serve":
         serve_until_interrupted(opened.url, quiet or as_json)
 

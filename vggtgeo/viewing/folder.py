@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,32 @@ from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam.outputs import DEPTH_UNIT
 from vggtgeo.trajectory import Trajectory
 from vggtgeo.viewing import entities
-from vggtgeo.viewing.target import flush
+from vggtgeo.viewing.target import STAND_IN, flush
+
+
+def check_folder(folder: Path) -> None:
+    """InputError unless `folder` holds what `log_folder` needs."""
+    if not folder.is_dir():
+        raise InputError(f"`{folder}` is no folder; give the folder that `vggtgeo run -o` wrote")
+    for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
+        if not (folder / name).is_file():
+            raise InputError(f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote")
+
+
+def recording_of(folder: Path) -> Path | None:
+    """The recording that the run in `folder` made there, or None.
+
+    The run's settings name it, so that the recording of an earlier run into the same folder is not taken for it. A run
+    that was killed left no settings: then any recording that is there, the newest of several.
+    """
+    try:
+        target = tomllib.loads((folder / "settings.toml").read_text(encoding="utf-8")).get("rerun")
+    except (OSError, ValueError):
+        return max(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, default=None)
+    if target is None:
+        return None
+    file = folder / (STAND_IN if target == "spawn" else Path(str(target)).name)
+    return file if file.suffix == ".rrd" and file.is_file() else None
 
 
 def log_folder(stream: Any, folder: Path) -> None:
@@ -25,9 +51,7 @@ def log_folder(stream: Any, folder: Path) -> None:
     """
     import rerun as rr
 
-    for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
-        if not (folder / name).is_file():
-            raise InputError(f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote")
+    check_folder(folder)
     trajectory = Trajectory.load_tum(folder / "trajectory.txt")
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.set_time("frame", sequence=0)

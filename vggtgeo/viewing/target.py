@@ -17,6 +17,8 @@ from vggtgeo.errors import InputError, InputWarning
 from vggtgeo.files import make_parent
 
 APPLICATION = "vggtgeo"
+STAND_IN = "run.rrd"
+"""In the run's folder: the recording of a run whose window could not open."""
 VIEWER_PORT = 9876
 """Where the viewer listens, and where a served recording is to be had if the port is free."""
 WEB_PORT = 9090
