@@ -121,6 +121,26 @@ def test_a_command_that_is_not_there() -> None:
     assert "solve" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("solv",), "No such command 'solv'. Did you mean 'solve'? (see `vggtgeo --help`)"),
+        (("--bad",), "No such option: --bad (see `vggtgeo --help`)"),
+        (("solve", "--bad"), "No such option: --bad (see `vggtgeo solve --help`)"),
+        (("run",), "Missing argument 'path' (see `vggtgeo run --help`)"),
+        (("demo", "--frames", "many"), "Invalid value for '--frames': "),
+        (("models", "verify"), "Missing argument 'file' (see `vggtgeo models verify --help`)"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line(arguments: tuple[str, ...], message: str) -> None:
+    # Proves that what typer finds wrong is said as briefly as everything else, with where to read on.
+    result = CliRunner().invoke(make_app(), list(arguments), prog_name="vggtgeo")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {message}")
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stdout == ""
+
+
 def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
     # Proves that the program computes in 64 bits, keeps compiled code in the user's cache folder, and leaves memory of
     # a GPU to others.

@@ -12,7 +12,7 @@ from conftest import ROOT
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import COMMANDS, EXIT_INPUT, EXIT_INTERNAL, CommandEntry, load_command, make_app
-from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption
+from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption, write_settings
 from vggtgeo.errors import InputError
 
@@ -128,6 +128,37 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     # Proves that the message names the flag and the file.
     with pytest.raises(InputError, match=r"`--settings` is .*none.toml"):
         seen_by_the_command("clip", "--settings", str(tmp_path / "none.toml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "flags", "expected"),
+    [
+        ('output = "runs/a"\nrerun = "runs/a/deep/run.rrd"\n', ("-o", "runs/b"), "runs/b/deep/run.rrd"),
+        ('output = "runs/a"\nrerun = "runs/a/run.rrd"\n', (), "runs/a/run.rrd"),
+        ('output = "runs/a"\nrerun = "elsewhere/run.rrd"\n', ("-o", "runs/b"), "elsewhere/run.rrd"),
+        ('output = "runs/a"\nrerun = "serve"\n', ("-o", "runs/b"), "serve"),
+        ('output = "runs/a"\n', ("--rerun", "runs/a/run.rrd", "-o", "runs/b"), "runs/a/run.rrd"),
+        ('rerun = "run/run.rrd"\n', ("-o", "runs/b"), "run/run.rrd"),
+    ],
+)
+def test_a_run_again_leaves_the_old_recording(tmp_path: Path, text: str, flags: tuple[str, ...], expected: str) -> None:
+    # Proves that a recording inside the file's output folder goes to the new output, and any other stays where it is.
+    found: list[str | None] = []
+
+    def command(
+        output: Annotated[Path, typer.Option("-o", "--output")] = Path("run"),
+        settings: SettingsOption = None,
+        rerun: RerunOption = None,
+    ) -> None:
+        found.append(rerun)
+        assert settings is not None
+        assert settings.values()["rerun"] == rerun
+
+    app = typer.Typer(add_completion=False)
+    app.command()(command)
+    result = CliRunner().invoke(app, ["--settings", file_with(tmp_path, text), *flags], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert found == [expected]
 
 
 def test_help_of_every_command_is_quick_and_shows_examples() -> None:

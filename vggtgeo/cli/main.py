@@ -107,7 +107,15 @@ EXIT_CODES = (
 
 
 class _LazyGroup(TyperGroup):
-    """Lists stand-ins of its commands, and loads the one that is called."""
+    """Lists stand-ins of its commands, and loads the one that is called; an error of any kind is one line."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            if not _is_usage_error(error):
+                raise
+            _leave(error)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, stand_in, rest = super().resolve_command(ctx, args)
@@ -120,7 +128,7 @@ class _LazyGroup(TyperGroup):
         except (typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except (Exception, KeyboardInterrupt) as error:
-            if ctx.params.get("debug") or _is_usage_error(error):
+            if ctx.params.get("debug") or _is_call_for_help(error):
                 raise
             _leave(error)
 
@@ -142,9 +150,14 @@ def _examples(calls: tuple[str, ...]) -> str | None:
     return "\n\n".join(("Examples:", *(f"  {call}" for call in calls))) if calls else None
 
 
+def _is_call_for_help(error: BaseException) -> bool:
+    """Whether typer answers with the help page: no argument where one is needed."""
+    return type(error).__name__ == "NoArgsIsHelpError"
+
+
 def _is_usage_error(error: BaseException) -> bool:
-    """Whether typer itself prints this error (a wrong option, say), with the command's usage."""
-    return callable(getattr(error, "show", None)) and hasattr(error, "exit_code")
+    """Whether it is the command line that is wrong: an option or a value that is not there, say."""
+    return callable(getattr(error, "format_message", None)) and not _is_call_for_help(error)
 
 
 def _leave(error: BaseException) -> NoReturn:
@@ -153,11 +166,20 @@ def _leave(error: BaseException) -> NoReturn:
         message, code = "interrupted", EXIT_INTERRUPTED
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
+    elif _is_usage_error(error):
+        message, code = f"error: {_usage_message(error)}", EXIT_INPUT
     else:
         message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`)"
         code = EXIT_INTERNAL
     typer.echo(" ".join(message.split()), err=True)
     raise typer.Exit(code) from None
+
+
+def _usage_message(error: Any) -> str:
+    """What is wrong with the command line, and where to read how it should be."""
+    said = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
+    command = error.ctx.command_path if error.ctx is not None else "vggtgeo"
+    return f"{said} (see `{command} --help`)"
 
 
 def _stand_in() -> None:

@@ -4,7 +4,8 @@ settings file says.
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
@@ -12,7 +13,29 @@ EXIT_INTERRUPTED = 130
 """After Ctrl-C."""
 QuietOption = Annotated[bool, typer.Option("--quiet/--no-quiet", help="Say nothing: no progress bar, no report.")]
 JsonOption = Annotated[bool, typer.Option("--json/--no-json", help="Print one JSON object and nothing else.")]
+
+
+def _beside_output(context: Any, parameter: Any, target: str | None) -> str | None:
+    """`target`; one that a settings file put into its own output folder moves along where a flag names another.
+
+    Else the example of the help, a run again into a new folder, would write over the recording of the old one.
+    """
+    source = context.get_parameter_source(parameter.name)
+    old, new = (context.default_map or {}).get("output"), context.params.get("output")
+    if target is None or source is None or source.name != "DEFAULT_MAP" or old is None or new is None:
+        return target
+    try:
+        return str(Path(new) / Path(target).relative_to(old))
+    except ValueError:  # a word, or a file that lies elsewhere
+        return target
+
+
 RerunOption = Annotated[
     str | None,
-    typer.Option("--rerun", metavar="TARGET", help="Log to Rerun: spawn, serve, or a file ending with .rrd."),
+    typer.Option(
+        "--rerun",
+        metavar="TARGET",
+        callback=_beside_output,
+        help="Log to Rerun: spawn, serve, or a file ending with .rrd.",
+    ),
 ]

@@ -41,16 +41,28 @@ def run(
     rgb_only: Annotated[
         bool, typer.Option("--rgb-only/--no-rgb-only", help="Ignore depth images: the scale stays free.")
     ] = False,
-    lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Ablation: no line residuals.")] = True,
+    lines: Annotated[
+        bool, typer.Option("--lines/--no-lines", help="Residuals of lines; without them: an ablation.")
+    ] = True,
     depth_prior: Annotated[
         bool,
-        typer.Option("--depth-prior/--no-depth-prior", help="Ablation: depth starts the estimate, does not hold it."),
+        typer.Option(
+            "--depth-prior/--no-depth-prior",
+            help="Depth holds the estimate; without it, it starts it only: an ablation.",
+        ),
     ] = True,
     confidence: Annotated[
-        bool, typer.Option("--confidence/--no-confidence", help="Ablation: all weights are one.")
+        bool,
+        typer.Option(
+            "--confidence/--no-confidence", help="Weights by confidence; without it, all are one: an ablation."
+        ),
     ] = True,
     global_adjustment: Annotated[
-        bool, typer.Option("--global/--no-global", help="Ablation: the sliding window alone.")
+        bool,
+        typer.Option(
+            "--global/--no-global",
+            help="One adjustment of the whole map at the end; without it, the sliding window alone: an ablation.",
+        ),
     ] = True,
     init: Annotated[Init, typer.Option(help="How a new frame's pose starts.")] = "pnp",
     features: Annotated[Features, typer.Option(help="Key points.")] = "sift",
