@@ -127,6 +127,14 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     Use with `optimistix.least_squares(residuals, solver, y0, args=problem)`: `args` is an `AbstractArrowProblem`, `y0`
     one of its points; the residual function is only asked for its shape.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
+        >>> solution = vg.solve(problem, initial, solver=vg.SchurLevenbergMarquardt(max_iterations=2))
+        >>> solution.history.shape, solution.result
+        ((3,), 'max_iterations')
+
     """
 
     rtol: float = 1e-9

@@ -10,8 +10,8 @@ import pytest
 
 import vggtgeo as vg
 
-WITHOUT = {"ArrowAdjoint", "BenchReport", "Problem", "SchurLevenbergMarquardt", "State", "bench"}
-"""Arguments and results of other names, shown by the examples of those; and `bench`, which takes minutes."""
+WITHOUT = {"BenchReport"}
+"""What takes minutes to make; `notebooks/evaluate.ipynb` shows it."""
 
 
 @pytest.fixture(scope="module")

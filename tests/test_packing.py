@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scenes import Scene, make_scene
 from vggtgeo.errors import InputError
 from vggtgeo.packing import Observations, PaddedSize
 from vggtgeo.problem import Problem
+from vggtgeo.simulation import simulate_window
 
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)
 
@@ -26,6 +28,20 @@ def shuffled(scene: Scene) -> tuple[Observations, np.ndarray]:
         changes[f"{kind}_edge"] = edge_at[getattr(seen, f"{kind}_edge")]
         changes[f"{kind}_landmark"] = landmark_at[getattr(seen, f"{kind}_landmark")]
     return replace(seen, edges=seen.edges[edges], **changes), landmarks
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_the_precision_is_that_of_jax_unless_it_is_given(double: bool) -> None:
+    """A user who did not turn on `jax_enable_x64` gets single precision without a warning; oracle: JAX's own type, and
+    the warnings, which are errors here.
+    """
+    window = simulate_window(keyframes=3, points=4, lines=1)
+    with jax.enable_x64(double):
+        problem, initial, _ = window.pack()
+        expected = jnp.ones(()).dtype
+    leaves = [leaf for leaf in jax.tree.leaves((problem, initial)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    assert {leaf.dtype for leaf in leaves} == {expected}
+    assert {leaf.dtype for leaf in jax.tree.leaves(window.pack(dtype=np.float32)[1])} == {np.dtype(np.float32)}
 
 
 def observed(problem: Problem) -> set[tuple[float, ...]]:

@@ -134,6 +134,9 @@ class SlotIndex:
     slot: np.ndarray
     edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
+    def __repr__(self) -> str:
+        return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
+
     def gather(self, per_slot: np.ndarray | Array) -> np.ndarray:
         """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`."""
         return np.asarray(per_slot)[self.host, self.slot]
@@ -155,7 +158,7 @@ def pack(
     fixed_pose: np.ndarray | None = None,
     fixed_intrinsics: np.ndarray | bool = False,
     kernel: AbstractKernel | None = None,
-    dtype: DTypeLike = np.float64,
+    dtype: DTypeLike | None = None,
 ) -> tuple[Problem, State, SlotIndex]:
     """Pack flat observations and an initial guess into arrays.
 
@@ -170,7 +173,7 @@ def pack(
         fixed_pose: bool `[n]`; None holds the first pose.
         fixed_intrinsics: bool or bool `[4]`: intrinsics that are held.
         kernel: robust kernel; None = Cauchy with delta 1.5 px, the best of `benchmarks/robustness.py`.
-        dtype: float type of all arrays.
+        dtype: float type of all arrays; None = JAX's own, which is double where `jax_enable_x64` is on.
 
     Raises:
         InputError: an array of a wrong shape, an index out of range, a match given twice, a landmark with both points
@@ -186,6 +189,7 @@ def pack(
         ((6, 10, 2), (42,))
 
     """
+    dtype = jnp.result_type(float) if dtype is None else dtype
     count = len(observations.host)
     _check_shapes(observations, poses, intrinsics)
     _check_indices(observations, len(poses))

@@ -16,7 +16,18 @@ from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 
 class State(eqx.Module):
-    """What bundle adjustment estimates."""
+    """What bundle adjustment estimates: `n` poses, the intrinsics they share, `s` inverse depths a keyframe.
+
+    Example:
+        >>> import jax.numpy as jnp, vggtgeo as vg
+        >>> _, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
+        >>> initial.inverse_depth.shape
+        (3, 14)
+        >>> step = jnp.zeros(6 * 3 + 4 + 3 * 14).at[18].set(2.0)  # the first of the intrinsics
+        >>> float(initial.moved(step).intrinsics[0] - initial.intrinsics[0])
+        2.0
+
+    """
 
     poses: jaxlie.SE3
     """World -> camera of each keyframe, batch `[n]`."""
@@ -105,7 +116,22 @@ class MarginalPrior(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A bundle-adjustment problem; every float leaf may be differentiated."""
+    """A bundle-adjustment problem; every float leaf may be differentiated. `vggtgeo.pack` makes one.
+
+    Pixels, 1/m for inverse depths, poses world -> camera. Weight 0 means that an observation is not there, so that a
+    kind can be left out without another shape.
+
+    Example:
+        >>> import jax.numpy as jnp, vggtgeo as vg
+        >>> from dataclasses import replace
+        >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
+        >>> problem.points.target.shape, problem.lines.weight.shape
+        ((6, 10, 2), (6, 4))
+        >>> without = replace(problem, lines=replace(problem.lines, weight=jnp.zeros((6, 4))))
+        >>> bool(vg.energy(without, initial) < vg.energy(problem, initial))
+        True
+
+    """
 
     pixels: Float[Array, "n s 2"]
     """Where slot s of keyframe i looks: point slots first, then line samples."""

@@ -29,8 +29,10 @@ LAYOUT: dict[str, tuple[str | int, ...]] = {
 """Arrays of a problem and their shapes; the first array with a letter decides its size."""
 
 
-def load_problem(path: Path, dtype: DTypeLike = np.float64) -> tuple[Problem, State, SlotIndex]:
+def load_problem(path: Path, dtype: DTypeLike | None = None) -> tuple[Problem, State, SlotIndex]:
     """Read a problem: poses world -> camera `(qw, qx, qy, qz, tx, ty, tz)`, pixels, inverse depths in 1/m.
+
+    dtype: float type of all arrays, as `vggtgeo.pack` takes it.
 
     Raises:
         InputError: the file is missing, is no `.npz`, lacks an array or holds one that does not fit.

@@ -38,7 +38,7 @@ class Covariances(Readable):
         >>> found.poses.shape, found.intrinsics.shape
         ((4, 6, 6), (4, 4))
         >>> vg.covariances(problem, solution.state)
-        Covariances(4 keyframes, centres known to 5.1 mm at worst, variance factor 0.77)
+        Covariances(4 keyframes, centres known to 5.5 mm at worst, variance factor 0.27)
 
     """
 

@@ -30,7 +30,13 @@ Progress = Callable[[int, int, Job, Result], None]
 
 @dataclass(frozen=True)
 class BenchReport:
-    """The results of a plan; all simulated."""
+    """The results of a plan, as `vggtgeo.bench` returns them; all simulated. Lengths in metres, angles in degrees.
+
+    Fields:
+        plan: what was to be run.
+        results: a run each, in the order of the plan: scene, variant, seed and `errors`.
+
+    """
 
     plan: Plan
     results: tuple[Result, ...]
@@ -77,6 +83,14 @@ def bench(
     plan: "small" (a minute), "quick" or "full". scenes, variants: the part of the plan to run. seeds: how many, in
     place of the plan's own; first_seed: the first of them. workers: processes, each of which takes up to 4 GB with the
     plan "quick". Raises InputError for names that are not there.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.bench("runs/office", "quick", scenes=["ofice"])  # with "office": every run of that scene
+        Traceback (most recent call last):
+            ...
+        vggtgeo.errors.InputError: `scenes` holds ['ofice']; choose among office, hall, corridor
+
     """
     if plan not in PLANS:
         raise InputError(f"`plan` is {plan!r}; it must be one of {', '.join(PLANS)}")
