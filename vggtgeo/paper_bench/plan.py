@@ -12,7 +12,7 @@ from vggtgeo.paper_bench.variants import FULL, VARIANTS
 TABLE_6 = (FULL, "A", "B", "C", "D")
 OURS = (
     *("pnp", "window-5", "window-15", "huber", "huber-B", "square", "alpha", "formula", "text"),
-    *("two-ends", "heavy-lines", "manhattan", "global"),
+    *("two-ends", "heavy-lines", "manhattan", "global", "accurate-depth"),
 )
 
 
