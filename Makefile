@@ -20,7 +20,7 @@ $(READY): pyproject.toml setup.py requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
-demo: $(READY)  ## run the system on a synthetic room; OUT=runs/demo
+demo: $(READY)  ## run the system in a synthetic office; OUT=runs/demo
 	$(BIN)/vggtgeo demo -o $(OUT)
 
 test: $(READY)  ## run the tests (a few minutes); ARGS="-k name" for some

@@ -7,13 +7,14 @@ The problems are those of the generator's size `global` (128 points and 8 lines 
 keyframes before and after), made once and kept in the output folder. Each row is a process of its own, in float64:
 a whole jitted `solve` of so many iterations, run four times. Wall time is the median of the last three, processor time
 their least (the one to read where the core is shared). With `--ceres`, Ceres solves the same files (SPARSE_SCHUR,
-analytic, cached edges, one thread). Prints Markdown, and writes it to `scale.md` and the plot to `scale.png` beside
-the problems.
+analytic, cached edges, one thread); inverse depths may become negative here, as they may there. Prints Markdown, and
+writes it to `scale.md` and the plot to `scale.png` beside the problems.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib.util
 import json
 import resource
@@ -113,6 +114,7 @@ def _measure(path: Path, name: str, iterations: int) -> dict[str, Any]:
     from vggtgeo.solver_choice import choose_reduced_solver
 
     problem, state, _ = load_problem(path)
+    problem = dataclasses.replace(problem, positive_depth=False)
     reduced = {"dense": DenseCholesky, "jacobi": ConjugateGradients}.get(name, lambda: choose_reduced_solver(problem))()
     solver = SchurLevenbergMarquardt(rtol=0.0, max_iterations=iterations, reduced_solver=reduced)
     start = time.perf_counter()

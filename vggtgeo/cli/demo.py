@@ -1,4 +1,4 @@
-"""`vggtgeo demo`: the main job on a synthetic room, rendered on the spot."""
+"""`vggtgeo demo`: the main job in a synthetic office, rendered on the spot."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from vggtgeo.cli.view import serve_until_interrupted
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("runs/demo"),
     settings: SettingsOption = None,
-    scene: Annotated[str, typer.Option(help="Synthetic scene.")] = "room",
+    scene: Annotated[str, typer.Option(help="Synthetic scene: office, hall, corridor, staircase, room.")] = "office",
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of the scene and its noise.")] = 0,
     rerun: RerunOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run on a synthetic room with exact truth, rendered on the spot."""
+    """Run in a synthetic office with exact truth, rendered on the spot."""
     from vggtgeo.cli.run import make_roles
     from vggtgeo.cli.run_sequence import run_and_write
     from vggtgeo.simulation import simulate

@@ -94,7 +94,7 @@ COMMANDS = (
     ),
 )
 START = (
-    "vggtgeo demo  # a simulated room, results in runs/demo",
+    "vggtgeo demo  # a simulated office, results in runs/demo",
     "vggtgeo run PATH -o runs/mine  # a video or a folder of images",
     "vggtgeo evaluate runs/mine PATH  # errors, where the truth is known",
     "vggtgeo COMMAND --help  # examples of each command",
