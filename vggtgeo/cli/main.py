@@ -46,7 +46,7 @@ COMMANDS = (
     CommandEntry(
         "demo",
         "vggtgeo.cli.demo",
-        "Run on a synthetic room with exact truth, rendered on the spot.",
+        "Run in a synthetic office with exact truth, rendered on the spot.",
         ("vggtgeo demo -o runs/demo --frames 60",),
     ),
     CommandEntry(

@@ -70,12 +70,14 @@ class Store:
 
 
 def fingerprint(job: Job) -> str:
-    """Changes with the course, the settings of the system, and the version of the package."""
-    settings = VARIANTS[job.variant].settings(job.course)
+    """Changes with the course, the settings of the system, the stubs' errors, and the version of the package."""
+    variant = VARIANTS[job.variant]
+    settings = variant.settings(job.course)
     chosen = [field for field in fields(SlamSettings) if field.name != "record_iterations"]  # it changes no result
     parts = {
         "course": asdict(job.course),
         "settings": {field.name: _plain(getattr(settings, field.name)) for field in chosen},
+        "depth_errors": variant.depth_errors,
         "version": importlib.metadata.version("vggtgeo"),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
