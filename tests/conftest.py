@@ -1,6 +1,7 @@
 """What all tests share: JAX's global flags, checks of shapes and types, and where the real clips lie."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -17,6 +18,20 @@ SHARED = ROOT.parent / "shared"
 jax.config.update("jax_enable_x64", True)  # oracles need it; a test of float32 says so in its arrays
 # From here on every annotated function of the package checks its arguments and results; see typechecker.py.
 install_import_hook("vggtgeo", "typechecker.check")
+
+
+_MOST_MAPPINGS = 30_000
+"""Half of what Linux allows a process by default (`vm.max_map_count`). Each compiled function holds some, and XLA ends
+with a segmentation fault where there are no more."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_compiled_functions() -> Iterator[None]:
+    """Drop what earlier files compiled, before it is too much for one process."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPPINGS:
+        jax.clear_caches()
 
 
 def _shared(folder: str) -> Path:
