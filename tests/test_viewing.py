@@ -26,6 +26,7 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 from vggtgeo.cli.main import make_app
 from vggtgeo.cli.settings_file import write_settings
 from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.keyframe_depth import fused_depths
 from vggtgeo.slam import rigid
 from vggtgeo.slam.outputs import write_depth, write_map, write_trajectories
 from vggtgeo.slam.state import Slam
@@ -120,8 +121,9 @@ def test_ellipsoids_have_the_axes_of_the_covariance() -> None:
 def test_a_run_folder_becomes_a_recording(run: RecordedRun, tmp_path: Path) -> None:
     """`vggtgeo view` writes a file with path, map, depth and confidence; oracle: rerun's own reader."""
     write_trajectories(tmp_path, run.slam)
-    write_map(tmp_path, run.slam)
-    write_depth(tmp_path, run.slam)
+    depths = fused_depths(run.slam.keyframes, run.slam.intrinsics)
+    write_map(tmp_path, run.slam, depths)
+    write_depth(tmp_path, run.slam, depths)
     result = CliRunner().invoke(make_app(), ["view", str(tmp_path), "--rerun", str(tmp_path / "out" / "v.rrd")])
     assert result.exit_code == 0, result.output
     found = entities_of(tmp_path / "out" / "v.rrd")

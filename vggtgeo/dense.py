@@ -16,15 +16,23 @@ _Weighted = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def map_points(
-    keyframes: Sequence[Keyframe], intrinsics: np.ndarray, *, voxel: float = 0.02, least_confidence: float = 0.5
+    keyframes: Sequence[Keyframe],
+    intrinsics: np.ndarray,
+    depths: Sequence[np.ndarray | None] | None = None,
+    *,
+    voxel: float = 0.02,
+    least_confidence: float = 0.5,
 ) -> PointCloud:
     """One coloured cloud of all keyframes, in the world frame.
+
+    depths: the keyframes' `fused_depths`, where they are at hand.
+
 
     Where there is metric depth: every third pixel whose confidence is at least `least_confidence` and whose depth
     another keyframe confirms to 4 %; else the adjusted points alone. Points of one cell of `voxel` metres are averaged.
     """
     metric = [bool(np.isfinite(keyframe.depth).any()) for keyframe in keyframes]
-    depths = fused_depths(keyframes, intrinsics)
+    depths = fused_depths(keyframes, intrinsics) if depths is None else depths
     parts = []
     for i, keyframe in enumerate(keyframes):
         if not metric[i]:

@@ -18,6 +18,7 @@ from vggtgeo.cli.settings_file import write_settings
 from vggtgeo.datasets import Frame, Sequence, split
 from vggtgeo.errors import InputError, InputWarning
 from vggtgeo.evaluation import TrajectoryReport
+from vggtgeo.keyframe_depth import fused_depths
 from vggtgeo.report import write_page
 from vggtgeo.slam import outputs
 from vggtgeo.slam.clock import Clock
@@ -86,10 +87,11 @@ def run_and_write(
             interrupted = True
         outputs.write_trajectories(folder, slam)
     with clock.measure("write"):
-        cloud = outputs.write_map(folder, slam)
+        depths = fused_depths(slam.keyframes, slam.intrinsics)
+        cloud = outputs.write_map(folder, slam, depths)
         outputs.write_plot(folder, slam, truth, label or sequence.name)
         if save_depth:
-            outputs.write_depth(folder, slam)
+            outputs.write_depth(folder, slam, depths)
     with clock.measure("record and draw"):
         for watcher in watchers:
             watcher.finish(slam, cloud)

@@ -6,7 +6,7 @@ import importlib.metadata
 import os
 import platform
 import resource
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from vggtgeo.dense import map_points
 from vggtgeo.errors import InputError
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.files import atomic_path, write_json
-from vggtgeo.keyframe_depth import fused_depths
 from vggtgeo.plots import plot_trajectory
 from vggtgeo.point_cloud import PointCloud
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -34,16 +33,18 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
     keyframe_trajectory(slam).save_tum(folder / "keyframes.txt")
 
 
-def write_map(folder: Path, slam: Slam) -> PointCloud:
-    """`map.ply`; returns the points."""
-    cloud = map_points(slam.keyframes, slam.intrinsics)
+def write_map(folder: Path, slam: Slam, depths: Sequence[np.ndarray | None]) -> PointCloud:
+    """`map.ply`, of the keyframes' `fused_depths`; returns the points."""
+    cloud = map_points(slam.keyframes, slam.intrinsics, depths)
     cloud.save_ply(folder / "map.ply")
     return cloud
 
 
-def write_depth(folder: Path, slam: Slam) -> None:
-    """`depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none) and `depth/NNNNNN.confidence.png` (8 bit) a keyframe."""
-    for keyframe, depth in zip(slam.keyframes, fused_depths(slam.keyframes, slam.intrinsics), strict=True):
+def write_depth(folder: Path, slam: Slam, depths: Sequence[np.ndarray | None]) -> None:
+    """The keyframes' `fused_depths` as `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none), and beside each
+    `depth/NNNNNN.confidence.png` (8 bit).
+    """
+    for keyframe, depth in zip(slam.keyframes, depths, strict=True):
         metres = np.zeros(keyframe.depth.shape) if depth is None else np.nan_to_num(depth)
         counts = np.clip(metres * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
         for name, image in (("depth", counts), ("confidence", keyframe.depth_confidence)):
