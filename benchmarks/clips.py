@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vggtgeo.evaluation import evaluate_trajectory
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
 
 ABLATIONS = {
     "default": (),

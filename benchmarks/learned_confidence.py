@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import vggtgeo as vg
-from vggtgeo.files import atomic_path, write_json
+from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.learning import Batch, PoseErrors, TrackedWindow, compare, stack, tracked_windows, train
 
 TRAINING = (("room", 101), ("office", 102), ("staircase", 103), ("room", 104))

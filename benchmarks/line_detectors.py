@@ -29,8 +29,8 @@ from vggtgeo.models.roles import LineDetector, Segments
 from vggtgeo.cli.run import run_and_write
 from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.trajectory import Trajectory
 
 DRAWN = 4
 """Frames of which a picture is made, spread over the sequence."""

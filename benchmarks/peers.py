@@ -171,8 +171,8 @@ def _work(path: Path, flags: dict[str, Any]) -> None:
     jax.config.update("jax_enable_x64", True)
     from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-    from vggtgeo.problem_file import load_problem
-    from vggtgeo.solution import solve
+    from vggtgeo.bundle.problem_file import load_problem
+    from vggtgeo.bundle.solution import solve
 
     problem, state, _ = load_problem(path, flags.get("dtype", "float64"))
     problem = dataclasses.replace(problem, positive_depth=flags.get("positive_depth", False))

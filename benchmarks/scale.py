@@ -109,9 +109,9 @@ def _measure(path: Path, name: str, iterations: int) -> dict[str, Any]:
     from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
     from vggtgeo.solvers.reduced import DenseCholesky
 
-    from vggtgeo.problem_file import load_problem
-    from vggtgeo.solution import solve
-    from vggtgeo.solver_choice import choose_reduced_solver
+    from vggtgeo.bundle.problem_file import load_problem
+    from vggtgeo.bundle.solution import solve
+    from vggtgeo.bundle.solver_choice import choose_reduced_solver
 
     problem, state, _ = load_problem(path)
     problem = dataclasses.replace(problem, positive_depth=False)

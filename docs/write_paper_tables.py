@@ -9,7 +9,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from vggtgeo.files import atomic_path, write_text
+from vggtgeo.io.files import atomic_path, write_text
 
 DOCS = Path(__file__).resolve().parent
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"

@@ -14,8 +14,8 @@ from scenes import SIGMA, Scene, make_scene
 from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.kernels import Huber
 
-from vggtgeo.packing import Observations, PaddedSize
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.packing import Observations, PaddedSize
+from vggtgeo.bundle.problem import Problem, State
 
 KEYFRAMES, POINTS, LINES, SAMPLES = 3, 8, 4, 2
 SIZE = PaddedSize(KEYFRAMES, POINTS, LINES * SAMPLES, KEYFRAMES - 1)

@@ -18,10 +18,10 @@ from scenes import make_scene
 from scipy.stats import chi2
 from vggtgeo.solvers.kernels import AbstractKernel
 
-from vggtgeo import lie
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import solve
-from vggtgeo.uncertainty import covariances
+from vggtgeo.bundle.analysis.covariances import covariances
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import solve
+from vggtgeo.geometry import lie
 
 PIXEL = 0.25
 """Standard deviation of matches and of distances to lines, pixels: small, so that the problem is nearly linear."""

@@ -8,10 +8,10 @@ from functools import cache
 from vggtgeo.models.classical import SiftMatcher
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.dense import map_points
-from vggtgeo.point_cloud import PointCloud
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.packing import Observations, SlotIndex, pack
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.packing import Observations, SlotIndex, pack
+from vggtgeo.bundle.problem import Problem, State
 
 INTRINSICS = np.array([300.0, 310.0, 160.0, 120.0])
 SIZE = np.array([320.0, 240.0])

@@ -16,8 +16,8 @@ from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import Solution, solve
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import Solution, solve
 
 SCENE = make_scene(5, points=8, lines=1, samples=3, noise=0.5, outliers=0.1, depth_error=0.05, seed=4)
 SOLVERS: dict[str, AbstractReducedSolver] = {

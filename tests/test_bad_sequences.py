@@ -11,7 +11,7 @@ import tiny_sequences as tiny
 
 from vggtgeo.datasets import Frame, Sequence, open_sequence
 from vggtgeo.datasets.image_files import read_image
-from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning
 
 
 def _read(sequence: Sequence) -> tuple[list[Frame], list[str]]:

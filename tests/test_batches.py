@@ -12,11 +12,11 @@ import pytest
 from scenes import Scene, make_scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-from vggtgeo.batches import Window, pack_batch, solve_batch
-from vggtgeo.errors import InputError
-from vggtgeo.packing import Observations
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import solve
+from vggtgeo.bundle.batches import Window, pack_batch, solve_batch
+from vggtgeo.bundle.packing import Observations
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import solve
+from vggtgeo.io.errors import InputError
 
 SOLVER = SchurLevenbergMarquardt(max_iterations=40, rtol=1e-12)
 SCENES = [
@@ -84,7 +84,7 @@ import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 from test_batches import SOLVER, SCENES, window
-from vggtgeo.batches import pack_batch, solve_batch
+from vggtgeo.bundle.batches import pack_batch, solve_batch
 problems, states, _ = pack_batch([window(SCENES[n]) for n in (0, 1, 2, 0)], intrinsics_sigma=5.0)
 run = jax.jit(lambda devices: solve_batch(problems, states, solver=SOLVER, devices=devices), static_argnums=0)
 two, one = run(tuple(jax.devices())), run(tuple(jax.devices()[:1]))

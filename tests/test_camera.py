@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vggtgeo.camera import Camera
-from vggtgeo.errors import InputError
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
 
 WIDTH, HEIGHT = 160, 120
 INTRINSICS = (131.0, 129.0, 79.0, 61.0)

@@ -16,12 +16,12 @@ from conftest import ROOT
 from test_problem_file import SCENE, arrays_of, write
 from typer.testing import CliRunner
 
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.problem_file import load_problem
 from vggtgeo.cli.jax_flags import cache_folder
 from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command, make_app
-from vggtgeo.errors import InputError
-from vggtgeo.objective import energy
-from vggtgeo.problem import Problem, State
-from vggtgeo.problem_file import load_problem
+from vggtgeo.io.errors import InputError
 
 HEAVY = {"jax", "cv2", "matplotlib", "scipy", "onnxruntime", "rerun", "equinox", "numpy"}
 PROBE = """

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import tiny_sequences as tiny
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets import (
     Frame,
     ImageFolder,
@@ -20,7 +19,8 @@ from vggtgeo.datasets import (
     with_intrinsics,
     without_depth,
 )
-from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError, InputWarning
 
 
 def _numbers(frames: list[Frame]) -> list[int]:

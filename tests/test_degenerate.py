@@ -23,9 +23,9 @@ from degenerate_scenes import (
 from scenes import Scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-from vggtgeo.bundle_adjustment import MIN_INVERSE_DEPTH
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import Solution, solve
+from vggtgeo.bundle.bundle_adjustment import MIN_INVERSE_DEPTH
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import Solution, solve
 
 NO_PRIOR = {"intrinsics_sigma": None}
 ALL_HELD = {"fixed_pose": np.ones(KEYFRAMES, bool), "fixed_intrinsics": HELD}

@@ -10,10 +10,10 @@ import pytest
 from scenes import Scene, make_scene, matrix
 from vggtgeo.solvers.kernels import Huber
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.objective import EnergyTerms, energy_terms
-from vggtgeo.packing import PaddedSize
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.objective import EnergyTerms, energy_terms
+from vggtgeo.bundle.packing import PaddedSize
+from vggtgeo.bundle.problem import Problem, State
 
 NOISY = make_scene(noise=0.7, outliers=0.2, depth_error=0.1, seed=1)
 

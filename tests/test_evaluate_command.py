@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 import vggtgeo.cli.evaluate
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.datasets import open_sequence
-from vggtgeo.errors import InputError
 from vggtgeo.evaluation import MAX_TIME_DIFFERENCE, evaluate_trajectory
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 app = typer.Typer()
 app.command()(evaluate)

@@ -11,9 +11,9 @@ from evo.core.units import Unit
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets import open_sequence
-from vggtgeo.errors import InputError
 from vggtgeo.evaluation import absolute_error, associate, evaluate_trajectory, relative_error, rotation_angle, umeyama
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 TOLERANCE = 1e-9
 

@@ -12,9 +12,9 @@ from jax.flatten_util import ravel_pytree
 from scenes import make_scene
 from vggtgeo.solvers.arrow import multiply, reduce
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.objective import energy
-from vggtgeo.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.problem import MarginalPrior, Problem, State
 
 SCENE = make_scene(2, 4, 1, 2, noise=0.7, outliers=0.3, depth_error=0.2, seed=3)
 

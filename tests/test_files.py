@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from vggtgeo.files import atomic_open, atomic_path, write_json, write_text
+from vggtgeo.io.files import atomic_open, atomic_path, write_json, write_text
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from scenes import Scene, make_scene
 from test_exact_hessian import prior_on
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import solve
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import solve
 
 SCENE = make_scene(3, 5, 1, 2, noise=0.5, outliers=0.1, depth_error=0.05, seed=4)
 RANDOM_PROBLEMS = 20

@@ -15,9 +15,9 @@ import pytest
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import make_app
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
-from vggtgeo.trajectory import Trajectory
 
 FRAMES = 120
 PROGRAM = "from vggtgeo.cli import main; main()"

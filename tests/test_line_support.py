@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.slam.adjustment import _prior_trust
 from vggtgeo.slam.line_support import sample_shares, spread_samples, supported
 from vggtgeo.slam.settings import SlamSettings

@@ -11,11 +11,11 @@ from scenes import make_scene
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, multiply, reduce
 from vggtgeo.solvers.reduced import DenseCholesky
 
-from vggtgeo import lie
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.objective import relative_poses
-from vggtgeo.problem import Problem, State
-from vggtgeo.residuals import MIN_RELATIVE_DEPTH, depth_residual, line_residual, point_residual
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.objective import relative_poses
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.residuals import MIN_RELATIVE_DEPTH, depth_residual, line_residual, point_residual
+from vggtgeo.geometry import lie
 
 SCENE = make_scene(noise=0.7, outliers=0.2, depth_error=0.1, seed=1)
 

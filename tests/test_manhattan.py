@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.classical import ManhattanEstimator, ManhattanView, nearest_frame
 
-from vggtgeo.camera import Camera
-from vggtgeo.marginalisation import no_prior
-from vggtgeo.objective import marginal_energy
-from vggtgeo.problem import State
-from vggtgeo.slam import rigid
+from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.objective import marginal_energy
+from vggtgeo.bundle.problem import State
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.manhattan import constrain_rotation, mean_rotation, with_rotation
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.settings import Roles, SlamSettings

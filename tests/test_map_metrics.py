@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.camera import Camera
-from vggtgeo.errors import InputError
 from vggtgeo.evaluation import cloud_error, depth_error, depth_of_cloud
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
 
 
 def test_depth_error_is_taken_where_both_are_valid() -> None:

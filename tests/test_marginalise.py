@@ -14,10 +14,10 @@ from vggtgeo.solvers.adjoint import ExactModel
 from vggtgeo.solvers.arrow import ArrowVector, reduce
 from vggtgeo.solvers.kernels import Square
 
-from vggtgeo.linearise import edge_observations, linearise
-from vggtgeo.marginalisation import marginalise, no_prior, reorder
-from vggtgeo.objective import energy
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.linearise import edge_observations, linearise
+from vggtgeo.bundle.marginalisation import marginalise, no_prior, reorder
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.problem import Problem, State
 
 
 class _Made(NamedTuple):

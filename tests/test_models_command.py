@@ -19,8 +19,8 @@ from vggtgeo.models.onnx.registry import NETWORKS, HubFile, Network
 from vggtgeo.models.onnx.session import open_session
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.errors import InputError
-from vggtgeo.network_files import fetch_network, networks_folder
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.network_files import fetch_network, networks_folder
 
 SMALL = NETWORKS["moge2-small"]
 

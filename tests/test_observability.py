@@ -23,11 +23,11 @@ from degenerate_scenes import (
 from scenes import Scene
 from vggtgeo.solvers.arrow import ArrowVector
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.degeneracy import KINDS, WEAK, Observability, observability
-from vggtgeo.degeneracy_report import undetermined_landmarks, weak_directions
-from vggtgeo.directions import MOTIONS, direction_names, named_directions
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.analysis.directions import MOTIONS, direction_names, named_directions
+from vggtgeo.bundle.analysis.observability import KINDS, WEAK, Observability, observability
+from vggtgeo.bundle.analysis.observability_report import undetermined_landmarks, weak_directions
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.problem import Problem, State
 
 Observe = Callable[[Problem, State], Observability]
 LOST = [f"keyframe 2: {motion}" for motion in MOTIONS]

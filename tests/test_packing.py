@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scenes import Scene, make_scene
 
-from vggtgeo.errors import InputError
-from vggtgeo.packing import Observations, PaddedSize
-from vggtgeo.problem import Problem
+from vggtgeo.bundle.packing import Observations, PaddedSize
+from vggtgeo.bundle.problem import Problem
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation import simulate_window
 
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)

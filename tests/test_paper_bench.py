@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.paper_bench import runner, tables
 from vggtgeo.paper_bench.courses import Course
 from vggtgeo.paper_bench.measure import Errors

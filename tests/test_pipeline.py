@@ -11,10 +11,10 @@ import pytest
 from vggtgeo.models.classical import ConstantVelocity, NoDepth, SiftMatcher
 from vggtgeo.models.roles import Features, PointMatcher, PointMatches
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.errors import InputError
 from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames

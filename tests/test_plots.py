@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vggtgeo import plots
-from vggtgeo.errors import InputError
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.figures import plots
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 
 def _walk(count: int = 40) -> Trajectory:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vggtgeo.errors import InputError
-from vggtgeo.point_cloud import PointCloud
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.errors import InputError
 
 
 def _cloud(count: int = 100) -> PointCloud:

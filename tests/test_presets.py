@@ -23,7 +23,7 @@ from vggtgeo.models.window_locator import WindowLocator
 
 from vggtgeo.cli.main import make_app
 from vggtgeo.cli.presets import NEEDED, perception
-from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.simulation.sequence import SyntheticSequence, simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.run import frame_trajectory, run

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scenes import INTRINSICS, Scene, make_scene
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.errors import InputError
-from vggtgeo.objective import energy
-from vggtgeo.problem_file import LAYOUT, load_problem, save_solution
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.problem_file import LAYOUT, load_problem, save_solution
+from vggtgeo.io.errors import InputError
 
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05, seed=7)
 

@@ -25,12 +25,12 @@ from vggtgeo.solvers.flat_directions import flat_stiffness
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.marginalisation import no_prior
-from vggtgeo.packing import PaddedSize
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import solve
-from vggtgeo.solver_choice import choose_reduced_solver
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.packing import PaddedSize
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.solver_choice import choose_reduced_solver
 
 KEYFRAMES, REACH = 9, 2
 LOOPS = ((0, 8), (1, 6), (2, 7))

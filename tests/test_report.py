@@ -14,14 +14,14 @@ from recorded_run import FRAMES, SETTINGS, RecordedRun, recorded_run
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
 
+from vggtgeo.bundle.residual_rms import residual_sizes
 from vggtgeo.evaluation import evaluate_trajectory
-from vggtgeo.point_cloud import PointCloud
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.report import map_view, write_page
-from vggtgeo.residual_rms import residual_sizes
 from vggtgeo.slam.outputs import write_summary
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.trajectory import Trajectory
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import INTRINSICS, make_scene, matrix
 
-from vggtgeo.residuals import MIN_RELATIVE_DEPTH, depth_residual, line_residual, point_residual, project
+from vggtgeo.bundle.residuals import MIN_RELATIVE_DEPTH, depth_residual, line_residual, point_residual, project
 
 POSES = make_scene().poses
 PIXEL, DEPTH = np.array([71.5, 180.25]), 2.6

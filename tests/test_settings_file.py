@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from vggtgeo.cli.main import COMMANDS, EXIT_INPUT, EXIT_INTERNAL, CommandEntry, load_command, make_app
 from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption, write_settings
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 DEFAULTS = {"path": "clip", "count": 3, "scale": None, "rgb-only": False, "lines": True, "mode": "fast", "json": False}
 

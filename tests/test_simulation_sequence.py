@@ -10,7 +10,7 @@ from synthetic_room import room
 from vggtgeo.cli.simulate import parse_size
 from vggtgeo.cli.simulate import simulate as simulate_command
 from vggtgeo.datasets import open_sequence
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
 from vggtgeo.simulation.shade import encode
 from vggtgeo.simulation.textures import paint_texture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic_room import room
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation import IDEAL, SimulatedOracle
 
 SIZE = (320, 240)

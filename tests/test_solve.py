@@ -12,9 +12,9 @@ import pytest
 from scenes import Scene, make_scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-from vggtgeo.packing import PaddedSize
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import Solution, solve
+from vggtgeo.bundle.packing import PaddedSize
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import Solution, solve
 
 EXACT = make_scene()
 NOISY = make_scene(noise=0.5, outliers=0.15, depth_error=0.05, seed=2)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
 
 GOOD = "0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n"
 

@@ -15,14 +15,14 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
 from vggtgeo.solvers.segments import expand, restrict
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.errors import InputError
-from vggtgeo.line_segments import fractions, segment_slots, straightened
-from vggtgeo.objective import energy
-from vggtgeo.packing import PaddedSize
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import solve
-from vggtgeo.uncertainty import covariances
+from vggtgeo.bundle.analysis.covariances import covariances
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.packing import PaddedSize
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import solve
+from vggtgeo.geometry.line_segments import fractions, segment_slots, straightened
+from vggtgeo.io.errors import InputError
 
 POINTS, SEGMENTS, SAMPLES = 6, 2, 4
 SOLVER = SchurLevenbergMarquardt(rtol=1e-12, max_iterations=100)

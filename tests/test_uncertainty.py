@@ -16,11 +16,11 @@ from vggtgeo.solvers.arrow import ArrowVector
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.kernels import Huber
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.linearise import scale_direction
-from vggtgeo.objective import energy
-from vggtgeo.problem import Problem, State
-from vggtgeo.uncertainty import Covariances, covariances
+from vggtgeo.bundle.analysis.covariances import Covariances, covariances
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.linearise import scale_direction
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.problem import Problem, State
 
 OPTIONS = {"fixed_intrinsics": np.array([False, False, False, True])}
 KEYFRAMES, CAMERA = lacking.KEYFRAMES, 6 * lacking.KEYFRAMES + 4

@@ -25,9 +25,9 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.cli.main import make_app
 from vggtgeo.cli.settings_file import write_settings
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.keyframe_depth import fused_depths
-from vggtgeo.slam import rigid
+from vggtgeo.geometry import rigid
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.outputs import write_depth, write_map, write_trajectories
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.target import check_target, has_screen

@@ -13,32 +13,38 @@ from vggtgeo import _source_tree as _source_tree  # first: in a source tree it f
 
 if TYPE_CHECKING:
     from vggtgeo import learning as learning
-    from vggtgeo.batches import pack_batch as pack_batch
-    from vggtgeo.batches import solve_batch as solve_batch
-    from vggtgeo.camera import Camera as Camera
+    from vggtgeo.bundle.analysis.covariances import Covariances as Covariances
+    from vggtgeo.bundle.analysis.covariances import covariances as covariances
+    from vggtgeo.bundle.analysis.observability import Observability as Observability
+    from vggtgeo.bundle.analysis.observability import observability as observability
+    from vggtgeo.bundle.batches import pack_batch as pack_batch
+    from vggtgeo.bundle.batches import solve_batch as solve_batch
+    from vggtgeo.bundle.graduation import Graduation as Graduation
+    from vggtgeo.bundle.marginalisation import marginalise as marginalise
+    from vggtgeo.bundle.marginalisation import no_prior as no_prior
+    from vggtgeo.bundle.objective import energy as energy
+    from vggtgeo.bundle.objective import energy_terms as energy_terms
+    from vggtgeo.bundle.packing import Observations as Observations
+    from vggtgeo.bundle.packing import PaddedSize as PaddedSize
+    from vggtgeo.bundle.packing import pack as pack
+    from vggtgeo.bundle.problem import Problem as Problem
+    from vggtgeo.bundle.problem import State as State
+    from vggtgeo.bundle.problem_file import load_problem as load_problem
+    from vggtgeo.bundle.residual_rms import Residuals as Residuals
+    from vggtgeo.bundle.residual_rms import ResidualSizes as ResidualSizes
+    from vggtgeo.bundle.residual_rms import residual_sizes as residual_sizes
+    from vggtgeo.bundle.residual_rms import residuals_at as residuals_at
+    from vggtgeo.bundle.solution import Solution as Solution
+    from vggtgeo.bundle.solution import solve as solve
+    from vggtgeo.bundle.solver_choice import choose_reduced_solver as choose_reduced_solver
     from vggtgeo.datasets import Frame as Frame
     from vggtgeo.datasets import open_sequence as open_sequence
-    from vggtgeo.degeneracy import Observability as Observability
-    from vggtgeo.degeneracy import observability as observability
-    from vggtgeo.errors import InputError as InputError
     from vggtgeo.evaluation import evaluate_trajectory as evaluate_trajectory
-    from vggtgeo.graduation import Graduation as Graduation
-    from vggtgeo.marginalisation import marginalise as marginalise
-    from vggtgeo.marginalisation import no_prior as no_prior
-    from vggtgeo.objective import energy as energy
-    from vggtgeo.objective import energy_terms as energy_terms
-    from vggtgeo.packing import Observations as Observations
-    from vggtgeo.packing import PaddedSize as PaddedSize
-    from vggtgeo.packing import pack as pack
+    from vggtgeo.geometry.camera import Camera as Camera
+    from vggtgeo.geometry.trajectory import Trajectory as Trajectory
+    from vggtgeo.io.errors import InputError as InputError
     from vggtgeo.paper_bench.runner import BenchReport as BenchReport
     from vggtgeo.paper_bench.runner import bench as bench
-    from vggtgeo.problem import Problem as Problem
-    from vggtgeo.problem import State as State
-    from vggtgeo.problem_file import load_problem as load_problem
-    from vggtgeo.residual_rms import Residuals as Residuals
-    from vggtgeo.residual_rms import ResidualSizes as ResidualSizes
-    from vggtgeo.residual_rms import residual_sizes as residual_sizes
-    from vggtgeo.residual_rms import residuals_at as residuals_at
     from vggtgeo.results import Result as Result
     from vggtgeo.results import evaluate as evaluate
     from vggtgeo.results import read as read
@@ -50,9 +56,6 @@ if TYPE_CHECKING:
     from vggtgeo.slam.run import run as run
     from vggtgeo.slam.settings import Roles as Roles
     from vggtgeo.slam.settings import SlamSettings as SlamSettings
-    from vggtgeo.solution import Solution as Solution
-    from vggtgeo.solution import solve as solve
-    from vggtgeo.solver_choice import choose_reduced_solver as choose_reduced_solver
     from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
     from vggtgeo.solvers.kernels import Barron as Barron
     from vggtgeo.solvers.kernels import Cauchy as Cauchy
@@ -60,36 +63,33 @@ if TYPE_CHECKING:
     from vggtgeo.solvers.kernels import Huber as Huber
     from vggtgeo.solvers.kernels import Square as Square
     from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt as SchurLevenbergMarquardt
-    from vggtgeo.trajectory import Trajectory as Trajectory
-    from vggtgeo.uncertainty import Covariances as Covariances
-    from vggtgeo.uncertainty import covariances as covariances
 
 _HOME = {
-    "batches": ("pack_batch", "solve_batch"),
-    "camera": ("Camera",),
+    "bundle.batches": ("pack_batch", "solve_batch"),
+    "geometry.camera": ("Camera",),
     "datasets": ("Frame", "open_sequence"),
-    "objective": ("energy", "energy_terms"),
-    "errors": ("InputError",),
+    "bundle.objective": ("energy", "energy_terms"),
+    "io.errors": ("InputError",),
     "evaluation": ("evaluate_trajectory",),
-    "graduation": ("Graduation",),
-    "marginalisation": ("marginalise", "no_prior"),
-    "degeneracy": ("Observability", "observability"),
-    "packing": ("Observations", "PaddedSize", "pack"),
+    "bundle.graduation": ("Graduation",),
+    "bundle.marginalisation": ("marginalise", "no_prior"),
+    "bundle.analysis.observability": ("Observability", "observability"),
+    "bundle.packing": ("Observations", "PaddedSize", "pack"),
     "paper_bench.runner": ("BenchReport", "bench"),
-    "problem": ("Problem", "State"),
-    "problem_file": ("load_problem",),
-    "residual_rms": ("ResidualSizes", "Residuals", "residual_sizes", "residuals_at"),
+    "bundle.problem": ("Problem", "State"),
+    "bundle.problem_file": ("load_problem",),
+    "bundle.residual_rms": ("ResidualSizes", "Residuals", "residual_sizes", "residuals_at"),
     "results": ("Result", "evaluate", "read"),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
     "slam.run": ("finish", "frame_trajectory", "run"),
     "slam.settings": ("Roles", "SlamSettings"),
-    "solution": ("Solution", "solve"),
-    "solver_choice": ("choose_reduced_solver",),
+    "bundle.solution": ("Solution", "solve"),
+    "bundle.solver_choice": ("choose_reduced_solver",),
     "solvers.adjoint": ("ArrowAdjoint",),
     "solvers.kernels": ("Barron", "Cauchy", "GemanMcClure", "Huber", "Square"),
     "solvers.levenberg_marquardt": ("SchurLevenbergMarquardt",),
-    "trajectory": ("Trajectory",),
-    "uncertainty": ("Covariances", "covariances"),
+    "geometry.trajectory": ("Trajectory",),
+    "bundle.analysis.covariances": ("Covariances", "covariances"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from vggtgeo.datasets import Sequence, open_sequence
-from vggtgeo.errors import InputError
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
-from vggtgeo.point_cloud import PointCloud
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,7 +51,7 @@ class Result:
     @classmethod
     def of(cls, slam: Slam) -> Self:
         """The result of a state: the last one that `vggtgeo.run` gave, or what `vggtgeo.finish` made of it."""
-        from vggtgeo.dense import map_points
+        from vggtgeo.slam.dense import map_points
         from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 
         fx, fy, cx, cy = (float(value) for value in slam.intrinsics)
@@ -91,7 +91,7 @@ class Result:
 
     def plot(self, truth: Trajectory | None = None) -> Figure:
         """Trajectory from above and from the side, and the map from behind and from above."""
-        from vggtgeo.plots import result_figure
+        from vggtgeo.figures.plots import result_figure
 
         return result_figure(self, truth)
 
@@ -115,7 +115,7 @@ def read(path: str | os.PathLike[str]) -> Result | Sequence:
         >>> vg.read("no/such/place")
         Traceback (most recent call last):
             ...
-        vggtgeo.errors.InputError: `no/such/place` does not exist; give a folder of images or a video file
+        vggtgeo.io.errors.InputError: `no/such/place` does not exist; give a folder of images or a video file
 
     """
     if (Path(path) / "summary.json").is_file():

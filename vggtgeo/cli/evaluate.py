@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vggtgeo.cli.options import JsonOption
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from vggtgeo.evaluation import ErrorStatistics, TrajectoryReport
-    from vggtgeo.trajectory import Trajectory
+    from vggtgeo.geometry.trajectory import Trajectory
 
 MAX_TIME_DIFFERENCE = 0.01
 """Seconds; that of `vggtgeo.evaluation`, repeated here so that `--help` need not load it (a test compares them)."""
@@ -43,7 +43,7 @@ def evaluate(
 
 def load_estimate(path: Path) -> Trajectory:
     """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`."""
-    from vggtgeo.trajectory import Trajectory
+    from vggtgeo.geometry.trajectory import Trajectory
 
     return Trajectory.load_tum(path / "trajectory.txt" if path.is_dir() else path)
 
@@ -51,7 +51,7 @@ def load_estimate(path: Path) -> Trajectory:
 def load_truth(path: Path) -> Trajectory:
     """The trajectory in the file `path`, or the truth of the dataset in the folder `path`."""
     from vggtgeo.datasets import open_sequence
-    from vggtgeo.trajectory import Trajectory
+    from vggtgeo.geometry.trajectory import Trajectory
 
     if not path.is_dir():
         return Trajectory.load_tum(path)

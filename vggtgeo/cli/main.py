@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 from vggtgeo.cli.jax_flags import set_jax_flags
 from vggtgeo.cli.options import EXIT_INTERRUPTED
-from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1

@@ -14,7 +14,7 @@ import typer
 
 from vggtgeo.cli.models_export import export
 from vggtgeo.cli.options import JsonOption
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 if TYPE_CHECKING:
     from vggtgeo.models.onnx.registry import Network
@@ -41,8 +41,8 @@ models.command("export")(export)
 @models.command("list")
 def list_networks(folder: Folder = None, as_json: JsonOption = False) -> None:
     """List the networks: role, licence, size, how to get each, and whether it is there."""
+    from vggtgeo.io.network_files import networks_folder
     from vggtgeo.models.onnx.registry import NETWORKS
-    from vggtgeo.network_files import networks_folder
 
     place = networks_folder(folder)
     rows = [_row(network, place) for network in NETWORKS.values()]
@@ -63,7 +63,7 @@ def path(
     folder: Folder = None,
 ) -> None:
     """Print the folder of the networks, or where the file of NAME lies or would lie."""
-    from vggtgeo.network_files import network_named, networks_folder
+    from vggtgeo.io.network_files import network_named, networks_folder
 
     place = networks_folder(folder)
     typer.echo(str(place if name is None else place / network_named(name).file))
@@ -76,7 +76,7 @@ def fetch(
     endpoint: Annotated[str | None, typer.Option(help="Address of the hub, for a mirror.")] = None,
 ) -> None:
     """Download the published file of NAME and check its hash."""
-    from vggtgeo.network_files import fetch_network, network_named, networks_folder
+    from vggtgeo.io.network_files import fetch_network, network_named, networks_folder
 
     network = network_named(name)
     typer.echo(f"{network.name}: {network.publication.licence}; allows {network.publication.allows}", err=True)

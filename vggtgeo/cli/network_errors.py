@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.session import NetworkRunError
 

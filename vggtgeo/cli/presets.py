@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.cli.network_errors import as_input_errors
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.network_files import networks_folder
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
 from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
@@ -31,7 +32,6 @@ from vggtgeo.models.onnx.registry import NETWORKS
 from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
 from vggtgeo.models.window_locator import WindowLocator
-from vggtgeo.network_files import networks_folder
 from vggtgeo.slam.settings import Roles
 
 NEEDED = {

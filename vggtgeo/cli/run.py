@@ -16,7 +16,7 @@ import typer
 from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.cli.view import serve_until_interrupted
-from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
     from vggtgeo.cli.presets import Perception

@@ -16,18 +16,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from vggtgeo.cli.settings_file import write_settings
 from vggtgeo.datasets import Frame, Sequence, split
-from vggtgeo.errors import InputError, InputWarning
 from vggtgeo.evaluation import TrajectoryReport
-from vggtgeo.keyframe_depth import fused_depths
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.report import write_page
 from vggtgeo.slam import outputs
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.run import finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.watching import Watcher, WindowRecorder
 from vggtgeo.slam.window import warm_up
-from vggtgeo.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)

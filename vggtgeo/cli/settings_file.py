@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 _NOT_SETTINGS = ("settings", "help")
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
@@ -65,7 +65,7 @@ def write_settings(path: Path, values: dict[str, Any]) -> None:
     """Writes a settings file that gives `values` again, atomically; what is None is left out, as TOML has no null."""
     import tomli_w
 
-    from vggtgeo.files import write_text
+    from vggtgeo.io.files import write_text
 
     write_text(path, tomli_w.dumps({key: value for key, value in values.items() if value is not None}))
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from vggtgeo.cli.options import JsonOption, QuietOption
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 
 def simulate(

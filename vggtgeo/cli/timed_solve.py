@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from vggtgeo.errors import InputError
-from vggtgeo.objective import energy
-from vggtgeo.problem import Problem, State
-from vggtgeo.problem_file import load_problem, save_solution
-from vggtgeo.solution import Solution, solve
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.problem_file import load_problem, save_solution
+from vggtgeo.bundle.solution import Solution, solve
+from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 

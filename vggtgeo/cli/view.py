@@ -22,7 +22,7 @@ def view(
     as_json: JsonOption = False,
 ) -> None:
     """Show the run in DIR: path, map, and depth where it was saved."""
-    from vggtgeo.errors import InputError
+    from vggtgeo.io.errors import InputError
     from vggtgeo.viewing.folder import check_folder, log_folder, recording_of
     from vggtgeo.viewing.target import check_target, flush, has_screen, open_target
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, DepthFormat, read_depth, read_image
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
 
 _SAMPLES = 3
 _NAMED_EMPTY_DEPTHS = 3

@@ -7,9 +7,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vggtgeo.camera import Camera
-from vggtgeo.errors import InputError
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

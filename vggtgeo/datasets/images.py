@@ -8,8 +8,8 @@ from typing import Self
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
-from vggtgeo.errors import InputError
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 FRAMES_PER_SECOND = 30.0
 _SECONDS = re.compile(r"\d+\.\d+")

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.errors import InputError
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.camera import Camera, check_distortion, check_intrinsics
-from vggtgeo.errors import InputError, InputWarning
+from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
+from vggtgeo.io.errors import InputError, InputWarning
 
 CALIBRATION = "calibration.txt"
 MATRIX = "camera-intrinsics.txt"

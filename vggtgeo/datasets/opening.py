@@ -9,7 +9,7 @@ from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 _FolderReader = type[SevenScenes] | type[TumRgbd] | type[ImageFolder]
 
@@ -33,7 +33,7 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequ
         >>> vg.open_sequence("no/such/folder")
         Traceback (most recent call last):
             ...
-        vggtgeo.errors.InputError: `no/such/folder` does not exist; give a folder of images or a video file
+        vggtgeo.io.errors.InputError: `no/such/folder` does not exist; give a folder of images or a video file
 
     """
     place = Path(path).expanduser()

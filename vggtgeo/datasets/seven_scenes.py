@@ -12,12 +12,12 @@ from typing import Self
 
 import numpy as np
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import MILLIMETRES
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
 
 FRAMES_PER_SECOND = 30.0
 COLOUR_TRUTH = "groundtruth-colour.txt"

@@ -17,8 +17,8 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
 from vggtgeo.datasets.intrinsics import camera_from_folder, freiburg_camera, guess_with_warning
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
 
 MAX_DEPTH_DELAY = 0.02
 """Seconds between an image and its depth."""

@@ -10,11 +10,11 @@ from typing import Self
 
 import cv2
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
 
 _FALLBACK_RATE = 30.0
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from vggtgeo.errors import InputError
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

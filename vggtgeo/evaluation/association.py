@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from vggtgeo.errors import InputError
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 MAX_TIME_DIFFERENCE = 0.01
 """Seconds between two poses that may still be compared; evo's default."""

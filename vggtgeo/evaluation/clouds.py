@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 
 @dataclass(frozen=True)

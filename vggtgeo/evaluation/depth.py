@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vggtgeo.camera import Camera
-from vggtgeo.errors import InputError
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
 
 
 @dataclass(frozen=True)

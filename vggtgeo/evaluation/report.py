@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vggtgeo.errors import InputError
 from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
 from vggtgeo.evaluation.relative import RelativeError, relative_error
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,7 +38,7 @@ class TrajectoryReport:
 
     def plot(self) -> "Figure":
         """Histogram of the errors of the camera centres after either alignment."""
-        from vggtgeo.plots import errors_figure
+        from vggtgeo.figures.plots import errors_figure
 
         return errors_figure(self)
 

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from vggtgeo.bundle.packing import Observations
+from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import StructureTensor
-from vggtgeo.packing import Observations
 from vggtgeo.simulation import SimulatedOracle, SyntheticSequence
-from vggtgeo.slam import rigid
 
 FEATURES = (
     "saliency at the host",

@@ -16,11 +16,11 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from vggtgeo.bundle.packing import PaddedSize, pack
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import solve
 from vggtgeo.learning.network import LEAST, ConfidenceNetwork
 from vggtgeo.learning.tracked_windows import TrackedWindow
-from vggtgeo.packing import PaddedSize, pack
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import solve
 
 GAIN = 16.0
 """Weight of a match of confidence 1: its standard deviation is 0.25 px, what the tracker reaches where it is right."""

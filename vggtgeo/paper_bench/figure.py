@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from vggtgeo.files import atomic_path
+from vggtgeo.io.files import atomic_path
 from vggtgeo.paper_bench.store import Result
 from vggtgeo.paper_bench.tables import ATE, select, values
 from vggtgeo.paper_bench.variants import FULL, VARIANTS

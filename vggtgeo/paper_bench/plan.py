@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.paper_bench.courses import Course
 from vggtgeo.paper_bench.variants import FULL, VARIANTS
 

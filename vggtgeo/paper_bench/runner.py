@@ -13,8 +13,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from vggtgeo.errors import InputError
-from vggtgeo.files import write_text
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_text
 from vggtgeo.paper_bench import tables
 from vggtgeo.paper_bench.courses import Course
 from vggtgeo.paper_bench.figure import ablation_figure, write_figure
@@ -89,7 +89,7 @@ def bench(
         >>> vg.bench("runs/office", "quick", scenes=["ofice"])  # with "office": every run of that scene
         Traceback (most recent call last):
             ...
-        vggtgeo.errors.InputError: `scenes` holds ['ofice']; choose among office, hall, corridor
+        vggtgeo.io.errors.InputError: `scenes` holds ['ofice']; choose among office, hall, corridor
 
     """
     if plan not in PLANS:

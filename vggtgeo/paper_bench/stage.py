@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
 from vggtgeo.paper_bench.courses import Course
 from vggtgeo.paper_bench.variants import Variant
 from vggtgeo.simulation import SimulatedOracle, simulate
 from vggtgeo.slam.settings import Roles
-from vggtgeo.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)

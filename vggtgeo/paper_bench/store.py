@@ -13,8 +13,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from vggtgeo.errors import InputError
-from vggtgeo.files import write_json
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_json
 from vggtgeo.paper_bench.measure import Errors
 from vggtgeo.paper_bench.plan import Job
 from vggtgeo.paper_bench.variants import VARIANTS

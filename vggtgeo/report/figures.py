@@ -16,9 +16,9 @@ from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from vggtgeo.plots import trajectory_figure
+from vggtgeo.figures.plots import trajectory_figure
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.watching import WindowRecord
-from vggtgeo.trajectory import Trajectory
 
 COLOURS = {
     "#1f5fbf": "var(--blue)",

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import UInt8
 
-from vggtgeo.plots import view_axes
-from vggtgeo.point_cloud import PointCloud
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.figures.plots import view_axes
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
 
 BACKGROUND = (246, 246, 244)
 _PATH, _START = (31, 95, 191), (224, 123, 26)

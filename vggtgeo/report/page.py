@@ -11,15 +11,15 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from vggtgeo.files import write_text
-from vggtgeo.keyframe_depth import optimised_depth
-from vggtgeo.point_cloud import PointCloud
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.files import write_text
 from vggtgeo.report import figures, map_view
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe_depth import optimised_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.watching import WindowRecord
-from vggtgeo.trajectory import Trajectory
 
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""

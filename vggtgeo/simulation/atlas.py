@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 _BORDER = 2
 _LEVELS = 7

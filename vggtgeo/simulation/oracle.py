@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.errors import InputError
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.raster import View, view_from
 from vggtgeo.simulation.render import Picture
 from vggtgeo.simulation.sequence import SyntheticSequence
@@ -28,7 +29,6 @@ from vggtgeo.simulation.truth import (
     texture_strength,
     visible_edges,
 )
-from vggtgeo.trajectory import Trajectory
 
 _KEPT_FRAMES = 14  # about 10 MB each at 640 x 480, 3 MB at 320 x 240
 

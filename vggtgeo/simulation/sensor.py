@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.shade import encode
 
 

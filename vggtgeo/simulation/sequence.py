@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.errors import InputError
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.render import Picture, render
 from vggtgeo.simulation.scene import Scene
 from vggtgeo.simulation.sensor import Sensor
 from vggtgeo.simulation.trajectories import HandheldMotion
 from vggtgeo.simulation.worlds import WORLDS
-from vggtgeo.trajectory import Trajectory
 
 _BAND = 16  # rows that share one pose under rolling exposure
 

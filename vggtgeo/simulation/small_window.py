@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.errors import InputError
-from vggtgeo.packing import Observations, SlotIndex, pack
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.packing import Observations, SlotIndex, pack
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.io.errors import InputError
 
 SIZE = (320, 240)
 """Width and height of the images that are not there, pixels."""

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.decals import DECALS
 from vggtgeo.simulation.noise import blend, fractal, quantise, random_colour, tile_cells
 

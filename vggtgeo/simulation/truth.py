@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vggtgeo.camera import Camera
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.simulation.raster import EMPTY, NEAR, View, inverse_depth_at
 from vggtgeo.simulation.render import Picture
 from vggtgeo.simulation.scene import Scene

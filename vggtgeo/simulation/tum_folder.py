@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.errors import InputError
-from vggtgeo.files import write_text
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_text
 from vggtgeo.simulation.sequence import SyntheticSequence
 
 _DEPTH_UNITS = 5000.0

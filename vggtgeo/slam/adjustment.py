@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vggtgeo.bundle.packing import Observations, PaddedSize, SlotIndex, pack
+from vggtgeo.bundle.problem import MarginalPrior, Problem, State
+from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import line_coefficients
-from vggtgeo.packing import Observations, PaddedSize, SlotIndex, pack
-from vggtgeo.problem import MarginalPrior, Problem, State
-from vggtgeo.slam import rigid
 from vggtgeo.slam.covisibility import Directed
 from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.line_support import sample_shares, spread_samples, supported

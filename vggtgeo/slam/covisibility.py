@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import LineMatches, PointMatches, RelativeView
-from vggtgeo.slam import rigid
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 

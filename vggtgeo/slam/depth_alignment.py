@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from vggtgeo.marginalisation import square_root
-from vggtgeo.problem import MarginalPrior
-from vggtgeo.slam import rigid
+from vggtgeo.bundle.marginalisation import square_root
+from vggtgeo.bundle.problem import MarginalPrior
+from vggtgeo.geometry import rigid
 from vggtgeo.slam.keyframe import Keyframe
 
 CELL = 4

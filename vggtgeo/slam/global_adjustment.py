@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from vggtgeo.bundle.problem import MarginalPrior
+from vggtgeo.bundle.solver_choice import choose_reduced_solver
+from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
-from vggtgeo.problem import MarginalPrior
-from vggtgeo.slam import rigid
 from vggtgeo.slam.adjustment import build, write_back
 from vggtgeo.slam.covisibility import Directed, Pair, directions, overlap, some_points
 from vggtgeo.slam.depth_alignment import Surface, depth_prior
@@ -18,7 +19,6 @@ from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window import solve_jit, window_size
-from vggtgeo.solver_choice import choose_reduced_solver
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 

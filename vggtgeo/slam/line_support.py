@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.slam import rigid
+from vggtgeo.geometry import rigid
 
 
 def supported(

@@ -16,10 +16,10 @@ import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.marginalisation import no_prior, square_root
+from vggtgeo.bundle.marginalisation import no_prior, square_root
+from vggtgeo.bundle.problem import MarginalPrior
+from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import ManhattanEstimator, ManhattanView, nearest_frame
-from vggtgeo.problem import MarginalPrior
-from vggtgeo.slam import rigid
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam
 

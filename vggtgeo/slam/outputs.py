@@ -13,15 +13,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vggtgeo.dense import map_points
-from vggtgeo.errors import InputError
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
-from vggtgeo.files import atomic_path, write_json
-from vggtgeo.plots import plot_trajectory
-from vggtgeo.point_cloud import PointCloud
+from vggtgeo.figures.plots import plot_trajectory
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_path, write_json
+from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.trajectory import Trajectory
 
 DEPTH_UNIT = 5000.0
 """Counts a metre in the 16-bit depth images, as in the TUM RGB-D format."""

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
-from vggtgeo.slam import rigid
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation

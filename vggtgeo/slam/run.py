@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.camera import Camera
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.in_memory import frame_stream
-from vggtgeo.errors import InputError
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
-from vggtgeo.slam import rigid
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_adjustment import adjust_all, close_loops
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.trajectory import Trajectory
 
 AHEAD = 3
 """Frames that are prepared before they are needed."""

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, GeometryResult, PoseQuery
-from vggtgeo.slam import rigid
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import FramePose, Slam, Waiting

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vggtgeo.bundle.problem import MarginalPrior, State
 from vggtgeo.models.roles import Features
-from vggtgeo.problem import MarginalPrior, State
 from vggtgeo.slam.adjustment import Adjustment
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import Features, GeometryResult, PointMatches, PoseGuess, PoseQuery
-from vggtgeo.slam import rigid
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles
 

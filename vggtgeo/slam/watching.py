@@ -8,10 +8,10 @@ from typing import Protocol, runtime_checkable
 import equinox as eqx
 import numpy as np
 
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.residual_rms import residual_sizes
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.point_cloud import PointCloud
-from vggtgeo.problem import Problem, State
-from vggtgeo.residual_rms import residual_sizes
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.slam.state import Slam
 
 _sizes_jit = eqx.filter_jit(residual_sizes)

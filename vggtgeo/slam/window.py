@@ -8,17 +8,17 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vggtgeo.marginalisation import marginalise_jit, no_prior, reorder
-from vggtgeo.packing import Observations, PaddedSize, pack
-from vggtgeo.problem import MarginalPrior, Problem, State
-from vggtgeo.slam import rigid
+from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior, reorder
+from vggtgeo.bundle.packing import Observations, PaddedSize, pack
+from vggtgeo.bundle.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.solution import solve
+from vggtgeo.geometry import rigid
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.solution import solve
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 solve_jit = eqx.filter_jit(solve)

@@ -7,13 +7,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vggtgeo.point_cloud import PointCloud
-from vggtgeo.slam import rigid
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.watching import WindowRecord
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
-from vggtgeo.trajectory import Trajectory
 
 ENTITIES = (
     "/world",

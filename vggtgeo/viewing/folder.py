@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vggtgeo.errors import InputError
-from vggtgeo.point_cloud import PointCloud
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 from vggtgeo.slam.outputs import DEPTH_UNIT
-from vggtgeo.trajectory import Trajectory
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import STAND_IN, flush
 

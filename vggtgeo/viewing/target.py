@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.files import make_parent
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.files import make_parent
 
 APPLICATION = "vggtgeo"
 STAND_IN = "run.rrd"

@@ -7,13 +7,13 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from vggtgeo.bundle.analysis.covariances import covariances
+from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.point_cloud import PointCloud
-from vggtgeo.problem import Problem, State
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.watching import WindowRecorder
-from vggtgeo.uncertainty import covariances
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import flush
 

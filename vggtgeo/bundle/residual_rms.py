@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.objective import relative_poses
-from vggtgeo.problem import Problem, State
-from vggtgeo.readable import Readable
-from vggtgeo.residuals import depth_residual, line_residual, point_residual
+from vggtgeo.bundle.objective import relative_poses
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.residuals import depth_residual, line_residual, point_residual
+from vggtgeo.io.readable import Readable
 
 
 class ResidualSizes(Readable):

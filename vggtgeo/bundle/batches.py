@@ -11,10 +11,10 @@ import numpy as np
 import optimistix as optx
 from jax.sharding import PartitionSpec
 
-from vggtgeo.errors import InputError
-from vggtgeo.packing import Observations, PaddedSize, SlotIndex, pack
-from vggtgeo.problem import Problem, State
-from vggtgeo.solution import Solution, solve
+from vggtgeo.bundle.packing import Observations, PaddedSize, SlotIndex, pack
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import Solution, solve
+from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 Window = tuple[Observations, np.ndarray, np.ndarray, np.ndarray]

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vggtgeo.keyframe_depth import fused_depths
-from vggtgeo.point_cloud import PointCloud
-from vggtgeo.slam import rigid
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe_depth import fused_depths
 
 _Weighted = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Points, colours, weights."""

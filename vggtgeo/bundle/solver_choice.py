@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.problem import Problem
+from vggtgeo.bundle.problem import Problem
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky

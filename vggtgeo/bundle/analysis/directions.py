@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo import lie
-from vggtgeo.linearise import SHARED
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.linearise import SHARED
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.geometry import lie
 
 MOTIONS = ("translation along x", "translation along y", "translation along z", "pitch", "yaw", "roll")
 """The names of a tangent's coordinates."""

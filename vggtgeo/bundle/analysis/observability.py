@@ -26,9 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.directions import named_directions
-from vggtgeo.linearise import edge_observations, linearise
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.analysis.directions import named_directions
+from vggtgeo.bundle.linearise import edge_observations, linearise
+from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.solvers.arrow import ArrowSystem, reduce
 from vggtgeo.solvers.covariance import balance, rank_tolerance
 from vggtgeo.solvers.segments import join_segments
@@ -82,7 +82,7 @@ class Observability(eqx.Module):
 
     def report(self) -> str:
         """The findings in words (outside `jit`, for one problem)."""
-        from vggtgeo.degeneracy_report import report
+        from vggtgeo.bundle.analysis.observability_report import report
 
         return report(self)
 
@@ -91,13 +91,13 @@ class Observability(eqx.Module):
         directions with all factors and without each kind, and the share of the information about each named direction
         that would be lost without each kind.
         """
-        from vggtgeo.degeneracy_report import as_dict
+        from vggtgeo.bundle.analysis.observability_report import as_dict
 
         return as_dict(self)
 
     def plot(self) -> Figure:
         """The eigenvalues, and what would be lost without each kind (outside `jit`, for one problem)."""
-        from vggtgeo.uncertainty_plots import observability_figure
+        from vggtgeo.figures.uncertainty import observability_figure
 
         return observability_figure(self)
 

@@ -9,7 +9,7 @@ class InputError(ValueError):
         >>> vg.simulate("moon")
         Traceback (most recent call last):
             ...
-        vggtgeo.errors.InputError: `scene` is 'moon'; it must be one of room, office, hall, corridor, staircase
+        vggtgeo.io.errors.InputError: `scene` is 'moon'; it must be one of room, office, hall, corridor, staircase
 
     """
 

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 GUESSED_FIELD_OF_VIEW = math.radians(60.0)
 """Of the longer image side: between phones (about 70 deg) and narrower depth and headset cameras (57 deg)."""

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
 
-from vggtgeo.errors import InputError
-from vggtgeo.files import atomic_open
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_open
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 

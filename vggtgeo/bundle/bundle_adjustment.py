@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo import lie
-from vggtgeo.gradient import energy_gradient
-from vggtgeo.linearise import EdgeObservations, edge_observations, fast_energy, free_coordinates, linearise
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.gradient import energy_gradient
+from vggtgeo.bundle.linearise import EdgeObservations, edge_observations, fast_energy, free_coordinates, linearise
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
 from vggtgeo.solvers.problem import AbstractArrowProblem
 from vggtgeo.solvers.segments import slopes

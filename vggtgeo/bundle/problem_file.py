@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from vggtgeo.errors import InputError
-from vggtgeo.files import atomic_open
-from vggtgeo.packing import Observations, SlotIndex, pack
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.packing import Observations, SlotIndex, pack
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_open
 from vggtgeo.solvers.kernels import Huber
 
 LAYOUT: dict[str, tuple[str | int, ...]] = {
@@ -43,7 +43,7 @@ def load_problem(path: Path, dtype: DTypeLike | None = None) -> tuple[Problem, S
         >>> vg.load_problem(Path("no.npz"))
         Traceback (most recent call last):
             ...
-        vggtgeo.errors.InputError: `no.npz` is no file; give the .npz of a bundle-adjustment problem
+        vggtgeo.io.errors.InputError: `no.npz` is no file; give the .npz of a bundle-adjustment problem
 
     """
     arrays = _read(Path(path))

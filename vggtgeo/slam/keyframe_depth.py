@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from vggtgeo.slam import rigid
+from vggtgeo.geometry import rigid
 from vggtgeo.slam.keyframe import Keyframe
 
 CELL = 24.0

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 
 NONE = -1
 """Segment number of a landmark that is on no segment."""

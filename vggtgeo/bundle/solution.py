@@ -10,10 +10,10 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle_adjustment import BundleAdjustment
-from vggtgeo.graduation import Graduation
-from vggtgeo.problem import Problem, State
-from vggtgeo.readable import Readable
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.graduation import Graduation
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.adjoint import ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import (
     CONVERGED,
@@ -65,7 +65,7 @@ class Solution(Readable):
 
     def plot(self) -> Figure:
         """The energy by iteration (outside `jit`, for one solution)."""
-        from vggtgeo.plots import energy_figure
+        from vggtgeo.figures.plots import energy_figure
 
         history = np.asarray(self.history)
         return energy_figure(history[np.isfinite(history)], self.result)

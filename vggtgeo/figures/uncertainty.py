@@ -9,12 +9,12 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 
-from vggtgeo.degeneracy import KINDS, WEAK, Observability
-from vggtgeo.degeneracy_report import lost_shares
-from vggtgeo.plots import Picture
-from vggtgeo.problem import State
-from vggtgeo.slam import rigid
-from vggtgeo.uncertainty import Covariances
+from vggtgeo.bundle.analysis.covariances import Covariances
+from vggtgeo.bundle.analysis.observability import KINDS, WEAK, Observability
+from vggtgeo.bundle.analysis.observability_report import lost_shares
+from vggtgeo.bundle.problem import State
+from vggtgeo.figures.plots import Picture
+from vggtgeo.geometry import rigid
 
 COLOURS = {"points": "#1f5fbf", "lines": "#e07b1a", "depth": "#3a8f5c", "priors": "#8a8f98"}
 _INK, _GRID = "#333333", "#e3e3e3"

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from vggtgeo.errors import InputError
 from vggtgeo.evaluation import AbsoluteError, TrajectoryReport, absolute_error, associate
-from vggtgeo.files import atomic_path
-from vggtgeo.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_path
 
 if TYPE_CHECKING:
     from vggtgeo.results import Result

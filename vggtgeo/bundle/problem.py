@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo import lie
+from vggtgeo.geometry import lie
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.errors import InputError, InputWarning
-from vggtgeo.files import write_text
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,7 +79,7 @@ class Trajectory:
 
     def plot(self, truth: "Trajectory | None" = None, *, with_scale: bool = False) -> "Figure":
         """Seen from above and from the side, the truth beside it after SE(3), or Sim(3) `with_scale`, alignment."""
-        from vggtgeo.plots import trajectory_figure
+        from vggtgeo.figures.plots import trajectory_figure
 
         return trajectory_figure(self, truth, with_scale=with_scale)
 

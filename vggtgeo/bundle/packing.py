@@ -16,9 +16,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
-from vggtgeo.errors import InputError
-from vggtgeo.line_segments import fractions, segment_slots, straightened
-from vggtgeo.problem import (
+from vggtgeo.bundle.problem import (
     DepthPrior,
     Edges,
     IntrinsicsPrior,
@@ -27,6 +25,8 @@ from vggtgeo.problem import (
     Problem,
     State,
 )
+from vggtgeo.geometry.line_segments import fractions, segment_slots, straightened
+from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import platformdirs
 
-from vggtgeo.errors import InputError
+from vggtgeo.io.errors import InputError
 from vggtgeo.models.onnx.registry import NETWORKS, HubFile, Network
 
 FOLDER_VARIABLE = "VGGTGEO_MODELS"

@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtgeo import lie
-from vggtgeo.linearise import (
+from vggtgeo.bundle.linearise import (
     EdgeObservations,
     depth_derivatives,
     derivative_row,
@@ -23,8 +22,9 @@ from vggtgeo.linearise import (
     project_host,
     rays_of,
 )
-from vggtgeo.objective import relative_poses
-from vggtgeo.problem import Problem, State
+from vggtgeo.bundle.objective import relative_poses
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowVector
 
 

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vggtgeo.linearise import SHARED, edge_observations, linearise
-from vggtgeo.objective import energy
-from vggtgeo.problem import Problem, State
-from vggtgeo.readable import Readable
+from vggtgeo.bundle.linearise import SHARED, edge_observations, linearise
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Covariances(Readable):
             sigmas: standard deviations that the ellipses reach; by default as many as can be seen well.
 
         """
-        from vggtgeo.uncertainty_plots import covariance_figure
+        from vggtgeo.figures.uncertainty import covariance_figure
 
         return covariance_figure(self, state, truth, sigmas)
 

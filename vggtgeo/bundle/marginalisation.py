@@ -20,8 +20,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.linearise import SHARED, edge_observations, linearise
-from vggtgeo.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.linearise import SHARED, edge_observations, linearise
+from vggtgeo.bundle.problem import MarginalPrior, Problem, State
 from vggtgeo.solvers.arrow import reduce
 
 _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.degeneracy import KINDS, WEAK, Observability, undetermined_below
-from vggtgeo.directions import direction_names
+from vggtgeo.bundle.analysis.directions import direction_names
+from vggtgeo.bundle.analysis.observability import KINDS, WEAK, Observability, undetermined_below
 
 ALIGNED = 0.9
 """Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""

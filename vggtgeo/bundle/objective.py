@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo import lie
-from vggtgeo.problem import MarginalPrior, Problem, State
-from vggtgeo.residuals import depth_residual, line_residual, point_residual
+from vggtgeo.bundle.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.residuals import depth_residual, line_residual, point_residual
+from vggtgeo.geometry import lie
 
 
 class EnergyTerms(NamedTuple):

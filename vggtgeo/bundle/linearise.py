@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo import lie
-from vggtgeo.objective import energy_terms, marginal_energy, marginal_residual, relative_poses
-from vggtgeo.problem import Edges, LineObservations, MarginalPrior, PointObservations, Problem, State
-from vggtgeo.residuals import MIN_RELATIVE_DEPTH
-from vggtgeo.second_order import Camera, Projection, second_order, twist
+from vggtgeo.bundle.objective import energy_terms, marginal_energy, marginal_residual, relative_poses
+from vggtgeo.bundle.problem import Edges, LineObservations, MarginalPrior, PointObservations, Problem, State
+from vggtgeo.bundle.residuals import MIN_RELATIVE_DEPTH
+from vggtgeo.bundle.second_order import Camera, Projection, second_order, twist
+from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, EdgeGraph
 from vggtgeo.solvers.kernels import AbstractKernel
 from vggtgeo.solvers.segments import join_segments

@@ -1,0 +1,1 @@
+"""Bundle adjustment: the problem, its terms, solving it, and what the solution knows."""

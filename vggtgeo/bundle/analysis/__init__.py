@@ -1,0 +1,1 @@
+"""What a problem determines and how well: covariances, observability."""

@@ -1,0 +1,1 @@
+"""Cameras, rigid motions, trajectories, point clouds: no optimisation."""

@@ -1,0 +1,1 @@
+"""Errors and files: what everything else may use."""
