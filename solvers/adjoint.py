@@ -32,6 +32,7 @@ from vggtgeo.solvers.arrow import (
     couple,
     dense_gradient,
     inverse_landmark_hessian,
+    moving_landmarks,
     multiply,
     reduce,
 )
@@ -190,5 +191,6 @@ def _restricted(system: ArrowSystem, gradient: ArrowVector) -> ArrowVector:
 
 
 def _free(vector: ArrowVector, system: ArrowSystem) -> ArrowVector:
-    determined = system.landmark_hessian != 0
-    return ArrowVector(jnp.where(system.free, vector.dense, 0.0), jnp.where(determined, vector.landmarks, 0.0))
+    return ArrowVector(
+        jnp.where(system.free, vector.dense, 0.0), jnp.where(moving_landmarks(system), vector.landmarks, 0.0)
+    )

@@ -319,5 +319,7 @@ def _gradient_norm(system: ArrowSystem) -> Float[Array, ""]:
     """Largest gradient entry, each scaled by the root of its own curvature (the unit of `sqrt(energy)`)."""
     scaled = lambda gradient, curvature: gradient * jax.lax.rsqrt(jnp.where(curvature > 0, curvature, jnp.inf))
     landmarks = scaled(system.landmark_gradient, system.landmark_hessian)
+    # A landmark that presses against its bound is at rest there (the condition of Karush, Kuhn and Tucker).
+    landmarks = landmarks if system.held is None else jnp.where(system.held, 0.0, landmarks)
     dense = jnp.where(system.free, scaled(*dense_gradient(system)), 0.0)
     return jnp.maximum(jnp.max(jnp.abs(landmarks), initial=0.0), jnp.max(jnp.abs(dense), initial=0.0))

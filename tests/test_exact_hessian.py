@@ -14,7 +14,8 @@ from vggtgeo.solvers.arrow import multiply, reduce
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import energy
-from vggtgeo.bundle.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.marginal import MarginalPrior
 
 SCENE = make_scene(2, 4, 1, 2, noise=0.7, outliers=0.3, depth_error=0.2, seed=3)
 

@@ -24,11 +24,12 @@ from scenes import Scene
 from vggtgeo.solvers.arrow import ArrowVector
 
 from vggtgeo.bundle.analysis.directions import MOTIONS, direction_names, named_directions
-from vggtgeo.bundle.analysis.observability import KINDS, WEAK, Observability, observability
+from vggtgeo.bundle.analysis.observability import WEAK, Observability, observability
 from vggtgeo.bundle.analysis.observability_report import undetermined_landmarks, weak_directions
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State
 
+KINDS = ("points", "lines", "depth", "intrinsics_prior")
 Observe = Callable[[Problem, State], Observability]
 LOST = [f"keyframe 2: {motion}" for motion in MOTIONS]
 NO_PRIOR = {"intrinsics_sigma": None}

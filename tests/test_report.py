@@ -14,7 +14,7 @@ from recorded_run import FRAMES, SETTINGS, RecordedRun, recorded_run
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
 
-from vggtgeo.bundle.residual_rms import residual_sizes
+from vggtgeo.bundle.residuals import residual_sizes
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory

@@ -37,7 +37,8 @@ class Graduation(eqx.Module):
         brief = eqx.tree_at(lambda s: s.max_iterations, solver, self.iterations)
 
         def stage(state: State, factor: Float[Array, ""]) -> tuple[State, None]:
-            wide = eqx.tree_at(lambda p: p.kernel, problem, problem.kernel.widened(factor))
+            widened = [eqx.tree_at(lambda t: t.kernel, term, term.kernel.widened(factor)) for term in problem.terms]
+            wide = problem.with_terms(tuple(widened))
             found: optx.Solution = optx.least_squares(
                 lambda point, ba: ba.energy(point),
                 brief,

@@ -16,15 +16,12 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
-from vggtgeo.bundle.problem import (
-    DepthPrior,
-    Edges,
-    IntrinsicsPrior,
-    LineObservations,
-    PointObservations,
-    Problem,
-    State,
-)
+from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.terms.depth import DepthPrior
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.line import LineTerm
+from vggtgeo.bundle.terms.point import PointTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.line_segments import fractions, segment_slots, straightened
 from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
@@ -133,6 +130,8 @@ class SlotIndex:
     host: np.ndarray
     slot: np.ndarray
     edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    shape: tuple[int, int] = (0, 0)
+    """Edges and slots of the problem."""
 
     def __repr__(self) -> str:
         return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
@@ -144,6 +143,20 @@ class SlotIndex:
     def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> np.ndarray:
         """Values of the point matches, `[A, ...]`, as `observations` lists them, from an array `[e, p, ...]`."""
         return np.asarray(per_match)[self.edge[observations.point_edge], self.slot[observations.point_landmark]]
+
+    def along_edges(self, edge: np.ndarray, landmark: np.ndarray, values: np.ndarray) -> Array:
+        """Data of observations as a term on edges takes it, `[e, s, ...]`, zero where nothing is given.
+
+        Args:
+            edge: int `[k]`, as `observations.edges` lists them.
+            landmark: int `[k]`, hosted in the edge's first keyframe.
+            values: `[k, ...]`.
+
+        """
+        given = np.asarray(values)
+        whole = np.zeros((*self.shape, *given.shape[1:]), given.dtype)
+        whole[self.edge[edge], self.slot[landmark]] = given
+        return jnp.asarray(whole)
 
 
 def pack(
@@ -158,6 +171,7 @@ def pack(
     fixed_pose: np.ndarray | None = None,
     fixed_intrinsics: np.ndarray | bool = False,
     kernel: AbstractKernel | None = None,
+    terms: Sequence[AbstractTerm] = (),
     dtype: DTypeLike | None = None,
 ) -> tuple[Problem, State, SlotIndex]:
     """Pack flat observations and an initial guess into arrays.
@@ -173,6 +187,8 @@ def pack(
         fixed_pose: bool `[n]`; None holds the first pose.
         fixed_intrinsics: bool or bool `[4]`: intrinsics that are held.
         kernel: robust kernel; None = Cauchy with delta 1.5 px, the best of `benchmarks/robustness.py`.
+        terms: what else is known: terms on poses, pairs or the camera, the prior of a marginalisation. Terms on
+            landmarks are added afterwards with `problem.with_term`, see `SlotIndex.along_edges`.
         dtype: float type of all arrays; None = JAX's own, which is double where `jax_enable_x64` is on.
 
     Raises:
@@ -204,7 +220,7 @@ def pack(
     graph, position = _pad_edges(edges, size)
     row = position[order]
     slot = np.where(lines, slots.where.slot - slots.points + size.points, slots.where.slot)
-    index = SlotIndex(slots.where.host, slot, row)
+    index = SlotIndex(slots.where.host, slot, row, (len(graph.source), size.points + size.lines))
 
     def per_slot(values: np.ndarray, empty: float) -> Array:
         array = np.full((size.keyframes, size.points + size.lines, *np.shape(values)[1:]), empty, dtype)
@@ -214,13 +230,17 @@ def pack(
     point_at = (row[observations.point_edge], index.slot[observations.point_landmark])
     line_at = (row[observations.line_edge], index.slot[observations.line_landmark] - size.points)
     num_edges = len(graph.source)
-    points = PointObservations(
-        _scatter(point_at, observations.point_target, (num_edges, size.points, 2), dtype),
-        _scatter(point_at, observations.point_weight, (num_edges, size.points), dtype),
+    kernel = kernel or Cauchy(jnp.asarray(1.5, dtype))
+    points = PointTerm(
+        target=_scatter(point_at, observations.point_target, (num_edges, size.points, 2), dtype),
+        weight=_scatter(point_at, observations.point_weight, (num_edges, size.points), dtype),
+        kernel=kernel,
     )
-    line_observations = LineObservations(
-        _scatter(line_at, observations.line_coefficients, (num_edges, size.lines, 3), dtype),
-        _scatter(line_at, observations.line_weight, (num_edges, size.lines), dtype),
+    line_term = LineTerm(
+        coefficients=_scatter(line_at, observations.line_coefficients, (num_edges, size.lines, 3), dtype),
+        weight=_scatter(line_at, observations.line_weight, (num_edges, size.lines), dtype),
+        kernel=kernel,
+        first_slot=size.points,
     )
     sigma = np.inf if intrinsics_sigma is None else np.asarray(intrinsics_sigma, dtype)
     padding = size.keyframes - len(poses)
@@ -228,16 +248,17 @@ def pack(
     problem = Problem(
         pixels=per_slot(observations.pixel, 0.0),
         edges=graph,
-        points=points,
-        lines=line_observations,
-        depth=_depth_prior(observations, per_slot, count, dtype),
-        intrinsics_prior=IntrinsicsPrior(
-            jnp.asarray(intrinsics if intrinsics_mean is None else intrinsics_mean, dtype),
-            jnp.asarray(np.broadcast_to(1 / np.square(sigma), 4), dtype),
+        terms=(
+            *(points, line_term, _depth_prior(observations, per_slot, count, dtype, kernel)),
+            IntrinsicsPrior(
+                index=jnp.arange(len(intrinsics)),
+                mean=jnp.asarray(intrinsics if intrinsics_mean is None else intrinsics_mean, dtype),
+                weight=jnp.asarray(np.broadcast_to(1 / np.square(sigma), len(intrinsics)), dtype),
+            ),
+            *terms,
         ),
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
-        fixed_intrinsics=jnp.asarray(np.broadcast_to(fixed_intrinsics, 4)),
-        kernel=kernel or Cauchy(jnp.asarray(1.5, dtype)),
+        fixed_intrinsics=jnp.asarray(np.broadcast_to(fixed_intrinsics, len(intrinsics))),
     )
     depths = per_slot(inverse_depth, 1.0)
     if observations.segment is not None:
@@ -267,21 +288,23 @@ def _with_segments(problem: Problem, depths: Array, present: Array, size: Padded
 
 
 def _depth_prior(
-    observations: Observations, per_slot: Callable[[np.ndarray, float], Array], count: int, dtype: DTypeLike
+    observations: Observations,
+    per_slot: Callable[[np.ndarray, float], Array],
+    count: int,
+    dtype: DTypeLike,
+    kernel: AbstractKernel,
 ) -> DepthPrior:
-    if observations.depth_mean is None:
-        zero, one = np.zeros(count), np.ones(count)
-        return DepthPrior(
-            per_slot(one, 1.0), per_slot(one, 1.0), per_slot(zero, 0.0), jnp.asarray(observations.alpha, dtype)
-        )
-    sigma = np.ones(count) if observations.depth_sigma is None else observations.depth_sigma
-    weight = np.ones(count) if observations.depth_weight is None else observations.depth_weight
+    given = observations.depth_mean is not None
+    fill = lambda values, default: np.full(count, default) if values is None or not given else values
+    mean, sigma = fill(observations.depth_mean, 1.0), fill(observations.depth_sigma, 1.0)
+    weight = fill(observations.depth_weight, 1.0 if given else 0.0)
     _check_positive("depth_sigma", sigma, count)
     return DepthPrior(
-        per_slot(observations.depth_mean, 1.0),
-        per_slot(sigma, 1.0),
-        per_slot(weight, 0.0),
-        jnp.asarray(observations.alpha, dtype),
+        mean=per_slot(mean, 1.0),
+        sigma=per_slot(sigma, 1.0),
+        weight=per_slot(weight, 0.0),
+        alpha=jnp.asarray(observations.alpha, dtype),
+        kernel=kernel,
     )
 
 

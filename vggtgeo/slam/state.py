@@ -6,11 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vggtgeo.bundle.problem import MarginalPrior, State
+from vggtgeo.bundle.problem import State
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.adjustment import Adjustment
 from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.factors import Factor
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 
@@ -49,6 +51,7 @@ class Slam:
     intrinsics: current fx, fy, cx, cy. given_intrinsics, intrinsics_sigma: mean and standard deviation of their prior,
     pixels. keyframes: all, by number. pairs: all matches between them. window: numbers of
     the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
+    factors: what is known about poses beyond matches.
     solved: the last window problem and its solution. energies: `1/2 sum rho` of that window before its first and after
     each iteration; iterations: what else each did, where the settings ask for it. frames: every frame's pose.
     velocity: last motion from frame to frame, camera -> camera. waiting: frames before the start of an RGB sequence.
@@ -64,7 +67,8 @@ class Slam:
     keyframes: tuple[Keyframe, ...] = ()
     pairs: tuple[Pair, ...] = ()
     window: tuple[int, ...] = ()
-    prior: MarginalPrior | None = None
+    prior: WindowPrior | None = None
+    factors: tuple[Factor, ...] = ()
     solved: tuple[Adjustment, State] | None = None
     energies: np.ndarray | None = None
     iterations: IterationRecord | None = None
