@@ -90,7 +90,7 @@ def test_what_each_kind_is_worth(observed: Observe) -> None:
     scale = direction_names(KEYFRAMES).index("scale")
     assert float(found.without.along[KINDS.index("depth"), scale]) < 1e-9 * float(found.whole.along[0, scale])
     assert float(found.alone.along[KINDS.index("depth"), scale]) == 0
-    with pytest.raises(ValueError, match="`without` is 'imu'; expected one of points, lines, depth, priors"):
+    with pytest.raises(ValueError, match="`without` is 'imu'; expected one of points, lines, depth, intrinsics_prior"):
         weak_directions(found, "imu")
 
 
@@ -103,7 +103,7 @@ def test_without_a_kind_is_the_problem_without_it(observed: Observe, kind: str) 
         "points": lambda p: p.points.weight,
         "lines": lambda p: p.lines.weight,
         "depth": lambda p: p.depth.weight,
-        "priors": lambda p: p.intrinsics_prior.information,
+        "intrinsics_prior": lambda p: p.intrinsics_prior.weight,
     }[kind]
     found = observed(problem, truth)
     lacking = observed(eqx.tree_at(weight, problem, replace_fn=jnp.zeros_like), truth)

@@ -24,9 +24,12 @@ class BundleAdjustment(AbstractArrowProblem[State]):
 
     problem: Problem
     """Prepared: see `objective.prepared`."""
+    start: State | None
+    """Where the iteration starts: held coordinates stay there, and a derivative by them goes through it."""
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, start: State | None = None):
         self.problem = prepared(problem)
+        self.start = start
 
     def energy(self, point: State) -> Float[Array, ""]:
         return prepared_energy(self.problem, point)
@@ -57,7 +60,8 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         lines = _shortened(depth[:, first:], moved[:, first:], self.problem.fraction.shape[1])
         return jnp.concatenate([_positive(moved[:, :first]), lines], 1)
 
-    def hold(self, point: State, initial: State) -> State:
+    def hold(self, point: State) -> State:
+        initial = point if self.start is None else self.start
         fixed_pose = self.problem.fixed_pose[:, None]
         poses = jnp.where(fixed_pose, initial.poses.wxyz_xyz, point.poses.wxyz_xyz)
         intrinsics = jnp.where(self.problem.fixed_intrinsics, initial.intrinsics, point.intrinsics)

@@ -165,7 +165,7 @@ def _exact(seen: Seen, correction: Float[Array, ""] | None, slots: int) -> tuple
     return gram, _placed(seen, [model.coupled for model in models], slots)
 
 
-def _placed(seen: Seen, parts: list[Float[Array, "r p"]], slots: int) -> Float[Array, "r s"]:
+def _placed(seen: Seen, parts: list[Float[Array, "r _"]], slots: int) -> Float[Array, "r s"]:
     """The terms' cross terms at their slots, added up."""
     first = [term.first_slot for term, _ in seen]
     ends = [start + part.shape[1] for start, part in zip(first, parts, strict=True)]

@@ -7,7 +7,7 @@ inverse depth, and no other file asks which entries are real.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,6 +16,19 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
+from vggtgeo.bundle.packing_checks import (
+    as_numbers,
+    as_poses,
+    check_camera,
+    check_edges,
+    check_fixed,
+    check_indices,
+    check_kernel,
+    check_positive,
+    check_shapes,
+    check_size,
+    check_values,
+)
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
@@ -194,7 +207,8 @@ def pack(
     Raises:
         InputError: an array of a wrong shape, an index out of range, a match given twice, a landmark with both points
             and lines, an observation between keyframes that its landmark is not hosted in, an inverse depth, focal
-            length or standard deviation that is not positive, or a size that is too small.
+            length or standard deviation that is not positive, weights that are negative or NaN, lines that are not
+            normalised, an edge twice or to itself, a kernel that is none, or a size that is too small.
 
     Example:
         >>> import vggtgeo as vg
@@ -206,16 +220,21 @@ def pack(
 
     """
     dtype = jnp.result_type(float) if dtype is None else dtype
+    observations, poses = _as_arrays(observations), as_poses(poses)
+    intrinsics, inverse_depth = as_numbers("intrinsics", intrinsics), as_numbers("inverse_depth", inverse_depth)
     count = len(observations.host)
-    _check_shapes(observations, poses, intrinsics)
-    _check_indices(observations, len(poses))
-    _check_positive("inverse_depth", inverse_depth, count)
-    _check_camera(poses, intrinsics, intrinsics_sigma)
+    check_kernel(kernel)
+    check_shapes(observations, poses, intrinsics)
+    check_indices(observations, len(poses))
+    check_edges(observations.edges)
+    check_values(observations)
+    check_positive("inverse_depth", inverse_depth, count)
+    check_camera(poses, intrinsics, intrinsics_sigma)
     slots = _assign_slots(observations, len(poses), size.samples if size else None)
     edges, order, ranks = _sort_edges(observations.edges, len(poses))
     needed = PaddedSize(len(poses), slots.points, slots.lines, ranks, len(edges), slots.samples)
     size = size or needed
-    _check_size(size, needed)
+    check_size(size, needed)
     lines = slots.where.slot >= slots.points
     graph, position = _pad_edges(edges, size)
     row = position[order]
@@ -244,7 +263,8 @@ def pack(
     )
     sigma = np.inf if intrinsics_sigma is None else np.asarray(intrinsics_sigma, dtype)
     padding = size.keyframes - len(poses)
-    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else np.asarray(fixed_pose, bool)
+    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, len(poses))
+    held = check_fixed("fixed_intrinsics", fixed_intrinsics, len(intrinsics))
     problem = Problem(
         pixels=per_slot(observations.pixel, 0.0),
         edges=graph,
@@ -258,7 +278,7 @@ def pack(
             *terms,
         ),
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
-        fixed_intrinsics=jnp.asarray(np.broadcast_to(fixed_intrinsics, len(intrinsics))),
+        fixed_intrinsics=jnp.asarray(held),
     )
     depths = per_slot(inverse_depth, 1.0)
     if observations.segment is not None:
@@ -270,6 +290,13 @@ def pack(
         depths,
     )
     return problem, state, index
+
+
+def _as_arrays(observations: Observations) -> Observations:
+    """The same observations, lists turned into arrays."""
+    names = [field.name for field in fields(observations) if field.name != "alpha"]
+    given = {name: getattr(observations, name) for name in names}
+    return replace(observations, **{name: as_numbers(name, v) for name, v in given.items() if v is not None})
 
 
 def _with_segments(problem: Problem, depths: Array, present: Array, size: PaddedSize) -> tuple[Problem, Array]:
@@ -298,7 +325,7 @@ def _depth_prior(
     fill = lambda values, default: np.full(count, default) if values is None or not given else values
     mean, sigma = fill(observations.depth_mean, 1.0), fill(observations.depth_sigma, 1.0)
     weight = fill(observations.depth_weight, 1.0 if given else 0.0)
-    _check_positive("depth_sigma", sigma, count)
+    check_positive("depth_sigma", sigma, count)
     return DepthPrior(
         mean=per_slot(mean, 1.0),
         sigma=per_slot(sigma, 1.0),
@@ -382,88 +409,3 @@ def _pad_edges(edges: np.ndarray, size: PaddedSize) -> tuple[Edges, np.ndarray]:
     of_host[source, ranks] = np.arange(len(source))
     arrays = (jnp.asarray(array, jnp.int32) for array in (source, target, ranks, of_host))
     return Edges(*arrays), position
-
-
-def _check_indices(observations: Observations, keyframes: int) -> None:
-    edges, landmarks = len(observations.edges), len(observations.host)
-    limits = [
-        ("edges", observations.edges, keyframes, "keyframes"),
-        ("host", observations.host, keyframes, "keyframes"),
-        ("point_edge", observations.point_edge, edges, "edges"),
-        ("line_edge", observations.line_edge, edges, "edges"),
-        ("point_landmark", observations.point_landmark, landmarks, "landmarks"),
-        ("line_landmark", observations.line_landmark, landmarks, "landmarks"),
-    ]
-    for name, given, limit, what in limits:
-        values = np.asarray(given)
-        if values.size and (values.min() < 0 or values.max() >= limit):
-            raise InputError(
-                f"`{name}` goes from {values.min()} to {values.max()}; there are {limit} {what}: use 0 to {limit - 1}"
-            )
-    for kind in ("point", "line"):
-        edge, landmark = getattr(observations, f"{kind}_edge"), getattr(observations, f"{kind}_landmark")
-        wrong = observations.edges[edge, 0] != observations.host[landmark]
-        if np.any(wrong):
-            first = int(np.nonzero(wrong)[0][0])
-            raise InputError(
-                f"`{kind}_edge[{first}]` starts at keyframe {observations.edges[edge[first], 0]}, but its landmark is "
-                f"hosted in keyframe {observations.host[landmark[first]]}: an edge observes landmarks of its own host"
-            )
-        _, first_seen = np.unique(edge * landmarks + landmark, return_index=True)
-        if len(first_seen) < len(edge):
-            twice = np.delete(np.arange(len(edge)), first_seen)[0]
-            raise InputError(
-                f"`{kind}_edge` and `{kind}_landmark` name landmark {landmark[twice]} on edge {edge[twice]} more than "
-                "once; a landmark has one match an edge"
-            )
-
-
-def _check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.ndarray) -> None:
-    edges, landmarks = len(observations.edges), len(observations.host)
-    points, lines = len(observations.point_edge), len(observations.line_edge)
-    expected = {
-        "edges": (edges, 2),
-        "pixel": (landmarks, 2),
-        "point_landmark": (points,),
-        "point_target": (points, 2),
-        "point_weight": (points,),
-        "line_landmark": (lines,),
-        "line_coefficients": (lines, 3),
-        "line_weight": (lines,),
-    }
-    optional = ("depth_mean", "depth_sigma", "depth_weight", "segment")
-    given = {name: getattr(observations, name) for name in (*expected, *optional)}
-    expected |= {name: (landmarks,) for name in optional if given[name] is not None}
-    given |= {"poses": poses, "intrinsics": intrinsics}
-    for name, shape in {**expected, "poses": (len(poses), 7), "intrinsics": (4,)}.items():
-        if np.shape(given[name]) != shape:
-            raise InputError(f"`{name}` has shape {np.shape(given[name])}; expected {shape}")
-
-
-def _check_camera(poses: np.ndarray, intrinsics: np.ndarray, sigma: np.ndarray | float | None) -> None:
-    if np.any(np.asarray(intrinsics)[:2] <= 0):
-        raise InputError(f"`intrinsics` is {np.asarray(intrinsics)}; both focal lengths must be positive")
-    if sigma is not None and not np.all(np.asarray(sigma) > 0):
-        raise InputError(f"`intrinsics_sigma` is {sigma}; it must be positive (None = no prior)")
-    lengths = np.linalg.norm(poses[:, :4], axis=1)
-    wrong = np.nonzero(np.abs(lengths - 1) > 1e-3)[0]
-    if len(wrong):
-        raise InputError(f"`poses[{wrong[0]}]` has a quaternion of length {lengths[wrong[0]]:.3g}; expected 1")
-
-
-def _check_positive(name: str, values: np.ndarray, count: int) -> None:
-    if np.shape(values) != (count,):
-        raise InputError(f"`{name}` has shape {np.shape(values)}; expected ({count},), one a landmark")
-    bad = ~(np.isfinite(values) & (np.asarray(values) > 0))
-    if np.any(bad):
-        first = int(np.nonzero(bad)[0][0])
-        raise InputError(f"`{name}[{first}]` is {values[first]}; it must be positive and finite")
-
-
-def _check_size(size: PaddedSize, needed: PaddedSize) -> None:
-    if needed.samples is not None and size.lines % needed.samples:
-        raise InputError(f"`size.lines` is {size.lines}; it must be a multiple of `size.samples`, {needed.samples}")
-    for name in ("keyframes", "points", "lines", "ranks", "edges"):
-        have, need = getattr(size, name), getattr(needed, name)
-        if have is not None and (have < need or (name == "edges" and have != need)):
-            raise InputError(f"`size.{name}` is {have}; this problem needs {need}")

@@ -98,8 +98,8 @@ class Problem(eqx.Module):
     """Keyframes whose pose is held (the gauge)."""
     fixed_intrinsics: Bool[Array, " q"]
     """Parameters of the camera that are held."""
-    fraction: Float[Array, "n g q"] | None = None
-    """Two-ends lines: the last `g q` slots are `g` segments of `q` samples, and the inverse depth of a segment is an
+    fraction: Float[Array, "n g m"] | None = None
+    """Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a segment is an
     affine function of this position along it (0 and 1 at its ends). None: each sample has its own inverse depth."""
     camera: type[AbstractCamera] = eqx.field(static=True, default=Pinhole)
     """Model of the camera whose parameters the state holds."""
@@ -128,8 +128,8 @@ class Problem(eqx.Module):
 
     @property
     def edge_terms(self) -> tuple[EdgeTerm, ...]:
-        """Terms along edges."""
-        return tuple(self._of_kind(EdgeTerm))
+        """Terms along edges that have room for an observation."""
+        return tuple(term for term in self._of_kind(EdgeTerm) if term.weight.shape[-1])
 
     @property
     def slot_terms(self) -> tuple[SlotTerm, ...]:

@@ -116,6 +116,8 @@ def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[
     if isinstance(term, DenseTerm):
         return term.residual(state.poses, state.intrinsics)
     alone, hosts = problem.with_terms((term,)), hosts_of(problem, state)
+    if not alone.edge_terms:
+        return jnp.zeros((1, *term.weight.shape), state.inverse_depth.dtype)
 
     def edge(host: Array, motion: tuple, data: tuple) -> Array:
         ((one, view),) = of_edge(alone, view_of(camera, hosts, host, motion), data)

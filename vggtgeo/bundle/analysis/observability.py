@@ -4,10 +4,10 @@ The landmarks are eliminated: the information about poses and intrinsics is the 
 
     S = H - W V^-1 W',      for all terms, for one term alone (`S_k`), and for all but one (`S_-k`),
 
-each from the Hessian of just those terms (a landmark that they do not determine stays where it is). They do not add
-up: `S >= S_k + S_-k`, since a depth prior alone says nothing about a pose and a match alone nothing about the scale, but both
-together do. So what a term is worth along a direction `d` is what would be lost without it: `1 - d' S_-k d / d' S d`,
-between 0 and 1; the shares of several terms may add up to more than 1.
+each from the Hessian of just those terms (a landmark that they do not determine stays where it is).
+They do not add up: `S >= S_k + S_-k`, since a depth prior alone says nothing about a pose and a match alone nothing
+about the scale, but both together do. So what a term is worth along a direction `d` is what would be lost without it:
+`1 - d' S_-k d / d' S d`, between 0 and 1; the shares of several terms may add up to more than 1.
 
 Spectra are those of `D^-1/2 S D^-1/2` with `D = diag(H)` of all factors: metres, radians and pixels become one unit,
 and an eigenvalue is the share of a direction's information that is left once everything else is estimated too. A

@@ -86,7 +86,7 @@ class EdgeTerm(AbstractTerm):
         """Of one edge."""
         return robust_energy(self.kernel, self.weights, self.residuals(view))
 
-    def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "d+2 m*p"]:
+    def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "c mp"]:
         """Weighted derivatives, residual and depth derivative of one edge: their products are its normal equations."""
         zero = jnp.zeros(view.size, view.inverse_depth.dtype)
         by_shared = lambda tangent: jax.jvp(lambda x: self._moved(view, x, view.inverse_depth), (zero,), (tangent,))[1]
@@ -159,7 +159,7 @@ class ImageTerm(EdgeTerm):
             return super().energy(view)
         return robust_energy(self.kernel, self.weights, self._image(view, view.projection)[0])
 
-    def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "d+2 m*p"]:
+    def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "c mp"]:
         if view.fast is None or view.projection is None:
             return super().columns(view, correction)
         residual, normal = self._image(view, view.projection)
@@ -215,7 +215,7 @@ class ImageTerm(EdgeTerm):
         return jnp.stack([pull * sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]), bend
 
 
-def times_depth_column(columns: Float[Array, "d+2 m*p"], slots: int) -> Float[Array, "d+2 p"]:
+def times_depth_column(columns: Float[Array, "c mp"], slots: int) -> Float[Array, "c p"]:
     """Each column times the depth column, the rows of an observation added; gradient and curvature come last."""
     depth, total = columns[-1], 0.0
     for start in range(0, columns.shape[1], slots):

@@ -94,8 +94,8 @@ class CameraTerm(AbstractTerm):
 
     def residuals(self, parameters: Float[Array, " q"]) -> Float[Array, "m k"]:
         """Of all of them, the residual's own axis first."""
-        one = lambda data: jnp.atleast_1d(self.holding(data).residual(parameters))
-        return jax.vmap(one, out_axes=-1)(self.data())
+        one = lambda data, _: jnp.atleast_1d(self.holding(data).residual(parameters))
+        return jax.vmap(one, out_axes=-1)(self.data(), self.weight)
 
     def model(
         self, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
