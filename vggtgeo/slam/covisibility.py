@@ -79,10 +79,10 @@ def match_keyframes(
     relative = second.pose @ rigid.invert(first.pose)
     points = roles.points.match(first.features, second.features, None)
     points = points.select(_consistent(points, first, relative, intrinsics, settings))
-    if len(points) <= settings.least_covisible:
-        return None
     view = RelativeView(relative, intrinsics, first.line_depths)
     lines = roles.line_matches.match(first.lines, second.lines, view)
+    if len(points) < settings.least_matches and len(lines) < settings.least_line_matches:
+        return None
     return Pair(first.number, second.number, points, lines)
 
 

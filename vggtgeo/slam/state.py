@@ -10,7 +10,9 @@ from vggtgeo.bundle.problem import MarginalPrior, State
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.adjustment import Adjustment
 from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.rgbd_alignment import RgbdView
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 
@@ -18,7 +20,8 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 class FramePose:
     """Pose of one frame relative to a keyframe, so that it follows when the keyframe is adjusted.
 
-    relative: float64 [4, 4], reference camera -> this camera. tracked: False where the pose is only predicted.
+    relative: float64 [4, 4], reference camera -> this camera. tracked: False where no pose could be believed; `relative`
+    is then that of the last one. evidence: what speaks for the pose, and how well it is known.
     """
 
     frame: int
@@ -27,19 +30,37 @@ class FramePose:
     relative: np.ndarray
     tracked: bool
     inliers: int
+    evidence: Evidence = field(default_factory=Evidence)
     arrival: tuple[int, np.ndarray] | None = None
     """Of a frame that became a keyframe: the earlier keyframe it was tracked against, and its pose relative to that
     one as tracked, before any adjustment."""
 
 
 @dataclass(frozen=True, eq=False)
+class Tie:
+    """The motion between two keyframes as it was tracked, by their numbers.
+
+    motion: float64 [4, 4], camera `first` -> camera `second`. information: float64 [6, 6] over its left tangent,
+    translation first, 1/m^2 and 1/rad^2.
+    """
+
+    first: int
+    second: int
+    motion: np.ndarray
+    information: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Waiting:
-    """A frame seen before the first two views of an RGB sequence gave a map; it is placed as soon as there is one."""
+    """A frame without a pose so far: seen before there was a map, or while tracking was lost. It is placed as soon as
+    there is a map that it fits into.
+    """
 
     frame: int
     timestamp: float
     image: np.ndarray
     features: Features
+    depth: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +72,10 @@ class Slam:
     the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
     solved: the last window problem and its solution. energies: `1/2 sum rho` of that window before its first and after
     each iteration; iterations: what else each did, where the settings ask for it. frames: every frame's pose.
-    velocity: last motion from frame to frame, camera -> camera. waiting: frames before the start of an RGB sequence.
-    lost: frames since tracking was lost.
+    velocity: last motion from frame to frame, camera -> camera. waiting: frames without a pose so far.
+    reference: number of the keyframe that frames are tracked against, and its view for the alignment. ties: the tracked
+    motion of each keyframe from the one it was tracked against; they hold the map together. lost: frames since tracking
+    was lost. origins: the first keyframe of each piece of the map; pieces are tied to nothing else.
     metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
     world), as the first keyframes saw them. notes: what the user should know.
     """
@@ -74,6 +97,8 @@ class Slam:
     lost: int = 0
     origins: tuple[int, ...] = ()
     axes: tuple[np.ndarray, ...] = ()
+    reference: tuple[int, RgbdView | None] | None = None
+    ties: tuple[Tie, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
