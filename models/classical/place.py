@@ -1,8 +1,8 @@
 """One vector for a whole image, to find places seen before: aggregated local descriptors (VLAD, Jegou et al. 2010).
 
-Each descriptor, without the mean of its image, goes to one of 2^bits cells by the signs of its products with fixed random
-directions (Charikar 2002), in place of a trained vocabulary: nothing must be learnt or kept, and it fits any descriptor.
-The sums of the cells, square-rooted and normalised each and then together, are the vector.
+Each descriptor, without the mean of its image, goes to one of 2^bits cells by the signs of its products with fixed
+random directions (Charikar 2002), in place of a trained vocabulary: nothing must be learnt or kept, and it fits any
+descriptor. The sums of the cells, square-rooted and normalised each and then together, are the vector.
 """
 
 from __future__ import annotations

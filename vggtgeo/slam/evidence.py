@@ -30,8 +30,10 @@ LEAST_CORRELATION, STRONG_CORRELATION = 0.4, 0.6
 CONTRADICTION = 0.1
 LEAST_SURFACE = 0.85
 LEAST_OVERLAP = 0.2
+BARE_SURFACE, BARE_OVERLAP, BARE_SIGMA = 0.95, 0.5, 0.03
+"""Where the picture is empty, surfaces speak alone if so many agree and they determine all directions, metres."""
 LARGEST_SIGMA = 0.10
-"""Metres; a pose that is known worse than this is none."""
+"""Metres; a pose that is measured worse than this in any direction is none."""
 STEP_GATE = float(chi_square.ppf(0.9999, 6))
 """Of the squared Mahalanobis distance to the prediction, 6 degrees of freedom."""
 STEP_FLOOR, STEP_GROWTH = (0.10, np.deg2rad(6.0)), 0.7
@@ -89,7 +91,15 @@ class Evidence:
 
     @property
     def dense_strong(self) -> bool:
-        return self.dense_fair and self.correlation >= STRONG_CORRELATION
+        """The same beyond doubt: the picture itself, or a fair picture of the same surfaces."""
+        surfaces = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP
+        return self.dense_fair and (self.correlation >= STRONG_CORRELATION or surfaces)
+
+    @property
+    def bare_surface(self) -> bool:
+        """Whether, in a picture without edges, the surfaces alone determine the pose."""
+        seen = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP
+        return bool(np.isnan(self.correlation)) and seen and self.sigma_translation < BARE_SIGMA
 
     @property
     def accepted(self) -> bool:
@@ -98,9 +108,8 @@ class Evidence:
             return False
         if not self.plausible:
             return self.points_strong and self.dense_fair
-        return (
-            self.points_strong or (self.points_fair and not self.correlation < LEAST_CORRELATION) or self.dense_strong
-        )
+        fair = self.points_fair and not self.correlation < LEAST_CORRELATION
+        return self.points_strong or fair or self.dense_strong or self.bare_surface
 
     @property
     def certain(self) -> bool:

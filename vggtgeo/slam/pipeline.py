@@ -22,9 +22,8 @@ from vggtgeo.slam.state import FramePose, Slam, Tie
 from vggtgeo.slam.tracking import Expectation, Sight, Track, track
 from vggtgeo.slam.window import adjust, enter
 
-LOST_PATIENCE = 30
-"""Frames without a pose before a new piece of map begins: a second of video. A piece that begins too early is never
-joined to the rest where the camera does not come back; one that begins late loses the frames up to then."""
+LOST_PATIENCE = 10
+"""Frames that show something, but nothing of the map, before a new piece of map begins. Black frames do not count."""
 NEIGHBOURS = 3
 """Keyframes before and after an old one that make up the window when the camera comes back to it."""
 
@@ -75,7 +74,6 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
         frames=(*slam.frames, record),
         velocity=np.eye(4),
         reference=None,
-        waiting=(),
         lost=0,
     )
 
@@ -92,6 +90,8 @@ def _follow(slam: Slam, frame: Frame, features: Features, roles: Roles, settings
     if not found.accepted:
         return _missed(slam, sight, found, roles, settings)
     was_lost = bool(slam.lost)
+    if was_lost:
+        slam = _noted_found(slam, frame)
     velocity = np.eye(4) if was_lost else found.pose @ rigid.invert(slam.last_pose)
     slam = _enter_frame(replace(slam, velocity=velocity, lost=0), sight, found, roles, settings, clock)
     return place_waiting(slam, roles) if was_lost else slam
@@ -109,7 +109,7 @@ def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Tra
         found = track(sight, keyframe, view_of(keyframe, slam, roles), expected, slam.intrinsics, roles, window)
         if best is None or _rank(found) > _rank(best):
             best = found
-        if best.accepted and best.evidence.inliers >= settings.least_inliers:
+        if best.accepted and (best.evidence.inliers >= settings.least_inliers or best.evidence.dense_strong):
             break
     assert best is not None
     return best
@@ -159,11 +159,15 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     return hold_pose(slam, number, settings)
 
 
+def _noted_found(slam: Slam, frame: Frame) -> Slam:
+    note = f"found again at frame {frame.index} ({frame.name}), {slam.lost} frames after tracking was lost"
+    return replace(slam, notes=(*slam.notes, note))
+
+
 def _found_again(slam: Slam, sight: Sight, place: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
     """Go on in the map where the camera was found."""
     frame = sight.frame
-    note = f"found again at frame {frame.index} ({frame.name}), {slam.lost} frames after tracking was lost"
-    slam = replace(slam, notes=(*slam.notes, note), velocity=np.eye(4), lost=0)
+    slam = replace(_noted_found(slam, frame), velocity=np.eye(4), lost=0)
     slam = _enter_frame(slam, sight, place, roles, settings, clock)
     return place_waiting(slam, roles)
 
@@ -174,16 +178,19 @@ def _missed(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: Slam
     if slam.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, notes=(*slam.notes, note), velocity=np.eye(4))
+    waiting = wait(slam, frame, features, MOST_WAITING)
     slam = replace(slam, lost=slam.lost + 1)
-    if slam.lost > LOST_PATIENCE and len(features) > settings.least_inliers:
+    shown = sum(len(other.features) > settings.least_inliers for other in waiting)
+    if shown > LOST_PATIENCE and len(features) > settings.least_inliers:
         note = (
             f"a new piece of map begins at frame {frame.index} ({frame.name}): "
             "nothing ties it to the one before, its place is only a guess"
         )
-        return _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
+        begun = _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
+        return place_waiting(begun, roles) if _started(begun) else begun
     last = slam.frames[-1]
     record = FramePose(frame.index, frame.timestamp, last.reference, last.relative, False, 0, found.evidence)
-    return replace(slam, frames=(*slam.frames, record), waiting=wait(slam, frame, features, MOST_WAITING))
+    return replace(slam, frames=(*slam.frames, record), waiting=waiting)
 
 
 def _needs_keyframe(slam: Slam, found: Track, settings: SlamSettings) -> bool:

@@ -1,7 +1,7 @@
 """What is known of one pose, or of the motion between two, as rows of the window's Gaussian prior.
 
-They are linearised where the prior is, or, at a pose it has said nothing about so far, at the current estimate, and stay
-there when keyframes leave, like any other information.
+They are linearised where the prior is, or, at a pose it has said nothing about so far, at the current estimate, and
+stay there when keyframes leave, like any other information.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Finding a lost camera again: the whole map is asked by appearance, and a place is believed on strict evidence only."""
+"""Finding a lost camera again: the map is asked by appearance, and a place is believed on strict evidence only."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def wait(slam: Slam, frame: Frame, features: Features, most: int) -> tuple[Waiti
 
 
 def place_waiting(slam: Slam, roles: Roles) -> Slam:
-    """Give the frames that waited while tracking was lost their poses, from the newest back, each by the motion since."""
+    """Give the frames that waited while tracking was lost their poses, from the newest back, each by the next one's."""
     placed: dict[int, FramePose] = {}
     pose, step = slam.last_pose, np.eye(4)
     keyframe = slam.keyframes[slam.frames[-1].reference]

@@ -20,8 +20,8 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 class FramePose:
     """Pose of one frame relative to a keyframe, so that it follows when the keyframe is adjusted.
 
-    relative: float64 [4, 4], reference camera -> this camera. tracked: False where no pose could be believed; `relative`
-    is then that of the last one. evidence: what speaks for the pose, and how well it is known.
+    relative: float64 [4, 4], reference camera -> this camera. tracked: False where no pose could be believed;
+    `relative` is then that of the last one. evidence: what speaks for the pose, and how well it is known.
     """
 
     frame: int

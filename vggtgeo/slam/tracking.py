@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.stats import chi2 as chi_square
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
@@ -22,8 +23,10 @@ PIXEL_SIGMA = 2.0
 SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
 """What no number of samples removes (calibration, rolling shutter, clocks): metres, radians, share of the motion. On
 pairs of the HoloLens clips 1 to 5 frames apart it brings the squared Mahalanobis distance to the truth down to 6."""
+AGREEMENT_GATE = float(chi_square.ppf(0.9999, 6))
+"""Of the squared Mahalanobis distance between the poses by points and by the picture, below which they are averaged."""
 LARGEST_DISAGREEMENT = 0.15
-"""Metres between the poses by points and by the picture; beyond, they are not averaged."""
+"""Metres between them, beyond which many points are believed rather than the picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,34 +134,28 @@ def _fused(
     expected: Expectation | None,
     intrinsics: np.ndarray,
 ) -> Track:
-    """One pose from points, picture and, weakly, the motion: the mean by information, in the tangent of the motion."""
+    """One pose from points, picture and, weakly, the motion: the mean by information, in the motion's tangent space."""
     back = rigid.invert(keyframe.pose)
-    by_points = guess.pose @ back
-    known = guess.result is GeometryResult.SUCCESS
-    information = np.zeros((6, 6))
-    if known:
-        inliers = guess.inliers
-        information = pose_information(guess.pose, points[inliers], intrinsics, PIXEL_SIGMA)
-    motion, agreement = by_points, float("nan")
     evidence = _seen(guess, len(matches))
+    by_points = None
+    if guess.result is GeometryResult.SUCCESS:
+        known = pose_information(guess.pose, points[guess.inliers], intrinsics, PIXEL_SIGMA)
+        by_points = _Motion(guess.pose @ back, known)
     if dense is not None:
-        off = tangent(by_points @ rigid.invert(dense.motion))
-        agreement = float(np.linalg.norm(off[:3])) if known else float("nan")
         evidence = _with_picture(evidence, dense)
-        if not known or (agreement < LARGEST_DISAGREEMENT and evidence.dense_fair):
-            both = information + dense.information
-            mean = np.linalg.solve(both + 1e-9 * np.eye(6), information @ off) if known else np.zeros(6)
-            motion, information = _moved(mean) @ dense.motion, both
-    total = information
+    found = _agreed(by_points, dense, evidence)
+    motion, information = found.motion, found.information
     if expected is not None:
-        # A direction that neither points nor surfaces see (along a bare wall) goes on as the motion did.
+        # A direction that is seen badly goes on as the motion did; what was measured does not gain by it.
         prior = step_information(expected.step) / (expected.waited + 1)
-        total = information + prior
         off = tangent(expected.pose @ back @ rigid.invert(motion))
-        motion = _moved(np.linalg.solve(total, prior @ off)) @ motion
-    total = _with_systematic(total, motion)
-    sigma_translation, sigma_rotation = worst_sigma(total)
+        motion = _moved(np.linalg.solve(information + prior, prior @ off)) @ motion
+    information = _with_systematic(information, motion)
+    sigma_translation, sigma_rotation = worst_sigma(information)
     pose = rigid.orthonormal(motion @ keyframe.pose)
+    agreement = float("nan")
+    if by_points is not None and dense is not None:
+        agreement = float(np.linalg.norm(by_points.motion[:3, 3] - dense.motion[:3, 3]))
     evidence = replace(
         evidence,
         sigma_translation=sigma_translation,
@@ -166,7 +163,34 @@ def _fused(
         chi2=float("nan") if expected is None else step_chi2(pose, expected.pose, expected.step, expected.waited),
         agreement=agreement,
     )
-    return Track(keyframe, pose, total, evidence, GeometryResult.SUCCESS)
+    return Track(keyframe, pose, information, evidence, GeometryResult.SUCCESS)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Keyframe camera -> frame camera, and its information over the left tangent."""
+
+    motion: np.ndarray
+    information: np.ndarray
+
+
+def _agreed(by_points: _Motion | None, dense: Aligned | None, evidence: Evidence) -> _Motion:
+    """The mean of both where they agree to within their noise, else the one with the better evidence."""
+    if dense is None:
+        assert by_points is not None
+        return by_points
+    by_picture = _Motion(dense.motion, dense.information)
+    if by_points is None:
+        return by_picture
+    off = tangent(by_points.motion @ rigid.invert(dense.motion))
+    noise = [np.linalg.inv(_with_systematic(one.information, one.motion)) for one in (by_points, by_picture)]
+    if off @ np.linalg.solve(noise[0] + noise[1], off) < AGREEMENT_GATE:
+        both = by_points.information + dense.information
+        mean = np.linalg.solve(both + 1e-9 * np.eye(6), by_points.information @ off)
+        return _Motion(_moved(mean) @ dense.motion, both)
+    # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
+    near = np.linalg.norm(off[:3]) < LARGEST_DISAGREEMENT or not evidence.points_strong
+    return by_picture if evidence.dense_fair and near else by_points
 
 
 def _seen(guess: PoseGuess, matches: int) -> Evidence:
