@@ -19,7 +19,7 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment, RgbdView
-from vggtgeo.slam.run import frame_trajectory, run_frames
+from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
@@ -185,3 +185,24 @@ def test_a_place_is_recognised(room: Room) -> None:
     places = [place_vector(matcher.describe(frames[i].image)) for i in (0, 1, 12, 20, 29)]
     similarity = [float(places[0] @ place) for place in places[1:]]
     assert int(np.argmax(similarity)) == 0, similarity
+
+
+def test_pieces_join_where_they_meet(room: Room) -> None:
+    """Two parts of a room, the second begun without knowing the first, become one map when the camera comes back.
+
+    Oracle: the renderer's poses, over both parts together.
+    """
+    sequence = simulate("room", 240, 0, SIZE, rate=10.0)
+    truth = sequence.ground_truth()
+    assert truth is not None
+    turned = [rigid.angle_between(rigid.invert(truth.poses[0]), rigid.invert(pose)) for pose in truth.poses]
+    away = next(i for i in range(20, 220) if turned[i] > np.deg2rad(80.0))
+    numbers = [*range(8), *range(away, 4, -2)]
+    frames = [replace(sequence.frame(i), index=k, timestamp=k / 10) for k, i in enumerate(numbers)]
+    slam = _run(frames, sequence.camera)
+    assert any("a new piece of map" in note for note in slam.notes), slam.notes
+    assert any("is joined to the one before" in note for note in slam.notes), slam.notes
+    assert len(slam.origins) == 1
+    slam = finish(slam, ROLES, replace(SETTINGS, global_adjustment=True, global_iterations=10))
+    times = np.arange(len(numbers)) / 10
+    assert _error(slam, Trajectory(times, truth.poses[numbers])) < 0.04

@@ -13,6 +13,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
+from vggtgeo.slam.pieces import join_pieces
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.prior_rows import add_tie, hold_pose
 from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, sight_of, view_of, wait
@@ -139,6 +140,8 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         slam = constrain_rotation(slam, settings)
     with clock.measure("adjust window"):
         slam = adjust(slam, settings)
+    with clock.measure("relocalise"):
+        slam = join_pieces(slam, sight, roles, settings)
     arrival = (found.keyframe.number, found.relative)
     evidence = found.evidence
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)

@@ -21,9 +21,11 @@ CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
 
 
-def relocalise(sight: Sight, candidates: Iterable[Keyframe], slam: Slam, roles: Roles) -> Track | None:
-    """The frame's pose by the most similar of `candidates`, where one is certain."""
-    for keyframe in most_similar(sight.features, tuple(candidates)):
+def relocalise(
+    sight: Sight, candidates: Iterable[Keyframe], slam: Slam, roles: Roles, most: int = CANDIDATES
+) -> Track | None:
+    """The frame's pose by the most similar of `candidates`, where one of the first `most` is certain."""
+    for keyframe in most_similar(sight.features, tuple(candidates))[:most]:
         found = track(sight, keyframe, view_of(keyframe, slam, roles), None, slam.intrinsics, roles)
         if found.evidence.certain:
             return found
