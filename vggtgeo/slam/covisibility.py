@@ -86,6 +86,12 @@ def match_keyframes(
     return Pair(first.number, second.number, points, lines)
 
 
+def without_matches(first: int, second: int) -> Pair:
+    """A pair of keyframes that is known to overlap though nothing was matched."""
+    none, nowhere, empty = np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
+    return Pair(first, second, PointMatches(none, none, nowhere, nowhere, empty), LineMatches(none, none, empty))
+
+
 def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Directed]:
     """Both directed edges of a pair. A target that was refined beyond a key point shifts its mirror image too."""
     points, lines = pair.points, pair.lines

@@ -16,6 +16,7 @@ from vggtgeo.slam.adjustment import build, write_back
 from vggtgeo.slam.covisibility import Directed, Pair, directions, overlap, some_points
 from vggtgeo.slam.depth_alignment import Surface, depth_prior
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.prior_rows import with_ties
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window import solve_jit, window_size
@@ -54,7 +55,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             given_intrinsics=slam.given_intrinsics,
             intrinsics_sigma=slam.intrinsics_sigma,
             fixed_pose=fixed,
-            marginal=_surface_prior(slam, surfaces, settings),
+            marginal=with_ties(_surface_prior(slam, surfaces, settings), slam),
         )
         solver = SchurLevenbergMarquardt(
             max_iterations=settings.global_iterations,

@@ -11,6 +11,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.covisibility import without_matches
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pieces import join_pieces
@@ -20,7 +21,7 @@ from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, si
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam, Tie
-from vggtgeo.slam.tracking import Expectation, Sight, Track, track
+from vggtgeo.slam.tracking import Expectation, Sight, Track, tie_between, track
 from vggtgeo.slam.window import adjust, enter
 
 LOST_PATIENCE = 10
@@ -123,7 +124,10 @@ def _rank(found: Track) -> tuple[bool, int]:
 def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
     """Hang a tracked frame on its keyframe, or make it one."""
     frame = sight.frame
-    if not _needs_keyframe(slam, found, settings):
+    if _needs_keyframe(found, settings):
+        with clock.measure("track"):
+            slam, found = _seen_before(slam, sight, found, roles, settings)
+    if not _needs_keyframe(found, settings):
         slam = _refer_to(slam, found.keyframe, roles)
         return replace(slam, frames=(*slam.frames, record_of(frame, found)))
     number = len(slam.keyframes)
@@ -137,6 +141,7 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         slam = replace(slam, ties=(*slam.ties, tie), reference=(number, sight.view))
         if tie.first in slam.window:
             slam = add_tie(slam, tie, settings)
+        slam = _with_pair(slam, tie)
         slam = constrain_rotation(slam, settings)
     with clock.measure("adjust window"):
         slam = adjust(slam, settings)
@@ -146,6 +151,13 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     evidence = found.evidence
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)
     return replace(slam, frames=(*slam.frames, record))
+
+
+def _with_pair(slam: Slam, tie: Tie) -> Slam:
+    """A pair for the tie, if without a match, so that the surfaces of both are compared in the last adjustment."""
+    if any(pair.key == (tie.first, tie.second) for pair in slam.pairs):
+        return slam
+    return replace(slam, pairs=(*slam.pairs, without_matches(tie.first, tie.second)))
 
 
 def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
@@ -196,7 +208,38 @@ def _missed(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: Slam
     return replace(slam, frames=(*slam.frames, record), waiting=waiting)
 
 
-def _needs_keyframe(slam: Slam, found: Track, settings: SlamSettings) -> bool:
+def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
+    """The frame by an old keyframe that stands where it does, if there is one: the map grows with space, not with time.
+
+    What the two keyframes know of each other by this frame ties them.
+    """
+    near = _nearest(slam, found, settings)
+    if near is None:
+        return slam, found
+    expected = Expectation(found.pose, slam.velocity)
+    again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
+    if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
+        return slam, found
+    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
+        return slam, again
+    return replace(slam, ties=(*slam.ties, tie_between(found, again))), again
+
+
+def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | None:
+    """Of all other keyframes the nearest that stands where the frame does."""
+    best, least = None, 1.0
+    for keyframe in slam.keyframes:
+        if keyframe.number == found.keyframe.number:
+            continue
+        distance = np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(found.pose)) / settings.keyframe_distance
+        if distance < least:
+            away = max(distance, rigid.angle_between(keyframe.pose, found.pose) / settings.keyframe_angle)
+            if away < least:
+                best, least = keyframe, float(away)
+    return best
+
+
+def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
     """Whether the frame sees what its keyframe, the nearest there is, does not."""
     distance = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(found.keyframe.pose))
     return bool(

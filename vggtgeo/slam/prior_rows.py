@@ -19,6 +19,8 @@ from vggtgeo.slam.evidence import tangent
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam, Tie
 
+TIE_SCALE = 12.6
+"""Squared Mahalanobis distance at which a tie counts half: the 95 % level of 6 degrees of freedom."""
 HOLD = 1e8
 """Information, 1/m^2 and 1/rad^2, that holds a pose: a tenth of a millimetre."""
 
@@ -74,3 +76,26 @@ def _with(
     points[: len(members)] = rigid.to_quaternion(members)
     new_root, new_offset = square_root(jnp.asarray(hessian), jnp.asarray(gradient))
     return MarginalPrior(new_root, new_offset, jaxlie.SE3(jnp.asarray(points)), prior.intrinsics)
+
+
+def with_ties(prior: MarginalPrior | None, slam: Slam) -> MarginalPrior | None:
+    """The prior of an adjustment of all keyframes, with every tie at the current poses; None where there is neither."""
+    if not slam.ties:
+        return prior
+    prior = no_prior(len(slam.keyframes)) if prior is None else prior
+    root, offset = np.asarray(prior.root), np.asarray(prior.offset)
+    hessian, gradient = root.T @ root, root.T @ offset
+    poses = np.array([keyframe.pose for keyframe in slam.keyframes])
+    for tie in slam.ties:
+        relative = poses[tie.second] @ rigid.invert(poses[tie.first])
+        rows = np.r_[6 * tie.first : 6 * tie.first + 6, 6 * tie.second : 6 * tie.second + 6]
+        jacobian = np.concatenate([-rigid.adjoint(relative), np.eye(6)], 1)
+        residual = tangent(relative @ rigid.invert(tie.motion))
+        # Cauchy's weight: a tie that everything else contradicts (a false loop) gives way.
+        information = tie.information / (1.0 + residual @ tie.information @ residual / TIE_SCALE)
+        hessian[np.ix_(rows, rows)] += jacobian.T @ information @ jacobian
+        gradient[rows] += jacobian.T @ information @ residual
+    new_root, new_offset = square_root(jnp.asarray(hessian), jnp.asarray(gradient))
+    return MarginalPrior(
+        new_root, new_offset, jaxlie.SE3(jnp.asarray(rigid.to_quaternion(poses))), jnp.asarray(slam.intrinsics)
+    )

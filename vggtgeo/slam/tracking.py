@@ -17,6 +17,7 @@ from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, tangent
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.rgbd_alignment import Aligned, RgbdView
 from vggtgeo.slam.settings import Roles
+from vggtgeo.slam.state import Tie
 
 PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
@@ -95,6 +96,15 @@ def track(
     if not known and dense is None:
         return Track(keyframe, guess.pose, np.zeros((6, 6)), _seen(guess, len(matches)), guess.result)
     return _fused(keyframe, guess, matches, points, dense, expected, intrinsics)
+
+
+def tie_between(first: Track, second: Track) -> Tie:
+    """What two tracks of one frame say of the motion between their keyframes."""
+    motion = rigid.invert(second.relative) @ first.relative
+    # Both errors are tangents at the frame; carried to the second keyframe by the adjoint of its motion.
+    carry = rigid.adjoint(rigid.invert(second.relative))
+    noise = np.linalg.inv(first.information) + np.linalg.inv(second.information)
+    return Tie(first.keyframe.number, second.keyframe.number, motion, np.linalg.inv(carry @ noise @ carry.T))
 
 
 def _by_points(
