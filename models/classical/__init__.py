@@ -6,7 +6,9 @@ from vggtgeo.models.classical.line_geometry import line_coefficients, sample_seg
 from vggtgeo.models.classical.line_matcher import BandLineMatcher
 from vggtgeo.models.classical.manhattan import ManhattanEstimator, ManhattanView, nearest_frame
 from vggtgeo.models.classical.orb import OrbMatcher
+from vggtgeo.models.classical.place import place_vector
 from vggtgeo.models.classical.pnp import ConstantVelocity, PnpGeometry
+from vggtgeo.models.classical.pose_refinement import pose_information
 from vggtgeo.models.classical.sift import SiftMatcher
 from vggtgeo.models.classical.structure_tensor import StructureTensor
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
@@ -30,6 +32,8 @@ __all__ = [
     "TwoViewStart",
     "line_coefficients",
     "nearest_frame",
+    "place_vector",
+    "pose_information",
     "sample_segments",
     "segment_depths",
 ]

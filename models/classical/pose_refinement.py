@@ -50,6 +50,16 @@ def residuals(
     return np.where(ahead[:, None], error, np.inf), local
 
 
+def pose_information(pose: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, sigma: float) -> np.ndarray:
+    """What matches know of a pose: `sum J^T J / sigma^2` over its left tangent, float64 [6, 6], translation first.
+
+    pose: [4, 4] world -> camera. points: [n, 3], the inliers. sigma: standard deviation of a match, pixels.
+    """
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    row_x, row_y = _pose_rows(local[local[:, 2] > 1e-3], intrinsics)
+    return (row_x @ row_x.T + row_y @ row_y.T) / sigma**2
+
+
 def _energy(
     pose: np.ndarray,
     points: np.ndarray,
@@ -72,18 +82,25 @@ def _gauss_newton_step(
     intrinsics: np.ndarray,
     delta: float,
 ) -> np.ndarray:
-    fx, fy = intrinsics[:2]
     error, local = residuals(pose, points, pixels, intrinsics)
     use = np.isfinite(error[:, 0])
-    error, (x, y, z), weights = error[use], local[use].T, weights[use]
+    error, weights = error[use], weights[use]
     weights = weights * np.minimum(1.0, delta / np.maximum(np.linalg.norm(error, axis=1), 1e-12))
-    zero, u, v = np.zeros_like(x), x / z, y / z
-    row_x = fx * np.stack([1 / z, zero, -u / z, -u * v, 1 + u * u, -v])
-    row_y = fy * np.stack([zero, 1 / z, -v / z, -1 - v * v, u * v, u])
+    row_x, row_y = _pose_rows(local[use], intrinsics)
     hessian = (row_x * weights) @ row_x.T + (row_y * weights) @ row_y.T
     gradient = row_x @ (weights * error[:, 0]) + row_y @ (weights * error[:, 1])
     hessian[np.diag_indices(6)] += 1e-9 * np.trace(hessian) + 1e-12
     return -np.linalg.solve(hessian, gradient)
+
+
+def _pose_rows(local: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of the pixel's x and y by the left tangent of the pose, float64 [6, n] each; local: camera frame."""
+    fx, fy = intrinsics[:2]
+    x, y, z = local.T
+    zero, u, v = np.zeros_like(x), x / z, y / z
+    row_x = fx * np.stack([1 / z, zero, -u / z, -u * v, 1 + u * u, -v])
+    row_y = fy * np.stack([zero, 1 / z, -v / z, -1 - v * v, u * v, u])
+    return row_x, row_y
 
 
 def _exponential(tangent: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ class SiftMatcher:
     """
 
     count: int = 1500
-    contrast: float = 0.015
+    contrast: float = 0.005
     ratio: float = 0.85
     radius: float = 60.0
     verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)

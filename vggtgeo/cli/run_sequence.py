@@ -68,7 +68,7 @@ def run_and_write(
     clock, began = Clock(), time.perf_counter()
     recorder = WindowRecorder()
     with clock.measure("compile"):
-        compiled = warm_up(settings)
+        compiled = warm_up(settings, roles.metric)
         for watcher in (recorder, *watchers):
             watcher.warm_up(*compiled)
     with collected_warnings() as said:

@@ -79,11 +79,17 @@ def match_keyframes(
     relative = second.pose @ rigid.invert(first.pose)
     points = roles.points.match(first.features, second.features, None)
     points = points.select(_consistent(points, first, relative, intrinsics, settings))
-    if len(points) <= settings.least_covisible:
-        return None
     view = RelativeView(relative, intrinsics, first.line_depths)
     lines = roles.line_matches.match(first.lines, second.lines, view)
+    if len(points) < settings.least_matches and len(lines) < settings.least_line_matches:
+        return None
     return Pair(first.number, second.number, points, lines)
+
+
+def without_matches(first: int, second: int) -> Pair:
+    """A pair of keyframes that is known to overlap though nothing was matched."""
+    none, nowhere, empty = np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
+    return Pair(first, second, PointMatches(none, none, nowhere, nowhere, empty), LineMatches(none, none, empty))
 
 
 def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Directed]:

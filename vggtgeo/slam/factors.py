@@ -14,6 +14,7 @@ from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment, q
 from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
+from vggtgeo.solvers.kernels import Cauchy
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,10 @@ class MeasuredRelativePose:
     def keyframes(self) -> tuple[int, ...]:
         return self.first, self.second
 
+
+TIE_WIDTH = 12.6**0.5
+"""Mahalanobis distance at which a measured motion counts half, so that one that all else contradicts (a false loop)
+gives way: the 95 % level of 6 degrees of freedom."""
 
 Factor = MeasuredRotation | MeasuredBaseline | MeasuredRelativePose
 
@@ -122,6 +127,7 @@ def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, in
         measured=jnp.asarray(rigid.to_quaternion(poses)),
         root=_roots([factor.information for factor in own], 6, room),
         weight=_present(own, room),
+        kernel=Cauchy(jnp.asarray(TIE_WIDTH)),
     )
 
 

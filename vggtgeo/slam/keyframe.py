@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.models.classical import sample_segments, segment_depths
+from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures
 from vggtgeo.slam.settings import Roles, SlamSettings
 
@@ -32,7 +32,8 @@ class Slots:
 @dataclass(frozen=True, eq=False)
 class Keyframe:
     """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; what the
-    roles measured; and the slots of its points and line samples (`sample_segment` int [m]: segment of each sample).
+    roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each sample); and
+    place, what it looks like as a whole, float32 [n] of unit length, None = not known.
 
     depth: float16 [H, W] metres, NaN = none (its rounding, 0.5 mm at 1 m, is below any sensor's noise);
     depth_confidence: uint8 [H, W], 255 is 1. A map lives as long as the run, so what it holds is small.
@@ -51,6 +52,7 @@ class Keyframe:
     points: Slots
     samples: Slots
     sample_segment: np.ndarray
+    place: np.ndarray | None = None
 
 
 def make_keyframe(
@@ -86,6 +88,7 @@ def make_keyframe(
         points=points,
         samples=_with_line_depth(samples, on_line),
         sample_segment=segment,
+        place=place_vector(features),
     )
 
 

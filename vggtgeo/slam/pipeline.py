@@ -11,17 +11,23 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.keyframe import make_keyframe
+from vggtgeo.slam.covisibility import without_matches
+from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
+from vggtgeo.slam.pieces import join_pieces
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, sight_of, view_of, wait
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.start import begin_again_with_depth, start_without_depth, without_depth
+from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking import Track, track_any
+from vggtgeo.slam.tracking import Expectation, Sight, Track, tie_between, track
 from vggtgeo.slam.window import adjust, enter
 
 LOST_PATIENCE = 10
-"""Frames that are only predicted before the map goes on from a new origin."""
+"""Frames that show something, but nothing of the map, before a new piece of map begins. Black frames do not count."""
+NEIGHBOURS = 3
+"""Keyframes before and after an old one that make up the window when the camera comes back to it."""
 
 
 def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
@@ -66,65 +72,176 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
         prior=None,
         solved=None,
         origins=(*slam.origins, number),
+        held=(),
         axes=(),
         frames=(*slam.frames, record),
         velocity=np.eye(4),
+        reference=None,
         lost=0,
     )
 
 
 def _follow(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
-    predicted = rigid.orthonormal(slam.velocity @ slam.last_pose)
-    recent = [slam.keyframes[number] for number in reversed(slam.window[-3:])]
     with clock.measure("track"):
-        found = track_any(
-            frame.image, features, recent, predicted, slam.intrinsics, roles, enough=settings.least_inliers
-        )
-    if not found.found:
-        return _missed(slam, frame, features, found, roles, settings)
-    pose = found.guess.pose
-    velocity = pose @ rigid.invert(slam.last_pose)
-    slam = replace(slam, velocity=velocity, lost=0)
-    if not _needs_keyframe(slam, found, settings):
-        return _record(slam, frame, pose, found)
+        sight = sight_of(frame, features, slam, roles)
+        found = _find(slam, sight, roles, settings)
+    if not found.accepted and slam.lost:
+        with clock.measure("relocalise"):
+            place = relocalise(sight, slam.keyframes, slam, roles)
+        if place is not None:
+            return _found_again(slam, sight, place, roles, settings, clock)
+    if not found.accepted:
+        return _missed(slam, sight, found, roles, settings)
+    was_lost = bool(slam.lost)
+    if was_lost:
+        slam = _noted_found(slam, frame)
+    velocity = np.eye(4) if was_lost else found.pose @ rigid.invert(slam.last_pose)
+    slam = _enter_frame(replace(slam, velocity=velocity, lost=0), sight, found, roles, settings, clock)
+    return place_waiting(slam, roles) if was_lost else slam
+
+
+def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Track:
+    """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
+    predicted = rigid.orthonormal(slam.velocity @ slam.last_pose)
+    expected = Expectation(predicted, slam.velocity, slam.lost)
+    first = slam.reference[0] if slam.reference is not None else slam.window[-1]
+    others = [number for number in reversed(slam.window) if number != first][:2]
+    window = [slam.keyframes[number] for number in (first, *others)]
+    best: Track | None = None
+    for keyframe in window:
+        found = track(sight, keyframe, view_of(keyframe, slam, roles), expected, slam.intrinsics, roles, window)
+        if best is None or _rank(found) > _rank(best):
+            best = found
+        if best.accepted and (best.evidence.inliers >= settings.least_inliers or best.evidence.dense_strong):
+            break
+    assert best is not None
+    return best
+
+
+def _rank(found: Track) -> tuple[bool, int]:
+    return found.accepted, found.evidence.inliers
+
+
+def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
+    """Hang a tracked frame on its keyframe, or make it one."""
+    frame = sight.frame
+    if _needs_keyframe(found, settings):
+        with clock.measure("track"):
+            slam, found = _seen_before(slam, sight, found, roles, settings)
+    if not _needs_keyframe(found, settings):
+        slam = _refer_to(slam, found.keyframe, roles)
+        return replace(slam, frames=(*slam.frames, record_of(frame, found)))
     number = len(slam.keyframes)
     with clock.measure("keyframe"):
-        keyframe = make_keyframe(number, frame, pose, features, roles, settings, slam.intrinsics)
+        keyframe = make_keyframe(number, frame, found.pose, sight.features, roles, settings, slam.intrinsics)
     with clock.measure("match keyframes"):
-        slam = constrain_rotation(enter(slam, keyframe, roles, settings), settings)
+        tie = MeasuredRelativePose(found.keyframe.number, number, found.relative, found.information)
+        if found.keyframe.number not in slam.window:
+            slam = _window_around(slam, found.keyframe.number, settings)
+        slam = enter(slam, keyframe, roles, settings)
+        slam = replace(slam, factors=(*slam.factors, tie), reference=(number, sight.view))
+        slam = _with_pair(slam, tie)
+        slam = constrain_rotation(slam, settings)
     with clock.measure("adjust window"):
         slam = adjust(slam, settings)
-    arrival = (found.keyframe.number, pose @ rigid.invert(found.keyframe.pose))
-    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, found.guess.inlier_count, arrival)
+    with clock.measure("relocalise"):
+        slam = join_pieces(slam, sight, roles, settings)
+    arrival = (found.keyframe.number, found.relative)
+    evidence = found.evidence
+    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)
     return replace(slam, frames=(*slam.frames, record))
 
 
-def _missed(slam: Slam, frame: Frame, features: Features, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
-    """Predict the pose; after too many such frames go on from a new origin."""
+def _with_pair(slam: Slam, tie: MeasuredRelativePose) -> Slam:
+    """A pair for the tie, if without a match, so that the surfaces of both are compared in the last adjustment."""
+    if any(pair.key == (tie.first, tie.second) for pair in slam.pairs):
+        return slam
+    return replace(slam, pairs=(*slam.pairs, without_matches(tie.first, tie.second)))
+
+
+def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
+    if slam.reference is not None and slam.reference[0] == keyframe.number:
+        return slam
+    return replace(slam, reference=(keyframe.number, view_of(keyframe, slam, roles)))
+
+
+def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
+    """A window of the keyframes around an old one, held where it is: the camera has come back to it."""
+    low = max(max((origin for origin in slam.origins if origin <= number), default=0), number - NEIGHBOURS)
+    window = tuple(range(low, min(number + NEIGHBOURS + 1, len(slam.keyframes))))[-(settings.window - 1) :]
+    return replace(slam, window=window, prior=None, solved=None, held=(number,))
+
+
+def _noted_found(slam: Slam, frame: Frame) -> Slam:
+    note = f"found again at frame {frame.index} ({frame.name}), {slam.lost} frames after tracking was lost"
+    return replace(slam, notes=(*slam.notes, note))
+
+
+def _found_again(slam: Slam, sight: Sight, place: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
+    """Go on in the map where the camera was found."""
+    frame = sight.frame
+    slam = replace(_noted_found(slam, frame), velocity=np.eye(4), lost=0)
+    slam = _enter_frame(slam, sight, place, roles, settings, clock)
+    return place_waiting(slam, roles)
+
+
+def _missed(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
+    """No pose; after too many such frames begin a piece of map of its own."""
+    frame, features = sight.frame, sight.features
     if slam.lost == 0:
-        note = f"tracking was lost at frame {frame.index} ({frame.name}): {found.guess.result.message}"
+        note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, notes=(*slam.notes, note), velocity=np.eye(4))
+    waiting = wait(slam, frame, features, MOST_WAITING)
     slam = replace(slam, lost=slam.lost + 1)
-    if slam.lost > LOST_PATIENCE and len(features) > settings.least_inliers:
-        note = f"the map goes on from a new origin at frame {frame.index} ({frame.name}); its place is only predicted"
-        return _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
-    reference = slam.frames[-1].reference
-    record = FramePose(frame.index, frame.timestamp, reference, slam.frames[-1].relative, False, 0)
-    return replace(slam, frames=(*slam.frames, record))
+    shown = sum(len(other.features) > settings.least_inliers for other in waiting)
+    if shown > LOST_PATIENCE and len(features) > settings.least_inliers:
+        note = (
+            f"a new piece of map begins at frame {frame.index} ({frame.name}): "
+            "nothing ties it to the one before, its place is only a guess"
+        )
+        begun = _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
+        return place_waiting(begun, roles) if _started(begun) else begun
+    last = slam.frames[-1]
+    record = FramePose(frame.index, frame.timestamp, last.reference, last.relative, False, 0, found.evidence)
+    return replace(slam, frames=(*slam.frames, record), waiting=waiting)
 
 
-def _record(slam: Slam, frame: Frame, pose: np.ndarray, found: Track) -> Slam:
-    relative = pose @ rigid.invert(found.keyframe.pose)
-    record = FramePose(frame.index, frame.timestamp, found.keyframe.number, relative, True, found.guess.inlier_count)
-    return replace(slam, frames=(*slam.frames, record))
+def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
+    """The frame by an old keyframe that stands where it does, if there is one: the map grows with space, not with time.
+
+    What the two keyframes know of each other by this frame ties them.
+    """
+    near = _nearest(slam, found, settings)
+    if near is None:
+        return slam, found
+    expected = Expectation(found.pose, slam.velocity)
+    again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
+    if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
+        return slam, found
+    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
+        return slam, again
+    return replace(slam, factors=(*slam.factors, tie_between(found, again))), again
 
 
-def _needs_keyframe(slam: Slam, found: Track, settings: SlamSettings) -> bool:
-    last = slam.keyframes[slam.window[-1]]
-    distance = np.linalg.norm(rigid.centre(found.guess.pose) - rigid.centre(last.pose))
+def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | None:
+    """Of all other keyframes the nearest that stands where the frame does."""
+    best, least = None, 1.0
+    for keyframe in slam.keyframes:
+        if keyframe.number == found.keyframe.number:
+            continue
+        distance = np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(found.pose)) / settings.keyframe_distance
+        if distance < least:
+            away = max(distance, rigid.angle_between(keyframe.pose, found.pose) / settings.keyframe_angle)
+            if away < least:
+                best, least = keyframe, float(away)
+    return best
+
+
+def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
+    """Whether the frame sees what its keyframe, the nearest there is, does not."""
+    distance = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(found.keyframe.pose))
     return bool(
         distance > settings.keyframe_distance
-        or rigid.angle_between(found.guess.pose, last.pose) > settings.keyframe_angle
-        or found.guess.inlier_count < settings.least_inliers
-        or found.keyframe.number != last.number
+        or rigid.angle_between(found.pose, found.keyframe.pose) > settings.keyframe_angle
+        or found.evidence.inliers < settings.least_inliers
     )

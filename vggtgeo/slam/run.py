@@ -112,10 +112,11 @@ def finish(
 
 
 def frame_trajectory(slam: Slam) -> Trajectory:
-    """Camera -> world of every frame.
+    """Camera -> world of every frame that has a pose.
 
-    A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and
-    the next is shared out over the frames in between, in proportion to time, so that the path has no steps.
+    A frame without one (lost, or before a start) is left out. A frame hangs on the keyframe it was tracked against.
+    What the adjustment then changed between that keyframe and the next is shared out over the frames in between, in
+    proportion to time, so that the path has no steps.
 
     Example:
         >>> import vggtgeo as vg
@@ -136,7 +137,8 @@ def frame_trajectory(slam: Slam) -> Trajectory:
         for k in between:
             poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
         last = row
-    return Trajectory(times, rigid.invert(poses))
+    tracked = np.array([record.tracked for record in slam.frames], bool)
+    return Trajectory(times[tracked], rigid.invert(poses[tracked]))
 
 
 def keyframe_trajectory(slam: Slam) -> Trajectory:

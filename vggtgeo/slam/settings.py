@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import jax.numpy as jnp
+import numpy as np
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.models.classical import (
@@ -18,6 +19,7 @@ from vggtgeo.models.classical import (
     StructureTensor,
 )
 from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector, LineMatcher, MetricDepth, PointMatcher
+from vggtgeo.slam.rgbd_alignment import RgbdAlignment
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 
@@ -39,6 +41,16 @@ class Roles:
     depth: MetricDepth = field(default_factory=SensorDepth)
     confidence: DenseConfidence = field(default_factory=StructureTensor)
     geometry: InitialGeometry = field(default_factory=PnpGeometry)
+    alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
+    """Aligns a frame's picture and depth to a keyframe's as a whole, beside its key points; None leaves that out."""
+
+    def tracking_depth(self, sensor_depth: np.ndarray | None) -> np.ndarray | None:
+        """What of a frame's own depth is used to track it; a network's depth costs too much for every frame."""
+        if sensor_depth is None or not isinstance(self.depth, SensorDepth):
+            return None
+        near, far = self.depth.nearest, self.depth.farthest
+        with np.errstate(invalid="ignore"):
+            return np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.nan)
 
     @property
     def metric(self) -> bool:
@@ -64,7 +76,12 @@ class SlamSettings:
     least_inliers: int = 50
     """A frame with fewer tracked inliers becomes a keyframe."""
     least_covisible: int = 50
-    """Keyframes with more matches than this are joined by an edge."""
+    """Keyframes that are far apart in time are joined by an edge if more matches than this agree."""
+    least_matches: int = 12
+    """Neighbouring keyframes are joined by an edge if so many matches agree with their tracked poses; fewer may do so
+    by chance."""
+    least_line_matches: int = 4
+    """The same of lines."""
     match_gate: float = 8.0
     """Largest reprojection error of a match between keyframes by the tracked poses, pixels."""
     epipolar_gate: float = 4.0
@@ -96,7 +113,7 @@ class SlamSettings:
     depth_trust: str = "own"
     """What scales the depth prior of a pixel. "own": the confidence of the depth itself; "saliency": the Omega that
     weights the matches, as in the paper's formula; "complement": 1 - Omega, as the paper's text describes it."""
-    known_intrinsics_sigma: float = 0.01
+    known_intrinsics_sigma: float = 1e-4
     """Standard deviation of the prior on known intrinsics, relative to the focal length."""
     guessed_intrinsics_sigma: float = 0.3
     """The same for guessed ones."""

@@ -10,8 +10,10 @@ from vggtgeo.bundle.problem import State
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.adjustment import Adjustment
 from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.factors import Factor
+from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.factors import Factor, MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.rgbd_alignment import RgbdView
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
@@ -20,7 +22,8 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 class FramePose:
     """Pose of one frame relative to a keyframe, so that it follows when the keyframe is adjusted.
 
-    relative: float64 [4, 4], reference camera -> this camera. tracked: False where the pose is only predicted.
+    relative: float64 [4, 4], reference camera -> this camera. tracked: False where no pose could be believed;
+    `relative` is then that of the last one. evidence: what speaks for the pose, and how well it is known.
     """
 
     frame: int
@@ -29,6 +32,7 @@ class FramePose:
     relative: np.ndarray
     tracked: bool
     inliers: int
+    evidence: Evidence = field(default_factory=Evidence)
     arrival: tuple[int, np.ndarray] | None = None
     """Of a frame that became a keyframe: the earlier keyframe it was tracked against, and its pose relative to that
     one as tracked, before any adjustment."""
@@ -36,12 +40,15 @@ class FramePose:
 
 @dataclass(frozen=True, eq=False)
 class Waiting:
-    """A frame seen before the first two views of an RGB sequence gave a map; it is placed as soon as there is one."""
+    """A frame without a pose so far: seen before there was a map, or while tracking was lost. It is placed as soon as
+    there is a map that it fits into.
+    """
 
     frame: int
     timestamp: float
     image: np.ndarray
     features: Features
+    depth: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +58,14 @@ class Slam:
     intrinsics: current fx, fy, cx, cy. given_intrinsics, intrinsics_sigma: mean and standard deviation of their prior,
     pixels. keyframes: all, by number. pairs: all matches between them. window: numbers of
     the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
-    factors: what is known about poses beyond matches.
+    factors: what is known about poses beyond matches: the tracked motion of each keyframe, which holds the map
+    together, measured rotations, the unit of a map without metric depth.
     solved: the last window problem and its solution. energies: `1/2 sum rho` of that window before its first and after
     each iteration; iterations: what else each did, where the settings ask for it. frames: every frame's pose.
-    velocity: last motion from frame to frame, camera -> camera. waiting: frames before the start of an RGB sequence.
-    lost: frames since tracking was lost.
+    velocity: last motion from frame to frame, camera -> camera. waiting: frames without a pose so far.
+    reference: number of the keyframe that frames are tracked against, and its view for the alignment. held: keyframes
+    that a window keeps where they are, besides origins. lost: frames since tracking
+    was lost. origins: the first keyframe of each piece of the map; pieces are tied to nothing else.
     metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
     world), as the first keyframes saw them. notes: what the user should know.
     """
@@ -78,12 +88,19 @@ class Slam:
     lost: int = 0
     origins: tuple[int, ...] = ()
     axes: tuple[np.ndarray, ...] = ()
+    reference: tuple[int, RgbdView | None] | None = None
+    held: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)
         doing = "lost" if self.lost else "waiting for parallax" if self.waiting else "tracking"
         return f"Slam({frames} frame{'s' * (frames != 1)}, {keyframes} keyframe{'s' * (keyframes != 1)}, {doing})"
+
+    @property
+    def ties(self) -> tuple[MeasuredRelativePose, ...]:
+        """The tracked motions between keyframes."""
+        return tuple(factor for factor in self.factors if isinstance(factor, MeasuredRelativePose))
 
     def pose(self, record: FramePose) -> np.ndarray:
         """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""

@@ -1,0 +1,150 @@
+"""What speaks for a tracked pose, and whether it is enough to believe it.
+
+A number of inliers alone is no evidence: with a mirrored picture 28 of 55 matches agreed on a step of 2.7 m. So three
+witnesses are heard, and a pose needs two of them, or one that is beyond doubt:
+
+- points: how many matches agree, of how many;
+- the picture and the surface: do brightness and depth of the keyframe, moved by the pose, look like those of the frame;
+- the motion: is the step one that the motion so far allows.
+
+The levels are measured on pairs of frames 1 to 5 apart of two HoloLens clips (230 right poses), on pairs of places that
+are far apart and on mirrored frames (138 wrong ones): right poses had a correlation above 0.44 at the 5th percentile,
+poses that alignment had carried elsewhere below 0.10; wrong ones never had both 30 inliers and half of the matches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2 as chi_square
+
+from vggtgeo.geometry import rigid
+
+NAN = float("nan")
+LEAST_INLIERS = 12
+STRONG_INLIERS = 30
+LEAST_SHARE, STRONG_SHARE = 0.4, 0.5
+LEAST_CORRELATION, STRONG_CORRELATION = 0.4, 0.6
+CONTRADICTION = 0.1
+LEAST_SURFACE = 0.85
+LEAST_OVERLAP = 0.2
+BARE_SURFACE, BARE_OVERLAP, BARE_SIGMA = 0.95, 0.5, 0.03
+"""Where the picture is empty, surfaces speak alone if so many agree and they determine all directions, metres."""
+LARGEST_SIGMA = 0.10
+"""Metres; a pose that is measured worse than this in any direction is none."""
+STEP_GATE = float(chi_square.ppf(0.9999, 6))
+"""Of the squared Mahalanobis distance to the prediction, 6 degrees of freedom."""
+STEP_FLOOR, STEP_GROWTH = (0.10, np.deg2rad(6.0)), 0.7
+"""Standard deviation of a prediction by constant velocity: metres, radians, and what the last step adds to each, as a
+share of it. On the HoloLens clips, the fastest at hand, 99 % of the steps are within 3 of these."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for the pose of one frame. NaN = was not measured.
+
+    matches, inliers: of key points with known depth. error: median reprojection error of the inliers, pixels.
+    correlation: in [-1, 1], of the brightness at edges, keyframe against frame. edges, surface: share in [0, 1] of
+    brightness samples and of surface points that agree. overlap: share of the keyframe's surface that the frame sees.
+    sigma_translation, sigma_rotation: standard deviation of the pose relative to the keyframe in its worst direction,
+    metres and radians, from the information matrix. chi2: squared Mahalanobis distance from the predicted pose, 6
+    degrees of freedom. agreement: distance between the poses by points and by surface, metres.
+    """
+
+    matches: int = 0
+    inliers: int = 0
+    error: float = NAN
+    correlation: float = NAN
+    edges: float = NAN
+    surface: float = NAN
+    overlap: float = NAN
+    sigma_translation: float = NAN
+    sigma_rotation: float = NAN
+    chi2: float = NAN
+    agreement: float = NAN
+
+    @property
+    def share(self) -> float:
+        """Inliers of the matches, in [0, 1]."""
+        return self.inliers / max(self.matches, 1)
+
+    @property
+    def plausible(self) -> bool:
+        """Whether the motion so far allows the step; true where there is no prediction."""
+        return not self.chi2 > STEP_GATE
+
+    @property
+    def points_fair(self) -> bool:
+        return self.inliers >= LEAST_INLIERS and self.share >= LEAST_SHARE
+
+    @property
+    def points_strong(self) -> bool:
+        return self.inliers >= STRONG_INLIERS and self.share >= STRONG_SHARE
+
+    @property
+    def dense_fair(self) -> bool:
+        """Whether picture and surface agree with the pose; a comparison with NaN is false."""
+        surface = not self.surface < LEAST_SURFACE
+        return self.correlation >= LEAST_CORRELATION and self.overlap >= LEAST_OVERLAP and surface
+
+    @property
+    def dense_strong(self) -> bool:
+        """The same beyond doubt: the picture itself, or a fair picture of the same surfaces."""
+        surfaces = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP
+        return self.dense_fair and (self.correlation >= STRONG_CORRELATION or surfaces)
+
+    @property
+    def bare_surface(self) -> bool:
+        """Whether, in a picture without edges, the surfaces alone determine the pose."""
+        seen = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP
+        return bool(np.isnan(self.correlation)) and seen and self.sigma_translation < BARE_SIGMA
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the pose is to be believed."""
+        if self.sigma_translation > LARGEST_SIGMA or self.correlation < CONTRADICTION:
+            return False
+        if not self.plausible:
+            return self.points_strong and self.dense_fair
+        fair = self.points_fair and not self.correlation < LEAST_CORRELATION
+        return self.points_strong or fair or self.dense_strong or self.bare_surface
+
+    @property
+    def certain(self) -> bool:
+        """Whether the pose is to be believed without any prediction, among all places of the map."""
+        known_place = self.inliers >= STRONG_INLIERS and self.share >= 0.6
+        return self.sigma_translation <= LARGEST_SIGMA and known_place and not self.correlation < LEAST_CORRELATION
+
+
+def step_chi2(pose: np.ndarray, predicted: np.ndarray, step: np.ndarray, waited: int = 0) -> float:
+    """Squared Mahalanobis distance of `pose` from a prediction by constant velocity, 6 degrees of freedom.
+
+    pose, predicted: float64 [4, 4], world -> camera. step: the last motion, camera -> camera. waited: frames since the
+    prediction was last confirmed; each adds a step's variance.
+    """
+    off = tangent(pose @ rigid.invert(predicted))
+    last = tangent(step)
+    sigma = [floor + STEP_GROWTH * np.linalg.norm(last[i : i + 3]) for floor, i in zip(STEP_FLOOR, (0, 3), strict=True)]
+    return float(sum((np.linalg.norm(off[i : i + 3]) / s) ** 2 for s, i in zip(sigma, (0, 3), strict=True))) / (
+        waited + 1
+    )
+
+
+def step_information(step: np.ndarray) -> np.ndarray:
+    """Information float64 [6, 6] of a prediction by constant velocity."""
+    last = tangent(step)
+    sigma = [floor + STEP_GROWTH * np.linalg.norm(last[i : i + 3]) for floor, i in zip(STEP_FLOOR, (0, 3), strict=True)]
+    return np.diag(1.0 / np.repeat(sigma, 3) ** 2)
+
+
+def tangent(motion: np.ndarray) -> np.ndarray:
+    """Translation and rotation vector of a rigid motion, float64 [6]: to first order its logarithm."""
+    return np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_rotvec()])
+
+
+def worst_sigma(information: np.ndarray) -> tuple[float, float]:
+    """Standard deviation in the worst direction of translation and of rotation, of information float64 [6, 6]."""
+    covariance = np.linalg.inv(information + 1e-9 * np.eye(6))
+    return tuple(float(np.sqrt(np.linalg.eigvalsh(covariance[i : i + 3, i : i + 3])[-1])) for i in (0, 3))  # type: ignore[return-value]
