@@ -25,6 +25,8 @@ STILL = 0.7
 MOVING = 3.0
 LEAST = 6
 """Corners in a group."""
+LEAST_MOVING = 0.3
+"""Share of the corners that must move: less is a person who walks past a camera that stands."""
 MOST_FOLLOWING = 0.1
 """Share of the steps with both groups in which the poses may follow the still one."""
 RIVAL = 0.4
@@ -47,8 +49,8 @@ def divide(step: Step, seed: int = 0) -> Parts:
     """Sort the corners of a step by what they do."""
     flow, agrees = step.flow, step.agrees
     still, moving = flow < STILL, flow > MOVING
-    both = np.count_nonzero(still) >= LEAST and np.count_nonzero(moving) >= LEAST
-    follows = both and bool(agrees[still].mean() > 0.7 and agrees[moving].mean() < 0.5)
+    both = bool(np.count_nonzero(still) >= LEAST and np.count_nonzero(moving) >= LEAST)
+    follows = both and bool(moving.mean() > LEAST_MOVING and agrees[still].mean() > 0.7 and agrees[moving].mean() < 0.5)
     return Parts(both, follows, _rival(step, seed))
 
 
