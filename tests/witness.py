@@ -59,7 +59,8 @@ def walk(count: int = 40, seed: int = 0, noise: float = 0.3, lens: Lens | None =
         pixel, z = seen[ids].astype(np.float32), depth.astype(np.float32)
         evidence.append(FrameEvidence(row, float(times[row]), ids.astype(np.int32), pixel, z, median, 1.0, 50.0))
     frames, sure = np.arange(count), np.ones(count, bool)
-    return Walk(Estimate(frames, times, poses, sure, K.copy(), K.copy(), np.full(4, 5.0), True), evidence)
+    seen = np.array([len(frame.ids) for frame in evidence]), frames % 3 == 0
+    return Walk(Estimate(frames, times, poses, sure, K.copy(), K.copy(), np.full(4, 5.0), True, *seen), evidence)
 
 
 def with_depth(evidence: list[FrameEvidence], change: Callable[[FrameEvidence], np.ndarray]) -> list[FrameEvidence]:

@@ -25,7 +25,9 @@ LEAST = 30
 """Corners in a run below which nothing is said."""
 MOST_OFF = 0.25
 """Share of triangulated corners that may be off."""
+HEALTHY_OFF = 0.15
 MOST_SURFACES_OFF = 0.10
+HEALTHY_SURFACES_OFF = 0.04
 MOST_SCALE = 0.08
 """Largest median of `x`. The poses of a metric run come from the same depth, so that a sane run has 0.00 to 0.02."""
 MOST_SPREAD = 0.10
@@ -62,6 +64,13 @@ def depth_ratios(estimate: Estimate, evidence: Evidence) -> DepthRatios:
             carried_rows.append(np.full(len(y), row))
     join = np.concatenate
     return DepthRatios(join(rows), join(seen), join(carried_rows), join(carried))
+
+
+def agree(ratios: DepthRatios) -> bool:
+    """Whether depth and motion agree as well as on undisturbed clips, from enough corners to say so."""
+    x, y = ratios.triangulated, ratios.carried
+    enough = min(len(x), len(y)) >= LEAST
+    return enough and bool(np.mean(np.abs(x) > MUCH) < HEALTHY_OFF and np.mean(np.abs(y) > MUCH) < HEALTHY_SURFACES_OFF)
 
 
 def check_depth(estimate: Estimate, ratios: DepthRatios) -> list[Finding]:

@@ -26,8 +26,12 @@ PLAUSIBLE = (0.5, 6.5)
 """Metres, of the median over all frames of their median depth."""
 
 
-def check_frozen(evidence: Evidence) -> list[Finding]:
-    """Depth images that are repeated while the picture moves."""
+def check_frozen(evidence: Evidence, harmless: bool) -> list[Finding]:
+    """Depth images that are repeated while the picture moves.
+
+    harmless: whether depth and motion agree all the same, as they do where the camera hardly moves: then it marks the
+    segment only.
+    """
     moved = np.array([0.0, *(_flow(a, b) for a, b in pairwise(evidence))])
     with np.errstate(invalid="ignore"):
         frozen = (np.array([frame.depth_changed for frame in evidence]) < LEAST_CHANGED) & (moved > MOVED)
@@ -37,7 +41,7 @@ def check_frozen(evidence: Evidence) -> list[Finding]:
     for first, last in spans(frozen, join=3):
         start, end = evidence[max(first - 1, 0)].frame, evidence[last].frame
         text = f"frames {start} to {end}: the depth image stays the same while the picture moves"
-        found.append(Finding("frozen depth", "degraded", text, start, end, scale=True))
+        found.append(Finding("frozen depth", "degraded", text, start, end, scale=not harmless, local=harmless))
     return found
 
 

@@ -21,7 +21,8 @@ class Estimate:
 
     frames: int [n]; times: float64 [n], s; poses: float64 [n, 4, 4], world -> camera; tracked: bool [n].
     intrinsics: fx, fy, cx, cy at the end; given: before the run; sigma: of their prior, pixels. metric: lengths are
-    metres. origins: how many parts the map has. started: whether there ever was a map.
+    metres. inliers: int [n], matches that agreed with the pose; is_keyframe: bool [n]. origins: how many parts the map
+    has. started: whether there ever was a map.
     """
 
     frames: np.ndarray
@@ -32,6 +33,8 @@ class Estimate:
     given: np.ndarray
     sigma: np.ndarray
     metric: bool
+    inliers: np.ndarray
+    is_keyframe: np.ndarray
     origins: int = 1
     started: bool = True
 
@@ -49,6 +52,8 @@ class Estimate:
             np.asarray(slam.given_intrinsics, np.float64),
             np.asarray(slam.intrinsics_sigma, np.float64),
             slam.metric,
+            np.array([record.inliers for record in slam.frames], int),
+            np.isin([record.frame for record in slam.frames], [keyframe.frame for keyframe in slam.keyframes]),
             len(slam.origins),
             known,
         )

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.slam.trust.finding import Finding
 
-MOST_LEFT_OUT = 0.08
+MOST_LEFT_OUT = 0.10
 """Share of the frames; as many as may be lost while the result is called good."""
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
-from vggtgeo.slam.trust.depth_agreement import check_depth, depth_ratios
+from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence
@@ -41,11 +41,12 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
     wrong = breaks(estimate, evidence, taken)
     yield from check_steps(estimate, taken, wrong)
     yield from check_parts(estimate, [divide(step) for step in taken])
-    yield from check_depth(estimate, depth_ratios(estimate, evidence))
-    yield from check_frozen(evidence)
+    ratios = depth_ratios(estimate, evidence)
+    yield from check_depth(estimate, ratios)
+    yield from check_frozen(evidence, harmless=agree(ratios))
     yield from check_range(estimate, evidence)
     sound = np.ones(len(estimate), bool)
     for part in wrong:
         sound[part.first : part.last + 2] = False
     yield from check_scale(estimate, hand_overs(estimate, evidence, sound))
-    yield from check_camera(estimate, camera_opinion(estimate, evidence, estimate.given), size)
+    yield from check_camera(estimate, camera_opinion(estimate, evidence), size)

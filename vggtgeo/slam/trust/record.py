@@ -16,7 +16,7 @@ ACCELERATION = 1.0
 """m/s^2."""
 MOST_BRIDGED = 0.04
 """Metres, RMS over all frames, that bridges may cost."""
-MOST_LOST = 0.08
+MOST_LOST = 0.10
 LEAST_TRACKED = 0.5
 """Share of frames below which the run is not to be used."""
 

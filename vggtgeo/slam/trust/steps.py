@@ -31,8 +31,8 @@ FAR = 1e-5
 HEALTHY = 0.6
 LEVEL = 1e-3
 LEAST_CORNERS = 8
-MOST_TRANSIENT = 0.05
-"""Share of frames that may have a wrong pose where those before and after agree: it moves the ATE by little."""
+MOST_DISPLACED = 0.10
+"""Share of frames that may be displaced: by 12 cm, say, they move the ATE by 4."""
 MOST_WRONG = 0.5
 """Share of contradicted steps beyond which nothing of the run can be used."""
 
@@ -92,14 +92,15 @@ def steps(estimate: Estimate, evidence: Evidence) -> list[Step]:
 class Break:
     """Steps `first` to `last` (rows of their first frames) that the images contradict.
 
-    agreeing: their median share of corners that agree. lasting: whether the frame before and the frame after disagree,
-    too, so that all that follows is displaced; else some frames in between have wrong poses, and nothing else.
+    agreeing: their median share of corners that agree. displaced: first and last row of the frames whose poses are
+    wrong. Where frames before and after agree with each other, these are the ones in between; else all that comes
+    after is displaced against all that came before, and the smaller part counts.
     """
 
     first: int
     last: int
     agreeing: float
-    lasting: bool
+    displaced: tuple[int, int]
 
 
 def breaks(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> list[Break]:
@@ -109,8 +110,14 @@ def breaks(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> list[Br
     found = []
     for first, last in spans(wrong, join=2):
         agreeing = float(np.median([step.agrees.mean() for step in taken[first : last + 1] if len(step.agrees)]))
-        found.append(Break(first, last, agreeing, not _bridged(estimate, evidence, first, last + 1)))
+        found.append(Break(first, last, agreeing, _displaced(estimate, evidence, first, last)))
     return found
+
+
+def _displaced(estimate: Estimate, evidence: Evidence, first: int, last: int) -> tuple[int, int]:
+    if _bridged(estimate, evidence, first, last + 1):
+        return min(first + 1, last), last
+    return (0, last) if last < len(evidence) - first - 1 else (first + 1, len(evidence) - 1)
 
 
 def _bridged(estimate: Estimate, evidence: Evidence, before: int, after: int) -> bool:
@@ -121,11 +128,13 @@ def _bridged(estimate: Estimate, evidence: Evidence, before: int, after: int) ->
 
 
 def check_steps(estimate: Estimate, taken: list[Step], found: list[Break]) -> list[Finding]:
-    """Breaks that displace what follows, and too many frames with wrong poses."""
+    """Where the images contradict the poses, and what of the run that displaces."""
     told = []
-    wrong = sum(part.last - part.first for part in found if not part.lasting)
+    off = np.zeros(len(estimate), bool)
     for part in found:
-        local = not part.lasting and wrong <= MOST_TRANSIENT * len(taken)
+        off[part.displaced[0] : part.displaced[1] + 1] = True
+    local = bool(off.mean() <= MOST_DISPLACED)
+    for part in found:
         start, end = int(estimate.frames[part.first]), int(estimate.frames[part.last + 1])
         text = (
             f"frames {start} to {end}: the images contradict the poses ({100 * part.agreeing:.0f} % of the followed "
