@@ -66,7 +66,7 @@ def _all(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:
     )
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_healthy_walk_is_told_nothing(seed: int) -> None:
     """No check fires on true poses with noise, with depth or without; oracle: the truth, over seeds."""
     here = walk(seed=seed)
@@ -215,7 +215,8 @@ def test_distortion_that_was_not_told_is_named() -> None:
 
     def lens(pixels: np.ndarray) -> np.ndarray:
         x = (pixels - K[2:]) / K[:2]
-        return (x * (1 - 0.2 * (x**2).sum(1, keepdims=True))) * K[:2] + K[2:]
+        square = (x**2).sum(1, keepdims=True)
+        return np.where(square < 1.2, x * (1 - 0.2 * square), np.nan) * K[:2] + K[2:]  # beyond, it folds back
 
     here = walk(lens=lens)
     opinion = camera_opinion(here.estimate, here.evidence)

@@ -33,7 +33,7 @@ LEAST_PAIRS = 8
 LEAST_CORNERS = 15
 BLOCK = 5
 """Frames in a block of time."""
-ITERATIONS = 4
+ITERATIONS = 6
 HUBER = 1.0
 FARTHEST = 30.0
 """Pixels: residuals beyond are none of this camera's."""
@@ -127,7 +127,7 @@ class _Pair:
 
 def _pairs(estimate: Estimate, evidence: Evidence) -> list[_Pair]:
     starts = np.unique(np.linspace(0, max(len(evidence) - GAP - 1, 0), MOST_PAIRS).astype(int))
-    starts = starts[starts + GAP < len(evidence)]
+    starts = [int(row) for row in starts if row + GAP < len(evidence)]
     pairs = [(row, row + GAP) for row in starts] + [(row + GAP, row) for row in starts]
     found = []
     for row, other in pairs:
