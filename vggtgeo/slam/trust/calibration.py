@@ -150,8 +150,10 @@ def _predict(
 ) -> np.ndarray:
     focal = intrinsics[:2] * np.exp(value[0])
     centre = intrinsics[2:] + value[1:3]
-    x = (before - centre) / focal
-    x = x / (1 + value[3] * (x**2).sum(1, keepdims=True))
+    bent = (before - centre) / focal
+    x = bent
+    for _ in range(4):  # the inverse of the lens by fixed-point iteration, as OpenCV does it
+        x = bent / (1 + value[3] * (x**2).sum(1, keepdims=True))
     points = np.column_stack([x, np.ones(len(x))]) * depth[:, None] @ pose[:3, :3].T + pose[:3, 3]
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
     y = points[:, :2] / z[:, None]
