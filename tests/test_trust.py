@@ -15,6 +15,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.results import Result
+from vggtgeo.slam.trust.blind import check_blind
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
 from vggtgeo.slam.trust.depth_agreement import check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
@@ -102,6 +103,21 @@ def test_one_wrong_pose_marks_its_frame_and_not_the_run(healthy: Walk) -> None:
     ]
     poses[5:35:6, :3, 3] += 0.3
     assert any(not f.local for f in _steps(healthy.with_poses(poses), healthy.evidence))
+
+
+def test_steps_that_nobody_saw_are_told(healthy: Walk) -> None:
+    """No corner lives across frame 20, and its pose has 12 inliers: told; with 100 inliers it is not."""
+    cut = [replace(f, ids=f.ids + (10_000 if f.frame >= 20 else 0)) for f in healthy.evidence]
+    few = np.where(np.arange(40) == 20, 12, 100)
+
+    def found(inliers: np.ndarray) -> list[Finding]:
+        estimate = replace(healthy.estimate, inliers=inliers)
+        return check_blind(estimate, cut, steps(estimate, cut))
+
+    assert [(f.start, f.end, f.local) for f in found(few)] == [(19, 20, False)]
+    assert found(np.full(40, 100)) == []
+    estimate = replace(healthy.estimate, inliers=few)
+    assert check_blind(estimate, healthy.evidence, steps(estimate, healthy.evidence)) == []
 
 
 def test_poses_that_mean_nothing_fail(healthy: Walk) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.blind import check_blind
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
 from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
@@ -40,6 +41,7 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
     taken = steps(estimate, evidence)
     wrong = breaks(estimate, evidence, taken)
     yield from check_steps(estimate, taken, wrong)
+    yield from check_blind(estimate, evidence, taken)
     yield from check_parts(estimate, [divide(step) for step in taken])
     ratios = depth_ratios(estimate, evidence)
     yield from check_depth(estimate, ratios)
