@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.bundle.terms.baseline import BaselinePrior
@@ -72,7 +73,11 @@ def factor_terms(
 
     places: row of each keyframe in the problem, by its number. Of more factors than there is room for, the last stay.
     """
-    makers = {MeasuredRotation: _rotations, MeasuredBaseline: _baselines, MeasuredRelativePose: _relative_poses}
+    makers: dict[type, Callable[..., AbstractTerm]] = {
+        MeasuredRotation: _rotations,
+        MeasuredBaseline: _baselines,
+        MeasuredRelativePose: _relative_poses,
+    }
     inside = [factor for factor in factors if all(number in places for number in factor.keyframes)]
     terms = []
     for kind, room in capacity.items():
@@ -91,7 +96,13 @@ def surface_term(
     measured, root = quadratic(at, jnp.asarray(hessians), jnp.asarray(gradients))
     first, second = np.asarray(pairs, int).reshape(-1, 2).T
     aligned = np.any(hessians != 0, (1, 2)).astype(np.float64)
-    return SurfaceAlignment(first=first, second=second, measured=measured, root=root, weight=aligned)
+    return SurfaceAlignment(
+        first=jnp.asarray(first, jnp.int32),
+        second=jnp.asarray(second, jnp.int32),
+        measured=measured,
+        root=root,
+        weight=jnp.asarray(aligned),
+    )
 
 
 def _rotations(own: Sequence[MeasuredRotation], places: Mapping[int, int], room: int) -> RotationPrior:
@@ -131,15 +142,15 @@ def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, in
     )
 
 
-def _padded(rows: list[int], room: int) -> np.ndarray:
-    return np.array([*rows, *[0] * (room - len(rows))], int)
+def _padded(rows: list[int], room: int) -> Array:
+    return jnp.asarray([*rows, *[0] * (room - len(rows))], jnp.int32)
 
 
-def _present(own: Sequence[Factor], room: int) -> jnp.ndarray:
+def _present(own: Sequence[Factor], room: int) -> Array:
     return jnp.asarray((np.arange(room) < len(own)).astype(np.float64))
 
 
-def _roots(information: Sequence[np.ndarray], size: int, room: int) -> jnp.ndarray:
+def _roots(information: Sequence[np.ndarray], size: int, room: int) -> Array:
     """Square roots `R' R` of information matrices, which may be singular."""
     whole = np.zeros((room, size, size))
     if len(information):

@@ -231,9 +231,10 @@ def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | Non
             continue
         distance = np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(found.pose)) / settings.keyframe_distance
         if distance < least:
-            away = max(distance, rigid.angle_between(keyframe.pose, found.pose) / settings.keyframe_angle)
+            turned = rigid.angle_between(keyframe.pose, found.pose) / settings.keyframe_angle
+            away = max(float(distance), float(turned))
             if away < least:
-                best, least = keyframe, float(away)
+                best, least = keyframe, away
     return best
 
 
