@@ -45,6 +45,8 @@ CAMERA_STEPS = (1e-5, 1e-2, 1e-2, 1e-5)
 """Of the numerical derivatives."""
 SIGMAS = 5.0
 """How sure a deviation must be to be told."""
+MOST_MOVED = 5.0
+"""Standard deviations of its prior that a run may move the camera (healthy ones: at most 3.8) to count as settled."""
 MOST_FOCAL = 0.08
 """Relative."""
 MOST_SHIFT = 0.05
@@ -89,23 +91,25 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
     """Deviations of the camera that the run ends with that are sure and large; size: width and height, pixels.
 
     opinion: found with the intrinsics at the end of the run. Those of a run that has moved from a wrong calibration to
-    where the images want them are no fault.
+    where the images want them are no fault; but whoever was that far off must have settled better than others.
     """
     if opinion is None or not estimate.calibrated:
         return []
     found = []
     focal, x, y, radial = (float(value) for value in opinion.value)
-    sure = np.abs(opinion.value) > SIGMAS * opinion.sigma
-    if sure[0] and abs(focal) > MOST_FOCAL:
+    moved = bool(np.any(np.abs(estimate.intrinsics - estimate.given) > MOST_MOVED * estimate.sigma))
+    sure = np.abs(opinion.value) > (0.8 if moved else 1.0) * SIGMAS * opinion.sigma
+    much = 0.5 if moved else 1.0
+    if sure[0] and abs(focal) > much * MOST_FOCAL:
         wanted = float(np.exp(focal) * estimate.intrinsics[0])
         text = f"the images want a focal length of {wanted:.0f} px; the run has {estimate.intrinsics[0]:.0f}"
         found.append(Finding("calibration", "degraded", text))
-    if (sure[1] and abs(x) > MOST_SHIFT * size[0]) or (sure[2] and abs(y) > MOST_SHIFT * size[0]):
+    if (sure[1] and abs(x) > much * MOST_SHIFT * size[0]) or (sure[2] and abs(y) > much * MOST_SHIFT * size[0]):
         text = f"the images want the principal point {x:.0f}, {y:.0f} px beside where it is taken to be"
         found.append(Finding("calibration", "degraded", text))
     diagonal, focal_length = float(np.hypot(*size)), float(estimate.intrinsics[0])
     warp = abs(radial) * (diagonal / 2 / focal_length) ** 3 * focal_length
-    if sure[3] and warp > MOST_WARP * diagonal:
+    if sure[3] and warp > much * MOST_WARP * diagonal:
         text = (
             f"the images are distorted (k1 about {radial:.2f}, {warp:.0f} px in the corners), and the calibration does "
             "not say so"
@@ -126,8 +130,8 @@ class _Pair:
 
 
 def _pairs(estimate: Estimate, evidence: Evidence) -> list[_Pair]:
-    starts = np.unique(np.linspace(0, max(len(evidence) - GAP - 1, 0), MOST_PAIRS).astype(int))
-    starts = [int(row) for row in starts if row + GAP < len(evidence)]
+    spread = np.unique(np.linspace(0, max(len(evidence) - GAP - 1, 0), MOST_PAIRS).astype(int))
+    starts = [int(row) for row in spread if row + GAP < len(evidence)]
     pairs = [(row, row + GAP) for row in starts] + [(row + GAP, row) for row in starts]
     found = []
     for row, other in pairs:
