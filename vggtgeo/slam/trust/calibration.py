@@ -31,6 +31,8 @@ GAP = 2
 MOST_PAIRS = 60
 LEAST_PAIRS = 8
 LEAST_CORNERS = 15
+LEAST_FLOW = 3.0
+"""Pixels: a camera that stands still says nothing of its lens."""
 BLOCK = 5
 """Frames in a block of time."""
 ITERATIONS = 6
@@ -109,7 +111,7 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
         found.append(Finding("calibration", "degraded", text))
     diagonal, focal_length = float(np.hypot(*size)), float(estimate.intrinsics[0])
     warp = abs(radial) * (diagonal / 2 / focal_length) ** 3 * focal_length
-    if sure[3] and warp > much * MOST_WARP * diagonal:
+    if sure[3] and warp > MOST_WARP * diagonal:
         text = (
             f"the images are distorted (k1 about {radial:.2f}, {warp:.0f} px in the corners), and the calibration does "
             "not say so"
@@ -143,8 +145,10 @@ def _pairs(estimate: Estimate, evidence: Evidence) -> list[_Pair]:
         known = np.isfinite(depth) & (depth > 0)
         if np.count_nonzero(known) < LEAST_CORNERS:
             continue
-        relative = estimate.poses[other] @ rigid.invert(estimate.poses[row])
         before, after = (pixels[known].astype(np.float64) for pixels in (first.pixels[rows], second.pixels[others]))
+        if np.median(np.linalg.norm(after - before, axis=1)) < LEAST_FLOW:
+            continue
+        relative = estimate.poses[other] @ rigid.invert(estimate.poses[row])
         found.append(_Pair(before, after, depth[known], relative, min(row, other) // BLOCK))
     return found
 
