@@ -22,7 +22,7 @@ from vggtgeo.report import map_view, write_page
 from vggtgeo.slam.outputs import write_summary
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.finding import Verdict
+from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
@@ -118,6 +118,20 @@ def test_the_page_is_whole_and_needs_nothing_else(run: RecordedRun, tmp_path: Pa
     assert "simulated, and so is every number" in text
     assert f"{FRAMES} / {FRAMES}" in text
     assert len(re.findall(r"data:image/jpeg", text)) == 2 + 3 * min(4, len(run.slam.keyframes))
+
+
+def test_the_verdict_is_the_first_thing_on_the_page(run: RecordedRun, tmp_path: Path) -> None:
+    """Level, reasons and segments stand before the title; a doubtful unit gives no length in metres."""
+    found = [
+        Finding("steps", "degraded", "frames 2 to 3: torn", 2, 3),
+        Finding("depth range", "degraded", "<unit>", scale=True),
+    ]
+    verdict = conclude(found, [record.frame for record in run.slam.frames], [0.1 * k for k in range(FRAMES)], True)
+    text = _page(run, tmp_path, verdict=verdict)
+    for words in ("Degraded: something", "frames 2 to 3: torn", "&lt;unit&gt;", 'title="frames 2 to 3'):
+        assert 0 < text.index(words) < text.index("<h1>"), words
+    assert "length of the path" not in text
+    assert "length of the path" in _page(run, tmp_path)
 
 
 def test_the_page_without_depth_and_without_windows(run: RecordedRun, tmp_path: Path) -> None:

@@ -78,6 +78,8 @@ if TYPE_CHECKING:
     from vggtgeo.slam.run import run as run
     from vggtgeo.slam.settings import Roles as Roles
     from vggtgeo.slam.settings import SlamSettings as SlamSettings
+    from vggtgeo.slam.trust.evidence import EvidenceRecorder as EvidenceRecorder
+    from vggtgeo.slam.trust.finding import Verdict as Verdict
     from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
     from vggtgeo.solvers.kernels import AbstractKernel as AbstractKernel
     from vggtgeo.solvers.kernels import Barron as Barron
@@ -120,6 +122,8 @@ _HOME = {
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
     "slam.run": ("finish", "frame_trajectory", "run"),
     "slam.settings": ("Roles", "SlamSettings"),
+    "slam.trust.evidence": ("EvidenceRecorder",),
+    "slam.trust.finding": ("Verdict",),
     "bundle.solution": ("Solution", "solve"),
     "bundle.solver_choice": ("choose_reduced_solver",),
     "solvers.adjoint": ("ArrowAdjoint",),

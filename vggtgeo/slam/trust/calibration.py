@@ -31,6 +31,8 @@ GAP = 2
 MOST_PAIRS = 60
 LEAST_PAIRS = 8
 LEAST_CORNERS = 15
+LEAST_FLOW = 3.0
+"""Pixels: a camera that stands still says nothing of its lens."""
 BLOCK = 5
 """Frames in a block of time."""
 ITERATIONS = 6
@@ -45,6 +47,8 @@ CAMERA_STEPS = (1e-5, 1e-2, 1e-2, 1e-5)
 """Of the numerical derivatives."""
 SIGMAS = 5.0
 """How sure a deviation must be to be told."""
+MOST_MOVED = 5.0
+"""Standard deviations of its prior that a run may move the camera (healthy ones: at most 3.8) to count as settled."""
 MOST_FOCAL = 0.08
 """Relative."""
 MOST_SHIFT = 0.05
@@ -89,18 +93,20 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
     """Deviations of the camera that the run ends with that are sure and large; size: width and height, pixels.
 
     opinion: found with the intrinsics at the end of the run. Those of a run that has moved from a wrong calibration to
-    where the images want them are no fault.
+    where the images want them are no fault; but whoever was that far off must have settled better than others.
     """
     if opinion is None or not estimate.calibrated:
         return []
     found = []
     focal, x, y, radial = (float(value) for value in opinion.value)
-    sure = np.abs(opinion.value) > SIGMAS * opinion.sigma
-    if sure[0] and abs(focal) > MOST_FOCAL:
+    moved = bool(np.any(np.abs(estimate.intrinsics - estimate.given) > MOST_MOVED * estimate.sigma))
+    sure = np.abs(opinion.value) > (0.8 if moved else 1.0) * SIGMAS * opinion.sigma
+    much = 0.5 if moved else 1.0
+    if sure[0] and abs(focal) > much * MOST_FOCAL:
         wanted = float(np.exp(focal) * estimate.intrinsics[0])
         text = f"the images want a focal length of {wanted:.0f} px; the run has {estimate.intrinsics[0]:.0f}"
         found.append(Finding("calibration", "degraded", text))
-    if (sure[1] and abs(x) > MOST_SHIFT * size[0]) or (sure[2] and abs(y) > MOST_SHIFT * size[0]):
+    if (sure[1] and abs(x) > much * MOST_SHIFT * size[0]) or (sure[2] and abs(y) > much * MOST_SHIFT * size[0]):
         text = f"the images want the principal point {x:.0f}, {y:.0f} px beside where it is taken to be"
         found.append(Finding("calibration", "degraded", text))
     diagonal, focal_length = float(np.hypot(*size)), float(estimate.intrinsics[0])
@@ -139,8 +145,10 @@ def _pairs(estimate: Estimate, evidence: Evidence) -> list[_Pair]:
         known = np.isfinite(depth) & (depth > 0)
         if np.count_nonzero(known) < LEAST_CORNERS:
             continue
-        relative = estimate.poses[other] @ rigid.invert(estimate.poses[row])
         before, after = (pixels[known].astype(np.float64) for pixels in (first.pixels[rows], second.pixels[others]))
+        if np.median(np.linalg.norm(after - before, axis=1)) < LEAST_FLOW:
+            continue
+        relative = estimate.poses[other] @ rigid.invert(estimate.poses[row])
         found.append(_Pair(before, after, depth[known], relative, min(row, other) // BLOCK))
     return found
 

@@ -22,6 +22,8 @@ MOVED = 2.0
 LEAST_CHANGED = 0.02
 """Share of pixels of a depth image that a moving camera changes at least, quantisation to 5 cm included (0.7)."""
 LEAST_FRAMES = 3
+NEAREST = 0.2
+"""Metres: at most a tenth of a room sensor's depths at corners is nearer."""
 PLAUSIBLE = (0.5, 6.5)
 """Metres, of the median over all frames of their median depth."""
 
@@ -52,6 +54,12 @@ def check_range(estimate: Estimate, evidence: Evidence) -> list[Finding]:
     if not estimate.metric or not len(medians):
         return []
     middle = float(np.median(medians))
+    corners = np.concatenate([frame.depth for frame in evidence])
+    corners = corners[np.isfinite(corners)]
+    near = float(np.quantile(corners, 0.1)) if len(corners) else NEAREST
+    if near < NEAREST:
+        text = f"a tenth of the depths is below {near:.2g} m, nearer than sensors for rooms can see: is the unit right?"
+        return [Finding("depth range", "degraded", text, scale=True)]
     if PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
         return []
     text = (

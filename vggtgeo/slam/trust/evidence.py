@@ -56,7 +56,18 @@ class FrameEvidence:
 
 
 class EvidenceRecorder:
-    """Collects a `FrameEvidence` of each frame; a `Watcher`."""
+    """Collects a `FrameEvidence` of each frame; a `Watcher`. `vggtgeo.Result.of` takes its `frames`.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> sequence = vg.simulate("room", 3, size=(160, 120))
+        >>> recorder = vg.EvidenceRecorder(sequence.camera)
+        >>> for frame in sequence.frames():
+        ...     recorder.add(frame)
+        >>> len(recorder.frames)
+        3
+
+    """
 
     def __init__(self, camera: Camera) -> None:
         self.frames: list[FrameEvidence] = []

@@ -32,7 +32,9 @@ HEALTHY = 0.6
 LEVEL = 1e-3
 LEAST_CORNERS = 8
 MOST_DISPLACED = 0.10
-"""Share of frames that may be displaced: by 12 cm, say, they move the ATE by 4."""
+"""Share of frames that may be displaced while the run is good."""
+MOST_COST = 0.03
+"""Metres that they may cost the ATE: below the few cm that good runs have."""
 MOST_WRONG = 0.5
 """Share of contradicted steps beyond which nothing of the run can be used."""
 
@@ -130,10 +132,8 @@ def _bridged(estimate: Estimate, evidence: Evidence, before: int, after: int) ->
 def check_steps(estimate: Estimate, taken: list[Step], found: list[Break]) -> list[Finding]:
     """Where the images contradict the poses, and what of the run that displaces."""
     told = []
-    off = np.zeros(len(estimate), bool)
-    for part in found:
-        off[part.displaced[0] : part.displaced[1] + 1] = True
-    local = bool(off.mean() <= MOST_DISPLACED)
+    off = displacements(estimate, found)
+    local = bool(np.mean(off > 0) <= MOST_DISPLACED and np.sqrt(np.mean(off**2)) <= MOST_COST)
     for part in found:
         start, end = int(estimate.frames[part.first]), int(estimate.frames[part.last + 1])
         text = (
@@ -145,6 +145,29 @@ def check_steps(estimate: Estimate, taken: list[Step], found: list[Break]) -> li
     if share > MOST_WRONG:
         told.append(Finding("steps", "failed", f"the images contradict the poses in {100 * share:.0f} % of all steps"))
     return told
+
+
+def displacements(estimate: Estimate, found: list[Break]) -> np.ndarray:
+    """About how far each frame is from where it should be, float64 [n], metres (or the map's unit); 0 = not displaced.
+
+    Frames between two that agree with each other: their distance from the straight line. A part that is displaced as a
+    whole: by how much the step to it differs from the steps around.
+    """
+    centres = estimate.centres
+    off = np.zeros(len(estimate))
+    for part in found:
+        first, last = part.displaced
+        if first == 0 or last == len(estimate) - 1:
+            rows = np.r_[max(part.first - 3, 0) : part.first, part.last + 1 : min(part.last + 4, len(estimate) - 1)]
+            usual = np.median(centres[rows + 1] - centres[rows], axis=0) if len(rows) else np.zeros(3)
+            leap = centres[part.last + 1] - centres[part.first] - (part.last + 1 - part.first) * usual
+            off[first : last + 1] = max(float(np.linalg.norm(leap)), 1e-9)
+        else:
+            share = (np.arange(first, last + 1) - first + 1)[:, None] / (last - first + 2)
+            line = (1 - share) * centres[first - 1] + share * centres[last + 1]
+            distance = np.linalg.norm(centres[first : last + 1] - line, axis=1)
+            off[first : last + 1] = np.maximum(distance, 1e-9)
+    return off
 
 
 def _carried(pixels: np.ndarray, inverse: np.ndarray, relative: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:

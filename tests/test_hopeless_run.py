@@ -1,0 +1,41 @@
+"""A run that nothing can come of ends in order: outputs kept, the verdict "failed", exit code 3."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_sequences as tiny
+from typer.testing import CliRunner
+
+from vggtgeo.cli.main import make_app
+from vggtgeo.results import Result
+
+
+@pytest.mark.parametrize("kind", ["black", "one picture", "unrelated pictures"])
+def test_a_run_that_never_begins_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """Pictures without parallax give identity poses, which nobody may take for a result: code 3, last line, summary and
+    page; oracle: no motion can be had from such pictures.
+    """
+    monkeypatch.setattr("vggtgeo.cli.run_sequence.warm_up", lambda settings: ())
+    monkeypatch.setattr("vggtgeo.slam.watching.WindowRecorder.warm_up", lambda self: None)
+    rng = np.random.default_rng(0)
+    for row in range(6):
+        pixels = rng.integers(0, 255, (12, 16, 3)).astype(np.uint8).repeat(20, 0).repeat(20, 1)
+        if kind == "one picture":
+            pixels = np.random.default_rng(1).integers(0, 255, (12, 16, 3)).astype(np.uint8).repeat(20, 0).repeat(20, 1)
+        tiny.write_image(tmp_path / f"frames/{row}.png", np.zeros_like(pixels) if kind == "black" else pixels)
+    tiny.write_calibration(tmp_path / "frames", (300.0, 300.0, 159.5, 119.5))
+    out = tmp_path / "run"
+    done = CliRunner().invoke(make_app(), ["run", str(tmp_path / "frames"), "-o", str(out)])
+    assert done.exit_code == 3, done.output
+    assert done.stdout.strip().splitlines()[-1] == "verdict: failed"
+    summary = json.loads((out / "summary.json").read_text())
+    assert next(iter(summary)) == "verdict"
+    assert summary["verdict"]["level"] == "failed"
+    assert "no map was ever started" in summary["verdict"]["reasons"][0]
+    assert "Failed: this result is not to be used." in (out / "report.html").read_text()
+    assert len((out / "trajectory.txt").read_text().splitlines()) == 7
+    assert Result.load(out).verdict.level == "failed"
