@@ -193,12 +193,13 @@ def _bad_sequences(frames: list[Frame]) -> Iterator[tuple[str, list[Frame]]]:
 
 
 @pytest.mark.parametrize("case", range(6))
-def test_bad_sequences_end_with_a_finite_pose_for_every_frame(room, case: int) -> None:
-    """Whatever the frames show, each gets a finite pose and nothing raises."""
+def test_bad_sequences_end_with_finite_poses(room, case: int) -> None:
+    """Whatever the frames show, nothing raises, and each frame has a finite pose or is said to have none."""
     name, frames = list(_bad_sequences(room[0]))[case]
     slam = _run(frames, room[1])
     poses = frame_trajectory(slam).poses
-    assert len(poses) == len(frames), name
+    assert len(slam.frames) == len(frames), name
+    assert len(poses) == sum(record.tracked for record in slam.frames) > 0, name
     assert np.all(np.isfinite(poses)), name
 
 
