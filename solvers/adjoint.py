@@ -11,12 +11,16 @@ The formula holds at a stationary point, and the optimum must be tighter for it 
 differentiated, it is polished first by chord steps, `y <- y - H0^-1 g(y)` with the exact Hessian where the iteration
 ended. One costs a gradient and a back-substitution, and so near the optimum gains almost the digits of a Newton step.
 Then the Hessian is taken once more. Cost: two exact Hessians, their factorisations, and a gradient for each step.
+
+Second derivatives: the rule differentiates what it returns. `y*` in it is the differentiable optimum again, and the
+linear solve knows its operator as the derivative of `g`, so `jax.grad` of `jax.grad` and `jax.hessian` work.
+
+A landmark on its bound that the energy presses against it is held: its multiplier is not zero, and it does not move.
 """
 
 from __future__ import annotations
 
-import functools
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -24,7 +28,8 @@ import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
     ArrowVector,
@@ -32,16 +37,23 @@ from vggtgeo.solvers.arrow import (
     couple,
     dense_gradient,
     inverse_landmark_hessian,
-    multiply,
+    moving_landmarks,
     reduce,
 )
+from vggtgeo.solvers.levenberg_marquardt import LevenbergMarquardtState
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced import MIN_DIAGONAL, gauge_stiffness
 from vggtgeo.solvers.segments import expand, restrict
 
+STATIONARY = 1e-6
+"""Gradient left after the polish, each entry in units of the root of its curvature (the unit of `sqrt(energy)`), above
+which a point is no optimum: its derivative is then wrong by about as much, relatively (measured: 1e-9 after a solve
+that converged)."""
+
 
 class ArrowAdjoint(optx.AbstractAdjoint):
-    """Use as `optimistix.least_squares(..., adjoint=ArrowAdjoint())` with `SchurLevenbergMarquardt`.
+    """Use as `optimistix.least_squares(energy_of, solver, y0, args=problem, adjoint=ArrowAdjoint())` with
+    `SchurLevenbergMarquardt`.
 
     Where the Hessian at the optimum is singular beyond the gauge (nothing determines some coordinate), the derivative
     is that of the coordinates that are determined; where no finite answer exists it is zero.
@@ -58,51 +70,125 @@ class ArrowAdjoint(optx.AbstractAdjoint):
 
     polish: int = 6
     """Chord steps before differentiating, at most: they end when the gradient no longer shrinks."""
+    not_stationary: Literal["keep", "nan", "error"] = "keep"
+    """What to do with a derivative at a point that the polish did not bring to rest: keep it (`gradient_residual` of
+    the solution says how far it is off), make it NaN, or raise an error. To differentiate the iterations themselves
+    take `optimistix.RecursiveCheckpointAdjoint()` instead of this class."""
+
+    def __check_init__(self) -> None:
+        if self.not_stationary not in ("keep", "nan", "error"):
+            raise ValueError(f"`not_stationary` is {self.not_stationary!r}; it must be 'keep', 'nan' or 'error'")
 
     def apply(self, primal_fn: Any, rewrite_fn: Any, inputs: Any, tags: Any) -> Any:
         del rewrite_fn, tags
-        _, _, initial, problem, *_ = inputs
+        problem = _only(AbstractArrowProblem, inputs)
         detached = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs)
-        loop = functools.partial(eqxi.while_loop, kind="lax")
+
+        def loop(*arguments: Any, **options: Any) -> Any:
+            return eqxi.while_loop(*arguments, **{**options, "kind": "lax"})
+
         point, rest = primal_fn((*detached, loop))
-        return _attach_derivative(problem, initial, point, self.polish), rest
+        state = _only(LevenbergMarquardtState, rest)
+        start = Polish(jnp.asarray(False), state.gradient_norm)
+        point, polish = _attach_derivative(problem, point, start, self)
+        told = eqx.tree_at(
+            lambda s: (s.polished, s.gradient_residual), state, (polish.polished, polish.gradient_residual)
+        )
+        is_state = lambda node: isinstance(node, LevenbergMarquardtState)
+        return point, jax.tree.map(lambda node: told if is_state(node) else node, rest, is_leaf=is_state)
+
+
+def _only(kind: type, tree: Any) -> Any:
+    """The one node of a type in a pytree."""
+    is_kind = lambda node: isinstance(node, kind)
+    found = [node for node in jax.tree.leaves(tree, is_leaf=is_kind) if is_kind(node)]
+    if len(found) != 1:
+        raise ValueError(
+            f"`ArrowAdjoint` found {len(found)} objects of type `{kind.__name__}` where it needs one; call "
+            "`optimistix.least_squares(energy_of, SchurLevenbergMarquardt(), y0, args=problem, adjoint=ArrowAdjoint())`"
+        )
+    return found[0]
+
+
+class Polish(eqx.Module):
+    """What differentiation did to a point before it took its derivative."""
+
+    polished: Bool[Array, ""]
+    gradient_residual: Float[Array, ""]
+    """Largest gradient entry, each in units of the root of its curvature."""
 
 
 @eqx.filter_custom_jvp
-def _attach_derivative(problem: AbstractArrowProblem, initial: Point, point: Point, polish: int) -> Point:
-    """`point`, differentiable as the optimum of `problem` with held coordinates taken from `initial`."""
-    del problem, initial, polish
-    return point
+def _attach_derivative(
+    problem: AbstractArrowProblem, point: Point, polish: Polish, options: ArrowAdjoint
+) -> tuple[Point, Polish]:
+    """`point`, differentiable as the optimum of `problem`."""
+    del problem, options
+    return point, polish
 
 
 @_attach_derivative.def_jvp
 def _implicit_derivative(primals: Any, tangents: Any) -> Any:
-    problem, initial, point, polish = primals
-    inputs, input_tangents = (problem, initial), tangents[:2]
-    absent = jax.tree.map(lambda leaf: leaf is None, input_tangents, is_leaf=lambda leaf: leaf is None)
-    fixed, moving = eqx.partition(inputs, absent, is_leaf=lambda leaf: leaf is None)
-    point, model = _polish(problem, point, polish)
-    system = model.system
+    problem, point, _, options = primals
+    moved = tangents[0]
+    absent = jax.tree.map(lambda leaf: leaf is None, moved, is_leaf=lambda leaf: leaf is None)
+    fixed, moving = eqx.partition(problem, absent, is_leaf=lambda leaf: leaf is None)
+    optimum, model = _polish(_detached(problem), _detached(point), options.polish)
+    left = model.largest(_gradient(_detached(problem), optimum, model.system))
+    told = _detached(Polish(jnp.asarray(True), left))
+    # The optimum as a function of the problem once more, for derivatives of this derivative.
+    at, _ = _attach_derivative(problem, _detached(optimum), told, options)
+    system = _detached(model.system)
 
-    def stationarity(moving: Any) -> ArrowVector:
-        shifted, start = eqx.combine(moving, fixed)
-        gradient = shifted.gradient(shifted.hold(point, start))
-        return _free(_restricted(_along(system, shifted), gradient), system)
+    def stationarity(moving: Any, point: Point) -> ArrowVector:
+        shifted = eqx.combine(moving, fixed)
+        return _gradient(shifted, shifted.hold(point), system)
 
-    _, right_hand_side = jax.jvp(stationarity, (moving,), (input_tangents,))
-    step = jax.lax.custom_linear_solve(
-        lambda vector: _free(multiply(system, _free(vector, system)), system),
-        jax.tree.map(jnp.negative, right_hand_side),
-        lambda _, vector: model.solve(vector),
-        symmetric=True,
-    )
+    _, right_hand_side = jax.jvp(lambda moving: stationarity(moving, at), (moving,), (moved,))
+    flat, unflatten = ravel_pytree(right_hand_side)  # one leaf: JAX wants all to depend on what is differentiated
 
-    def optimum(moving: Any, step: ArrowVector) -> Any:
-        shifted, start = eqx.combine(moving, fixed)
-        return shifted.retract(shifted.hold(point, start), _expanded(system, step))
+    def operator(vector: Array) -> Array:
+        along = _expanded(system, _free(unflatten(vector), system))
+        step = lambda size: problem.retract(at, jax.tree.map(lambda leaf: size * leaf, along))
+        zero, one = jnp.zeros((), vector.dtype), jnp.ones((), vector.dtype)
+        pushed = jax.jvp(lambda size: stationarity(moving, step(size)), (zero,), (one,))[1]
+        return ravel_pytree(pushed)[0]
 
-    zero = jax.tree.map(jnp.zeros_like, step)
-    return jax.jvp(optimum, (moving, zero), (input_tangents, step))
+    solve = lambda _, vector: ravel_pytree(model.solve(unflatten(vector)))[0]
+    solved = unflatten(jax.lax.custom_linear_solve(operator, -flat, solve, symmetric=True))
+
+    def found(moving: Any, step: ArrowVector) -> Any:
+        shifted = eqx.combine(moving, fixed)
+        return shifted.retract(shifted.hold(at), _expanded(system, step))
+
+    zero = jax.tree.map(jnp.zeros_like, solved)
+    value, tangent = jax.jvp(found, (moving, zero), (moved, solved))
+    tangent = _judged(tangent, left, options)
+    return (value, told), (tangent, jax.tree.map(jnp.zeros_like, eqx.filter(told, eqx.is_inexact_array)))
+
+
+def _judged(tangent: Any, left: Float[Array, ""], options: ArrowAdjoint) -> Any:
+    """The derivative, or what `not_stationary` asks for where the point is not at rest."""
+    if options.not_stationary == "keep":
+        return tangent
+    rest = left <= STATIONARY
+    if options.not_stationary == "error":
+        message = (
+            "The point is no optimum, so it has no derivative as one: the solve did not converge, and the polish did "
+            "not bring it to rest. Raise `max_iterations`, or differentiate the iterations with "
+            "`adjoint=optimistix.RecursiveCheckpointAdjoint()`."
+        )
+        return eqx.error_if(tangent, ~rest, message)
+    return jax.tree.map(lambda leaf: leaf * jnp.where(rest, 1.0, jnp.nan).astype(leaf.dtype), tangent)
+
+
+def _detached(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
+
+
+def _gradient(problem: AbstractArrowProblem, point: Any, system: ArrowSystem) -> ArrowVector:
+    """Gradient by what moves, in the coordinates of `system`."""
+    return _free(_restricted(_along(system, problem), problem.gradient(point)), system)
 
 
 class ExactModel(eqx.Module):
@@ -131,6 +217,12 @@ class ExactModel(eqx.Module):
         dense = jsp.linalg.lu_solve(self.factors, jnp.where(self.system.free, rest, 0.0))
         dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
         return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0)))
+
+    def largest(self, gradient: ArrowVector) -> Float[Array, ""]:
+        """Largest entry of a gradient, in units of the root of its own curvature."""
+        landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
+        dense = jnp.max(gradient.dense**2 / self.diagonal, initial=0.0)
+        return jnp.sqrt(jnp.maximum(dense, jnp.max(landmarks, initial=0.0)))
 
     def size(self, gradient: ArrowVector) -> Float[Array, ""]:
         """Squared norm of a gradient, each entry in units of its own curvature."""
@@ -190,5 +282,6 @@ def _restricted(system: ArrowSystem, gradient: ArrowVector) -> ArrowVector:
 
 
 def _free(vector: ArrowVector, system: ArrowSystem) -> ArrowVector:
-    determined = system.landmark_hessian != 0
-    return ArrowVector(jnp.where(system.free, vector.dense, 0.0), jnp.where(determined, vector.landmarks, 0.0))
+    return ArrowVector(
+        jnp.where(system.free, vector.dense, 0.0), jnp.where(moving_landmarks(system), vector.landmarks, 0.0)
+    )

@@ -67,6 +67,19 @@ class Segments(eqx.Module):
         return jnp.stack([first, jnp.where(self.determined[..., None], second, 0.0)], -1)
 
 
+class NodeFactors(eqx.Module):
+    """Second-order models of what touches one node or two, and the shared coordinates, but no landmark.
+
+    Local coordinates: `(x of first, x of second, shared)`, `2 b + q` of them.
+    """
+
+    first: Int[Array, " m"]
+    second: Int[Array, " m"]
+    """`n` where a factor touches one node only."""
+    hessian: Float[Array, "m l l"]
+    gradient: Float[Array, "m l"]
+
+
 class ArrowSystem(eqx.Module):
     """Second-order model of the energy at one point; `b` coordinates a node, `q` shared ones."""
 
@@ -88,6 +101,10 @@ class ArrowSystem(eqx.Module):
     """False for coordinates that are held."""
     gauge: Float[Array, "c g"]
     """Directions along which the energy may be flat for a known reason (a free scale): unit columns, or zero."""
+    factors: NodeFactors | None = None
+    """Terms on nodes and pairs of nodes: blocks of the matrix, however many there are."""
+    held: Bool[Array, "n s"] | None = None
+    """Landmarks that stay where they are, at a bound that they press against; None = none."""
     segments: Segments | None = None
     """Where the last `2 g` landmarks are coordinates of segments of `q` samples."""
 
@@ -111,9 +128,15 @@ class Reduced(eqx.Module):
     """`W V^-1 h`."""
 
 
-def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "n s"]:
-    """`V^-1`, zero for landmarks that nothing determines (they then stay where they are)."""
+def moving_landmarks(system: ArrowSystem) -> Bool[Array, "n s"]:
+    """Landmarks that something determines and that no bound holds."""
     determined = system.landmark_hessian != 0
+    return determined if system.held is None else determined & ~system.held
+
+
+def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "n s"]:
+    """`V^-1`, zero for landmarks that stay where they are: nothing determines them, or they are held."""
+    determined = moving_landmarks(system)
     return jnp.where(determined, 1 / jnp.where(determined, system.landmark_hessian, 1.0), 0.0)
 
 
@@ -187,7 +210,25 @@ def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array
     )
     whole = jnp.concatenate([nodes.reshape(-1), pulled[:, block:].sum(0)])
     prior = len(system.prior_hessian)
-    return whole.at[-prior:].add(system.prior_hessian @ dense[-prior:])
+    whole = whole.at[-prior:].add(system.prior_hessian @ dense[-prior:])
+    return whole if system.factors is None else whole + _factors_times(system, system.factors, dense)
+
+
+def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array, " c"]) -> Float[Array, " c"]:
+    hosts, block = system.graph.of_host.shape[0], system.transport.shape[-1]
+    nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
+    nodes = jnp.concatenate([nodes, jnp.zeros_like(nodes[:1])])
+    spread = jnp.broadcast_to(shared, (len(factors.first), len(shared)))
+    local = jnp.concatenate([nodes[factors.first], nodes[factors.second], spread], 1)
+    return _factors_gathered(system, factors, jnp.einsum("mab,mb->ma", factors.hessian, local))
+
+
+def _factors_gathered(system: ArrowSystem, factors: NodeFactors, local: Float[Array, "m l"]) -> Float[Array, " c"]:
+    """Values in the factors' local coordinates added up at the nodes and the shared coordinates."""
+    hosts, block = system.graph.of_host.shape[0], system.transport.shape[-1]
+    nodes = jnp.zeros((hosts + 1, block), local.dtype)
+    nodes = nodes.at[factors.first].add(local[:, :block]).at[factors.second].add(local[:, block : 2 * block])
+    return jnp.concatenate([nodes[:-1].reshape(-1), local[:, 2 * block :].sum(0)])
 
 
 def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "n s"]) -> Float[Array, " c"]:
@@ -218,7 +259,14 @@ def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array
     shared = system.gram[:, block:, block:].sum(0)
     gradient = jnp.concatenate([gradients.reshape(-1), shared[:-1, -1]]) + system.prior_gradient
     diagonal = jnp.concatenate([nodes.reshape(-1), jnp.diagonal(shared)[:-1]])
-    return gradient, diagonal.at[-len(system.prior_hessian) :].add(jnp.diagonal(system.prior_hessian))
+    diagonal = diagonal.at[-len(system.prior_hessian) :].add(jnp.diagonal(system.prior_hessian))
+    if system.factors is None:
+        return gradient, diagonal
+    own = jnp.diagonal(system.factors.hessian, axis1=1, axis2=2)
+    return (
+        gradient + _factors_gathered(system, system.factors, system.factors.gradient),
+        diagonal + _factors_gathered(system, system.factors, own),
+    )
 
 
 def _gather_at_nodes(
@@ -309,7 +357,28 @@ def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     blocks = layout.add(blocks, source, target, jnp.swapaxes(mixed, 1, 2))
     borders = jnp.zeros((hosts, block, border.shape[-1]), eta.dtype).at[target].add(border)
     borders = borders.at[source].add(-jnp.einsum("eba,ebc->eac", system.transport, border))
-    return Blocks(blocks, borders, system.gram[:, block:, block:].sum(0))
+    whole = Blocks(blocks, borders, system.gram[:, block:, block:].sum(0))
+    return whole if system.factors is None else _add_factors(whole, system.factors, layout)
+
+
+def _add_factors(whole: Blocks, factors: NodeFactors, layout: AbstractLayout) -> Blocks:
+    hosts, block = whole.border.shape[:2]
+    first, second = factors.first, factors.second
+    cut = lambda a, b: factors.hessian[:, a * block : (a + 1) * block, b * block : (b + 1) * block]
+    nodes = whole.nodes
+    for row, column, value in (
+        *((first, first, cut(0, 0)), (second, second, cut(1, 1))),
+        *((first, second, cut(0, 1)), (second, first, cut(1, 0))),
+    ):
+        # What touches no second node must not touch the first one's row either.
+        absent = (row == hosts) | (column == hosts)
+        nodes = layout.add(nodes, jnp.where(absent, hosts, row), jnp.where(absent, hosts, column), value)
+    tail = jnp.concatenate([factors.hessian[:, :, 2 * block :], factors.gradient[..., None]], 2)
+    borders = jnp.concatenate([whole.border, jnp.zeros_like(whole.border[:1])])
+    borders = borders.at[first].add(tail[:, :block]).at[second].add(tail[:, block : 2 * block])[:-1]
+    own = tail[:, 2 * block :].sum(0)
+    corner = whole.corner.at[:-1].add(own).at[-1, :-1].add(own[:, -1])
+    return Blocks(nodes, borders, corner)
 
 
 def add_prior_blocks(blocks: Blocks, system: ArrowSystem, layout: AbstractLayout) -> Blocks:

@@ -23,7 +23,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from vggtgeo.solvers.arrow import ArrowSystem, Reduced, inverse_landmark_hessian, padded_transports, reduce
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    Reduced,
+    inverse_landmark_hessian,
+    moving_landmarks,
+    padded_transports,
+    reduce,
+)
 from vggtgeo.solvers.reduced import MIN_DIAGONAL, gauge_stiffness
 from vggtgeo.solvers.segments import expand, expand_variance
 
@@ -66,7 +73,7 @@ def covariance(system: ArrowSystem) -> ArrowCovariance:
     return ArrowCovariance(
         dense=dense + jnp.diag(jnp.where(undetermined, jnp.inf, 0.0).astype(dense.dtype)),
         landmarks=jnp.where(known, variance, jnp.inf),
-        rank=inverse.rank + jnp.sum(system.landmark_hessian != 0),
+        rank=inverse.rank + jnp.sum(moving_landmarks(system)),
     )
 
 

@@ -1,6 +1,7 @@
 """Robust kernels `rho(s)` of a squared, weighted residual norm `s`; the energy of a residual is `rho(s) / 2`.
 
-A kernel is normalised so that `rho(0) = 0` and `rho'(0) = 1`: near zero every kernel is the plain square.
+A kernel is normalised so that `rho(0) = 0` and `rho'(0) = 1`: near zero every kernel is the plain square. A kernel of
+your own needs `rho` alone; its derivatives are derived.
 References: Huber 1964; Black & Anandan 1996; Barron, "A General and Adaptive Robust Loss Function", CVPR 2019.
 """
 
@@ -10,6 +11,7 @@ import abc
 from typing import Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -23,13 +25,16 @@ class AbstractKernel(eqx.Module):
     def rho(self, s: Values) -> Values:
         """The kernel's value, same shape and unit as `s`."""
 
-    @abc.abstractmethod
     def weight(self, s: Values) -> Values:
-        """The first derivative `rho'(s)`: the factor by which iteratively reweighted least squares scales `s`."""
+        """The first derivative `rho'(s)`: the factor by which iteratively reweighted least squares scales `s`.
 
-    @abc.abstractmethod
+        Derived from `rho`; a kernel may override it with a formula.
+        """
+        return jax.jvp(self.rho, (s,), (jnp.ones_like(s),))[1]
+
     def curvature(self, s: Values) -> Values:
-        """The second derivative `rho''(s)`, never positive for the kernels of this file."""
+        """The second derivative `rho''(s)`, never positive for the kernels of this file. Derived, like `weight`."""
+        return jax.jvp(self.weight, (s,), (jnp.ones_like(s),))[1]
 
     def widened(self, factor: Float[Array, ""]) -> Self:
         """The kernel whose width `delta` is `factor` times as large; a kernel without a width stays as it is."""

@@ -41,6 +41,10 @@ class Termination(eqx.Enumeration):
         "Failed: the energy of the initial state is not finite. Look for NaN or infinite poses, intrinsics, inverse "
         "depths, targets or weights; the initial state was returned."
     )
+    other_function = (
+        "Failed: the function given to optimistix is not the energy of the problem in `args`, which is what this "
+        "solver minimises; give `vggtgeo.solvers.problem.energy_of`. The initial state was returned."
+    )
     nonfinite_step = (
         "Failed: the normal equations have no finite solution. Look for weights or standard deviations that are far "
         "too large or too small; the last state that was accepted was returned."
@@ -101,6 +105,10 @@ class LevenbergMarquardtState(eqx.Module):
     gradient_norm: Float[Array, ""]
     history: Float[Array, " h"]
     termination: Termination
+    polished: Bool[Array, ""]
+    """Whether differentiation moved the point on to the optimum; set by the adjoint."""
+    gradient_residual: Float[Array, ""]
+    """`gradient_norm` at the point that was returned, as far as it is known."""
     record: IterationRecord | None = None
 
 
@@ -125,8 +133,8 @@ class _Try(eqx.Module):
 class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt with Schur elimination of the landmarks.
 
-    Use with `optimistix.least_squares(residuals, solver, y0, args=problem)`: `args` is an `AbstractArrowProblem`, `y0`
-    one of its points; the residual function is only asked for its shape.
+    Use with `optimistix.least_squares(energy_of, solver, y0, args=problem)`: `args` is an `AbstractArrowProblem`, `y0`
+    one of its points. Another function than its energy is refused. Failures are optimistix results, too.
 
     Example:
         >>> import vggtgeo as vg
@@ -160,8 +168,15 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def init(
         self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> LevenbergMarquardtState:
+        if not isinstance(args, AbstractArrowProblem):
+            raise ValueError(
+                f"`args` is of type `{type(args).__name__}`; `SchurLevenbergMarquardt` solves an "
+                "`AbstractArrowProblem` given as `args`, with `fn=vggtgeo.solvers.problem.energy_of`"
+            )
         energy = args.energy(y)
         finite = jnp.isfinite(energy)
+        # Of another function this solver would minimise something else without a word.
+        same = jnp.isclose(_value(fn(y, args)), energy, rtol=1e-3, atol=0.0) | ~finite
         history = jnp.full(self.max_iterations + 1, jnp.nan, energy.dtype).at[0].set(energy)
         return LevenbergMarquardtState(
             energy=energy,
@@ -172,7 +187,11 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             linearisations=jnp.asarray(0),
             gradient_norm=jnp.asarray(jnp.inf, energy.dtype),
             history=history,
-            termination=_CODES.where(finite, _CODES.running, _CODES.nonfinite_input),
+            termination=_CODES.where(
+                same, _CODES.where(finite, _CODES.running, _CODES.nonfinite_input), _CODES.other_function
+            ),
+            polished=jnp.asarray(False),
+            gradient_residual=jnp.asarray(jnp.inf, energy.dtype),
             record=self._start_record(args.recorded(y), history) if self.record_iterations else None,
         )
 
@@ -216,6 +235,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gradient_norm=gradient_norm,
             history=last.history,
             termination=self._terminate(state.energy, last, gradient_norm),
+            polished=state.polished,
+            gradient_residual=gradient_norm,
             record=last.record,
         )
         return last.point, new, None
@@ -224,7 +245,12 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         self, fn: Any, y: Any, args: Any, options: Any, state: LevenbergMarquardtState, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         results: Any = optx.RESULTS
-        return state.termination != _CODES.running, results.successful
+        failed = state.termination == _CODES.nonfinite_input
+        for code in (_CODES.nonfinite_step, _CODES.other_function):
+            failed = failed | (state.termination == code)
+        spent = state.termination == _CODES.max_iterations
+        result = results.where(spent, results.nonlinear_max_steps_reached, results.successful)
+        return state.termination != _CODES.running, results.where(failed, results.nonlinear_divergence, result)
 
     def postprocess(
         self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
@@ -310,6 +336,11 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return termination
 
 
+def _value(returned: Any) -> Array:
+    """What the function returned, without the auxiliary output that optimistix adds."""
+    return jnp.asarray(returned[0] if isinstance(returned, tuple) else returned)
+
+
 def _negligible(predicted: Float[Array, ""], energy: Float[Array, ""]) -> Bool[Array, ""]:
     """The model itself promises less than the energy's last digits."""
     return jnp.isfinite(predicted) & (jnp.abs(predicted) <= jnp.finfo(energy.dtype).eps * energy)
@@ -319,5 +350,7 @@ def _gradient_norm(system: ArrowSystem) -> Float[Array, ""]:
     """Largest gradient entry, each scaled by the root of its own curvature (the unit of `sqrt(energy)`)."""
     scaled = lambda gradient, curvature: gradient * jax.lax.rsqrt(jnp.where(curvature > 0, curvature, jnp.inf))
     landmarks = scaled(system.landmark_gradient, system.landmark_hessian)
+    # A landmark that presses against its bound is at rest there (the condition of Karush, Kuhn and Tucker).
+    landmarks = landmarks if system.held is None else jnp.where(system.held, 0.0, landmarks)
     dense = jnp.where(system.free, scaled(*dense_gradient(system)), 0.0)
     return jnp.maximum(jnp.max(jnp.abs(landmarks), initial=0.0), jnp.max(jnp.abs(dense), initial=0.0))

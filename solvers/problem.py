@@ -40,8 +40,8 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
         """Move on the manifold; a zero step is the identity and the derivative there is the tangent map."""
 
     @abc.abstractmethod
-    def hold(self, point: Point, initial: Point) -> Point:
-        """`point` with every held coordinate taken from `initial`.
+    def hold(self, point: Point) -> Point:
+        """`point` with every held coordinate taken from where the iteration starts, which the problem knows.
 
         Landmarks on segments stay where they are, but follow the fractions where those are differentiated.
         """
@@ -57,3 +57,8 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
     @abc.abstractmethod
     def zero_step(self, point: Point) -> ArrowVector:
         """The zero of the tangent space at `point`."""
+
+
+def energy_of(point: Point, problem: AbstractArrowProblem[Point]) -> Float[Array, ""]:
+    """The function to give to `optimistix.least_squares`, with the problem as its `args`."""
+    return problem.energy(point)

@@ -36,7 +36,9 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
     joined = jnp.einsum("nrms,nmsk->nrkm", rows, joint.basis)
     joined = joined.at[:, -1].set(jnp.stack([own, jnp.where(determined, rest, 0.0)], 1))
     cross = jnp.concatenate([system.cross[..., :alone], joined.reshape(*joined.shape[:2], 2 * segments)], -1)
-    return eqx.tree_at(lambda s: (s.cross, s.segments), system, (cross, joint), is_leaf=lambda leaf: leaf is None)
+    held = None if system.held is None else jnp.pad(system.held[:, :alone], ((0, 0), (0, 2 * segments)))
+    changed = (cross, joint, held)
+    return eqx.tree_at(lambda s: (s.cross, s.segments, s.held), system, changed, is_leaf=lambda leaf: leaf is None)
 
 
 def expand(segments: Segments | None, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:

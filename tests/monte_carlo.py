@@ -83,7 +83,7 @@ def noisy(problem: Problem, key: Array) -> Problem:
             problem.points.target + draw(keys[0], point),
             problem.lines.coefficients.at[..., 2].add(draw(keys[1], deviation(problem.lines.weight))),
             problem.depth.mean + draw(keys[2], depth),
-            problem.intrinsics_prior.mean + draw(keys[3], deviation(problem.intrinsics_prior.information)),
+            problem.intrinsics_prior.mean + draw(keys[3], deviation(problem.intrinsics_prior.weight)),
         ),
     )
 

@@ -1,4 +1,4 @@
-"""The exact Hessian of bundle adjustment against automatic differentiation of the readable energy."""
+"""The exact Hessian of bundle adjustment against automatic differentiation of an energy written by hand."""
 
 from functools import partial
 
@@ -7,14 +7,15 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import oracle
 import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene
 from vggtgeo.solvers.arrow import multiply, reduce
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
-from vggtgeo.bundle.objective import energy
-from vggtgeo.bundle.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.marginal import MarginalPrior
 
 SCENE = make_scene(2, 4, 1, 2, noise=0.7, outliers=0.3, depth_error=0.2, seed=3)
 
@@ -37,7 +38,7 @@ def both(problem: Problem, state: State) -> tuple[jax.Array, ...]:
     """Gradient and Hessian, dense, of the solver's arrow and of the energy in the same coordinates."""
     ba = BundleAdjustment(problem)
     flat, unflat = ravel_pytree(ba.zero_step(state))
-    total = lambda step: energy(problem, ba.retract(state, unflat(step)))
+    total = lambda step: oracle.energy(problem, ba.retract(state, unflat(step)))
     system = ba.hessian(state)
     matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
     gradient = jnp.concatenate([reduce(system).gradient, system.landmark_gradient.ravel()])
@@ -50,14 +51,14 @@ def test_hessian_is_that_of_automatic_differentiation(strength: float, depth: fl
     # Proves the exact Hessian: points, lines, outliers on Huber's linear branch, curvature of the poses, intrinsics,
     # the marginalisation prior, and a point behind its target. Oracle: `jax.hessian` of the energy after a retraction.
     problem, state, _ = SCENE.pack()
-    problem = eqx.tree_at(lambda p: p.marginal, problem, prior_on(state, strength), is_leaf=lambda leaf: leaf is None)
+    problem = problem.with_term(prior_on(state, strength))
     if depth is not None:
         state = eqx.tree_at(lambda s: s.inverse_depth, state, state.inverse_depth.at[0, 0].set(depth))
-    gradient, matrix, oracle_gradient, oracle = both(problem, state)
-    unit = 1 / np.sqrt(np.abs(np.diag(oracle)) + 1.0)
-    error = np.abs((matrix - oracle) * np.outer(unit, unit)).max()
+    gradient, matrix, expected_gradient, expected = both(problem, state)
+    unit = 1 / np.sqrt(np.abs(np.diag(expected)) + 1.0)
+    error = np.abs((matrix - expected) * np.outer(unit, unit)).max()
     assert error < 1e-9
-    error = np.abs((gradient - oracle_gradient) * unit).max() / np.abs(oracle_gradient * unit).max()
+    error = np.abs((gradient - expected_gradient) * unit).max() / np.abs(expected_gradient * unit).max()
     assert error < 1e-11
 
 

@@ -15,6 +15,7 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
+from vggtgeo.slam.factors import MeasuredRelativePose, factor_terms
 
 SCENE = make_scene(3, 5, 1, 2, noise=0.5, outliers=0.1, depth_error=0.05, seed=4)
 RANDOM_PROBLEMS = 20
@@ -33,12 +34,18 @@ LEAVES: dict[str, tuple[Callable[[Both], Any], float]] = {
     "depth confidence": (lambda both: both[0].depth.weight, 1e-4),
     "alpha": (lambda both: both[0].depth.alpha, 1e-4),
     "intrinsics' prior": (lambda both: both[0].intrinsics_prior.mean, 1e-3),
-    "intrinsics' information": (lambda both: both[0].intrinsics_prior.information, 2e-4),
-    "kernel": (lambda both: both[0].kernel.delta, 1e-4),
+    "intrinsics' weight": (lambda both: both[0].intrinsics_prior.weight, 2e-4),
+    "points' kernel": (lambda both: both[0].points.kernel.delta, 1e-4),
+    "lines' kernel": (lambda both: both[0].lines.kernel.delta, 1e-4),
+    "depth's kernel": (lambda both: both[0].depth.kernel.delta, 1e-4),
     "marginal root": (lambda both: both[0].marginal.root, 1e-4),
     "marginal offset": (lambda both: both[0].marginal.offset, 1e-4),
     "marginal poses": (lambda both: both[0].marginal.poses.wxyz_xyz, 1e-6),
     "marginal intrinsics": (lambda both: both[0].marginal.intrinsics, 1e-3),
+    "marginal weight": (lambda both: both[0].marginal.weight, 1e-4),
+    "measured pose": (lambda both: both[0].relative_poses.measured, 1e-6),
+    "measured root": (lambda both: both[0].relative_poses.root, 1e-4),
+    "measured weight": (lambda both: both[0].relative_poses.weight, 1e-4),
     "held pose": (lambda both: both[1].poses.wxyz_xyz, 1e-6),
     "held intrinsics": (lambda both: both[1].intrinsics, 1e-3),
 }
@@ -47,7 +54,11 @@ LEAVES: dict[str, tuple[Callable[[Both], Any], float]] = {
 def make_problem(scene: Scene = SCENE) -> Both:
     """A problem with every kind of leaf; pose 0 and c_y are held."""
     problem, state, _ = scene.pack(fixed_intrinsics=np.array([False, False, False, True]))
-    return eqx.tree_at(lambda p: p.marginal, problem, prior_on(state, 2.0), is_leaf=lambda leaf: leaf is None), state
+    pose, information = np.eye(4), np.diag([4e4, 3e4, 5e4, 4e5, 3e5, 5e5])
+    pose[:3, 3] = [-0.2, 0.02, 0.01]
+    factors = [MeasuredRelativePose(1, 2, pose, information)]
+    (measured,) = factor_terms(factors, {1: 1, 2: 2}, {MeasuredRelativePose: 1})
+    return problem.with_term(prior_on(state, 2.0)).with_term(measured), state
 
 
 def loss_of(state: State) -> jax.Array:
@@ -176,7 +187,7 @@ def test_what_is_not_determined_has_no_derivative(both: Both, value_and_gradient
     # Proves that a problem without any weight gives zero, not NaN: nothing there moves the optimum.
     problem, state = both
     problem = eqx.tree_at(
-        lambda p: (p.points.weight, p.lines.weight, p.depth.weight, p.marginal.root, p.intrinsics_prior.information),
+        lambda p: tuple(term.weight for term in p.terms),
         problem,
         replace_fn=jnp.zeros_like,
     )

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene
-from test_linearise import weighted_residuals
 from vggtgeo.solvers.arrow import multiply, reduce
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
@@ -38,16 +38,14 @@ def curved(problem: Problem, state: State) -> jax.Array:
     """Hessian of the energy with every residual replaced by its linearisation: `J' B J`, `B` from the kernel."""
     ba = BundleAdjustment(problem)
     flat, unflat = ravel_pytree(ba.zero_step(state))
-    weights = [problem.points.weight, problem.lines.weight, problem.depth.alpha * problem.depth.weight]
-    roots = [*weights, problem.intrinsics_prior.information]
-    residuals = lambda step: weighted_residuals(problem, ba.retract(state, unflat(step)), roots)
-    constant, jacobian = residuals(flat), jax.jacfwd(residuals)(flat)
+    moved = lambda step: ba.retract(state, unflat(step))
+    residuals = lambda step: oracle.residuals(problem, moved(step))
+    constant, jacobian, weights = residuals(flat), jax.jacfwd(residuals)(flat), oracle.weights(problem)
 
     def energy(step: jax.Array) -> jax.Array:
-        residual = constant + jacobian @ step
-        points, rest = residual[: 2 * weights[0].size].reshape(-1, 2), residual[2 * weights[0].size : -4]
-        rho = jnp.sum(problem.kernel.rho(jnp.sum(points**2, 1))) + jnp.sum(problem.kernel.rho(rest**2))
-        return (rho + jnp.sum(residual[-4:] ** 2)) / 2
+        linear = {name: constant[name] + jacobian[name] @ step for name in constant}
+        squares = {name: weights[name] * jnp.sum(residual**2, -1) for name, residual in linear.items()}
+        return sum(jnp.sum(oracle.kernel(problem, name).rho(s)) / 2 for name, s in squares.items())
 
     return jax.hessian(energy)(flat)
 

@@ -6,15 +6,16 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from scenes import make_scene
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.classical import ManhattanEstimator, ManhattanView, nearest_frame
 
-from vggtgeo.bundle.marginalisation import no_prior
-from vggtgeo.bundle.objective import marginal_energy
+from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import State
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.manhattan import constrain_rotation, mean_rotation, with_rotation
+from vggtgeo.slam.factors import MeasuredRotation, factor_terms
+from vggtgeo.slam.manhattan import constrain_rotation, mean_rotation
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.settings import Roles, SlamSettings
 
@@ -97,26 +98,27 @@ def test_the_residual_is_the_measured_rotation() -> None:
     # none at the measured one, and nothing for translations or other keyframes. Oracle: by hand.
     rng = np.random.default_rng(4)
     measured = Rotation.from_rotvec(rng.normal(0, 0.4, 3))
-    off = np.array([0.004, -0.003, 0.006])
-    pose = np.eye(4)
-    pose[:3, :3] = (Rotation.from_rotvec(off) * measured).as_matrix()
-    pose[:3, 3] = rng.normal(0, 1, 3)
-    view = ManhattanView(measured.as_matrix(), np.diag([1e4, 4e4, 2e4]), 1.0, np.array([9, 9, 9]))
-    prior = with_rotation(no_prior(3), 1, pose, off, view)
+    off = np.array([0.04, -0.03, 0.06])
+    information = np.diag([1e4, 4e4, 2e4])
+    information[0, 1] = information[1, 0] = 5e3
+    factors = [MeasuredRotation(7, measured.as_matrix(), information), MeasuredRotation(3, np.eye(3), information)]
+    places, room = {5: 0, 7: 1, 9: 2}, {MeasuredRotation: 4}
+    problem, _, _ = make_scene().pack()
+    problem = problem.with_terms(factor_terms(factors, places, room))  # keyframe 3 has left: it must not count
 
     def energy_at(rotation: Rotation, shift: float = 0.0) -> float:
         poses = np.tile(np.eye(4), (3, 1, 1))
         poses[0, 0, 3] = poses[2, 1, 3] = 5.0
-        poses[1] = pose
         poses[1, :3, :3] = rotation.as_matrix()
-        poses[1, :3, 3] += shift
-        state = State(jaxlie.SE3(jnp.asarray(rigid.to_quaternion(poses))), jnp.ones(4), jnp.zeros((3, 1)))
-        return float(marginal_energy(prior, state))
+        poses[1, :3, 3] = shift
+        slots = problem.pixels.shape[:2]
+        state = State(jaxlie.SE3(jnp.asarray(rigid.to_quaternion(poses))), jnp.ones(4), jnp.ones(slots))
+        return float(energy(problem, state))
 
-    expected = 0.5 * off @ view.information @ off
+    expected = 0.5 * off @ information @ off
     assert energy_at(Rotation.from_rotvec(off) * measured) == pytest.approx(expected, rel=1e-9)
-    assert energy_at(Rotation.from_rotvec(off) * measured, shift=0.3) == pytest.approx(expected, rel=1e-6)
-    assert energy_at(measured) < 1e-4 * expected
+    assert energy_at(Rotation.from_rotvec(off) * measured, shift=0.3) == pytest.approx(expected, rel=1e-9)
+    assert energy_at(measured) < 1e-12 * expected
 
 
 def test_it_is_off_unless_asked_for() -> None:

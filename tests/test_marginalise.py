@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,9 +14,9 @@ from vggtgeo.solvers.adjoint import ExactModel
 from vggtgeo.solvers.arrow import ArrowVector, reduce
 from vggtgeo.solvers.kernels import Square
 
-from vggtgeo.bundle.linearise import edge_observations, linearise
-from vggtgeo.bundle.marginalisation import marginalise, no_prior, reorder
-from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior, reorder
+from vggtgeo.bundle.objective import energy, prepared
 from vggtgeo.bundle.problem import Problem, State
 
 
@@ -26,43 +26,41 @@ class _Made(NamedTuple):
     truth: State
 
 
-def _made(keyframes: int, points: int, lines: int) -> _Made:
+def _made(keyframes: int, points: int, lines: int, **options: Any) -> _Made:
     scene = make_scene(keyframes, points, lines, noise=0.5, depth_error=0.02)
-    problem, initial, _ = scene.pack()
+    problem, initial, _ = scene.pack(terms=[no_prior(keyframes)], **options)
     return _Made(problem, initial, scene.at_truth()[1])
 
 
+@eqx.filter_jit
 def _gauss_newton_step(problem: Problem, state: State) -> ArrowVector:
-    system = linearise(problem, edge_observations(problem), state)
+    system = linearise(prepared(problem), state)
     gradient = ArrowVector(reduce(system).gradient, system.landmark_gradient)
     return ExactModel(system).solve(jax.tree.map(jnp.negative, gradient))
 
 
-def _without(problem: Problem, dropped_edges, dropped_host: int | None) -> Problem:
-    keep = ~dropped_edges[:, None]
-    depth = problem.depth.weight
-    depth = depth if dropped_host is None else depth.at[dropped_host].set(0.0)
-    return eqx.tree_at(
-        lambda p: (p.points.weight, p.lines.weight, p.depth.weight),
-        problem,
-        (jnp.where(keep, problem.points.weight, 0.0), jnp.where(keep, problem.lines.weight, 0.0), depth),
-    )
+def _without(problem: Problem, dropped_edges: jax.Array, dropped_host: int | None) -> Problem:
+    depth = problem.depth
+    depth = depth if dropped_host is None else depth.reweighted(depth.weight.at[dropped_host].set(0.0))
+    kept = [term.restricted(~dropped_edges) for term in problem.edge_terms]
+    for term in (*kept, depth):
+        problem = problem.with_term(term)
+    return problem
 
 
 @pytest.mark.parametrize("leaving", [0, 1])
 def test_marginalise_then_solve_equals_solve_all(leaving: int) -> None:
     """On the linearised problem both give one step, to 1e-9; oracle: the whole problem (0 is held, 1 is free)."""
-    made = _made(4, 10, 2)
-    whole = eqx.tree_at(lambda p: p.kernel, made.problem, Square())
+    made = _made(4, 10, 2, kernel=Square())
+    whole = made.problem
     source, target = whole.edges.source, whole.edges.target
     # Other hosts' landmarks seen in the leaving keyframe are dropped by design: the whole problem drops them too.
     whole = _without(whole, (target == leaving) & (source != leaving), None)
-    whole = eqx.tree_at(lambda p: p.marginal, whole, no_prior(4), is_leaf=lambda leaf: leaf is None)
     expected = _gauss_newton_step(whole, made.initial)
 
-    prior = marginalise(whole, made.initial, jnp.asarray(leaving))
+    prior = marginalise_jit(whole, made.initial, jnp.asarray(leaving))
     rest = _without(whole, source == leaving, leaving)
-    rest = eqx.tree_at(lambda p: (p.marginal, p.fixed_pose), rest, (prior, whole.fixed_pose.at[leaving].set(True)))
+    rest = eqx.tree_at(lambda p: p.fixed_pose, rest.with_term(prior), whole.fixed_pose.at[leaving].set(True))
     step = _gauss_newton_step(rest, made.initial)
 
     remaining = np.repeat(np.arange(4) != leaving, 6)
@@ -78,8 +76,7 @@ def test_marginalise_then_solve_equals_solve_all(leaving: int) -> None:
 def test_prior_is_silent_about_what_left_and_never_negative() -> None:
     """The prior says nothing of the keyframe that left, and its information is positive semidefinite and finite."""
     made = _made(3, 6, 1)
-    problem = eqx.tree_at(lambda p: p.marginal, made.problem, no_prior(3), is_leaf=lambda leaf: leaf is None)
-    prior = marginalise(problem, made.initial, jnp.asarray(0))
+    prior = marginalise_jit(made.problem, made.initial, jnp.asarray(0))
     hessian, gradient = prior.root.T @ prior.root, prior.root.T @ prior.offset
     assert np.all(np.asarray(prior.root)[:, :6] == 0.0), "the prior still speaks of the keyframe that left"
     assert np.linalg.eigvalsh(np.asarray(hessian)).min() > -1e-9 * float(jnp.max(jnp.abs(hessian)))
@@ -89,10 +86,8 @@ def test_prior_is_silent_about_what_left_and_never_negative() -> None:
 def test_first_estimates_are_kept() -> None:
     """A state under a prior keeps its linearisation point when the prior is carried on; oracle: the points given."""
     made = _made(3, 6, 1)
-    problem = eqx.tree_at(lambda p: p.marginal, made.problem, no_prior(3), is_leaf=lambda leaf: leaf is None)
-    first = marginalise(problem, made.initial, jnp.asarray(0))
-    carried = eqx.tree_at(lambda p: p.marginal, problem, first)
-    second = marginalise(carried, made.truth, jnp.asarray(1))
+    first = marginalise_jit(made.problem, made.initial, jnp.asarray(0))
+    second = marginalise_jit(made.problem.with_term(first), made.truth, jnp.asarray(1))
     kept = np.abs(np.asarray(second.poses.wxyz_xyz[2] - made.initial.poses.wxyz_xyz[2])).max()
     assert kept == 0.0, f"the linearisation point moved by {kept:.2e}"
 
@@ -100,8 +95,7 @@ def test_first_estimates_are_kept() -> None:
 def test_reorder_moves_information_with_its_keyframe() -> None:
     """Energy of a reordered prior at reordered states equals the original; oracle: the prior itself."""
     made = _made(3, 6, 1)
-    problem = eqx.tree_at(lambda p: p.marginal, made.problem, no_prior(3), is_leaf=lambda leaf: leaf is None)
-    prior = marginalise(problem, made.initial, jnp.asarray(0))
+    prior = marginalise_jit(made.problem, made.initial, jnp.asarray(0))
     order = np.array([1, 2, -1])
     moved = reorder(prior, order)
     shuffled = State(
@@ -109,13 +103,8 @@ def test_reorder_moves_information_with_its_keyframe() -> None:
         made.truth.intrinsics,
         made.truth.inverse_depth[jnp.asarray([1, 2, 0])],
     )
-    empty = _without(problem, jnp.ones(len(problem.edges.source), bool), None)
-    empty = eqx.tree_at(
-        lambda p: (p.depth.weight, p.intrinsics_prior.information),
-        empty,
-        (jnp.zeros_like(empty.depth.weight), jnp.zeros(4)),
-    )
-    before = float(energy(eqx.tree_at(lambda p: p.marginal, empty, prior), made.truth))
-    after = float(energy(eqx.tree_at(lambda p: p.marginal, empty, moved), shuffled))
+    alone = lambda term: made.problem.with_terms((term,))
+    energy_jit = eqx.filter_jit(energy)
+    before, after = float(energy_jit(alone(prior), made.truth)), float(energy_jit(alone(moved), shuffled))
     assert after == pytest.approx(before, rel=1e-12), f"{after} against {before}"
     assert before > 0

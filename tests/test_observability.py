@@ -24,11 +24,12 @@ from scenes import Scene
 from vggtgeo.solvers.arrow import ArrowVector
 
 from vggtgeo.bundle.analysis.directions import MOTIONS, direction_names, named_directions
-from vggtgeo.bundle.analysis.observability import KINDS, WEAK, Observability, observability
+from vggtgeo.bundle.analysis.observability import WEAK, Observability, observability
 from vggtgeo.bundle.analysis.observability_report import undetermined_landmarks, weak_directions
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State
 
+KINDS = ("points", "lines", "depth", "intrinsics_prior")
 Observe = Callable[[Problem, State], Observability]
 LOST = [f"keyframe 2: {motion}" for motion in MOTIONS]
 NO_PRIOR = {"intrinsics_sigma": None}
@@ -89,7 +90,7 @@ def test_what_each_kind_is_worth(observed: Observe) -> None:
     scale = direction_names(KEYFRAMES).index("scale")
     assert float(found.without.along[KINDS.index("depth"), scale]) < 1e-9 * float(found.whole.along[0, scale])
     assert float(found.alone.along[KINDS.index("depth"), scale]) == 0
-    with pytest.raises(ValueError, match="`without` is 'imu'; expected one of points, lines, depth, priors"):
+    with pytest.raises(ValueError, match="`without` is 'imu'; expected one of points, lines, depth, intrinsics_prior"):
         weak_directions(found, "imu")
 
 
@@ -102,7 +103,7 @@ def test_without_a_kind_is_the_problem_without_it(observed: Observe, kind: str) 
         "points": lambda p: p.points.weight,
         "lines": lambda p: p.lines.weight,
         "depth": lambda p: p.depth.weight,
-        "priors": lambda p: p.intrinsics_prior.information,
+        "intrinsics_prior": lambda p: p.intrinsics_prior.weight,
     }[kind]
     found = observed(problem, truth)
     lacking = observed(eqx.tree_at(weight, problem, replace_fn=jnp.zeros_like), truth)

@@ -1,19 +1,26 @@
 """Packing flat lists into padded arrays: nothing is lost, nothing is invented, wrong lists are refused."""
 
+import inspect
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 from scenes import Scene, make_scene
+from vggtgeo.solvers.kernels import Huber
 
-from vggtgeo.bundle.packing import Observations, PaddedSize
+from vggtgeo.bundle.packing import Observations, PaddedSize, pack
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.io.errors import InputError
 from vggtgeo.simulation import simulate_window
 
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)
+
+
+UNCHECKED = inspect.unwrap(pack)
+"""As a user calls it: in the tests a check of types comes before the words that are proved here."""
 
 
 def shuffled(scene: Scene) -> tuple[Observations, np.ndarray]:
@@ -101,9 +108,8 @@ def test_padding_is_harmless_and_held() -> None:
 def test_dtype_goes_through_everything() -> None:
     # Proves that one argument decides the precision of the whole problem.
     problem, state, _ = SCENE.pack(dtype=np.float32)
-    arrays = [*vars(problem.points).values(), *vars(problem.lines).values(), *vars(problem.depth).values()]
-    arrays += [problem.pixels, problem.intrinsics_prior.information, state.intrinsics, state.inverse_depth]
-    assert {array.dtype for array in [*arrays, state.poses.wxyz_xyz]} == {np.dtype(np.float32)}
+    arrays = [leaf for leaf in jax.tree.leaves((problem, state)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    assert {array.dtype for array in arrays if array.ndim} == {np.dtype(np.float32)}
 
 
 def bad(**changes: object) -> Scene:
@@ -133,7 +139,12 @@ def test_wrong_lists_are_refused_by_name() -> None:
         (replace(SCENE, start_intrinsics=np.array([300.0, -1.0, 0.0, 0.0])), "focal lengths must be positive"),
         (replace(SCENE, start_poses=2 * SCENE.start_poses), r"`poses\[0\]` has a quaternion of length 2"),
         (bad(point_weight=seen.point_weight[1:]), "`point_weight` has shape"),
-        (replace(SCENE, start_poses=SCENE.start_poses[:, :4]), r"`poses` has shape \(3, 4\); expected \(3, 7\)"),
+        (replace(SCENE, start_poses=SCENE.start_poses[:, :4]), r"`poses` has shape \(3, 4\); expected \(n, 7\)"),
+        (bad(point_weight=-seen.point_weight), r"`point_weight\[0\]` is -.*; it must be finite and not negative"),
+        (bad(line_weight=seen.line_weight * np.nan), r"`line_weight\[0\]` is nan"),
+        (bad(alpha=-1.0), "`alpha` is -1.0"),
+        (bad(depth_mean=-seen.depth_mean), r"`depth_mean\[0\]` is -.*; it must be positive and finite"),
+        (bad(line_coefficients=3 * seen.line_coefficients), r"`line_coefficients\[0\]` .*divided by its root"),
         (bad(depth_sigma=0 * seen.depth_sigma), r"`depth_sigma\[0\]` is 0"),
         (replace(SCENE, start_inverse_depth=-SCENE.start_inverse_depth), r"`inverse_depth\[0\]` is -"),
         (replace(SCENE, start_inverse_depth=SCENE.start_inverse_depth[1:]), "`inverse_depth` has shape"),
@@ -150,3 +161,29 @@ def test_a_size_that_is_too_small_is_refused(name: str) -> None:
     SCENE.pack(size=fits)
     with pytest.raises(InputError, match=rf"`size.{name}` is {getattr(fits, name) - 1}; this problem needs"):
         SCENE.pack(size=replace(fits, **{name: getattr(fits, name) - 1}))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fixed_intrinsics": 1}, "`fixed_intrinsics` is 1; expected True, False, or 4 of them"),
+        ({"fixed_intrinsics": [True, False]}, "expected True, False, or 4 of them"),
+        ({"kernel": "huber"}, "`kernel` is 'huber'; expected a kernel object"),
+        ({"kernel": Huber(jnp.asarray(0.0))}, "`kernel` has the width 0.0; it must be positive"),
+    ],
+)
+def test_wrong_options_are_refused_by_name(options: dict, message: str) -> None:
+    # Proves that an int is no mask, a name no kernel: each used to give a wrong result or a raw broadcast error.
+    start = (SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth)
+    with pytest.raises(InputError, match=message):
+        UNCHECKED(SCENE.observations, *start, **options)
+
+
+def test_lists_and_poses_are_taken_as_they_come() -> None:
+    # Proves that lists and `jaxlie.SE3` pack as arrays do. Oracle: the arrays.
+    expected, state, _ = SCENE.pack()
+    seen = SCENE.observations
+    start = (jaxlie.SE3(jnp.asarray(SCENE.start_poses)), list(SCENE.start_intrinsics), SCENE.start_inverse_depth)
+    problem, same, _ = UNCHECKED(seen, *start, intrinsics_sigma=5.0)
+    assert bool(jnp.all(problem.points.target == expected.points.target))
+    assert bool(jnp.all(same.poses.wxyz_xyz == state.poses.wxyz_xyz))

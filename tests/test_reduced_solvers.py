@@ -221,7 +221,4 @@ def test_the_choice_follows_the_graph() -> None:
     assert choose_reduced_solver(many(60, chain)) == BandCholesky(2)
     assert choose_reduced_solver(many(60, np.concatenate([chain, loops]))) == ConjugateGradients(BandPreconditioner(2))
     assert choose_reduced_solver(many(60, scattered)) == ConjugateGradients()
-    marginal = eqx.tree_at(
-        lambda p: p.marginal, many(60, chain), no_prior(60, jnp.float64), is_leaf=lambda leaf: leaf is None
-    )
-    assert choose_reduced_solver(marginal) == DenseCholesky()
+    assert choose_reduced_solver(many(60, chain).with_term(no_prior(60, jnp.float64))) == DenseCholesky()

@@ -14,7 +14,7 @@ from recorded_run import FRAMES, SETTINGS, RecordedRun, recorded_run
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
 
-from vggtgeo.bundle.residual_rms import residual_sizes
+from vggtgeo.bundle.residuals import residual_sizes
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
@@ -31,11 +31,11 @@ def test_residual_sizes_of_known_noise() -> None:
     scene = make_scene(keyframes=4, points=200, lines=40, noise=0.7, depth_error=0.05)
     problem, state, _ = scene.at_truth(kernel=Square())
     sizes = eqx.filter_jit(residual_sizes)(problem, state)
-    assert float(sizes.points) == pytest.approx(0.7 * np.sqrt(2), rel=0.03)
-    assert float(sizes.lines) == pytest.approx(0.7, rel=0.1)
-    assert float(sizes.depth) == pytest.approx(1.0, rel=0.1)
+    assert float(sizes.rms["points"]) == pytest.approx(0.7 * np.sqrt(2), rel=0.03)
+    assert float(sizes.rms["lines"]) == pytest.approx(0.7, rel=0.1)
+    assert float(sizes.rms["depth"]) == pytest.approx(1.0, rel=0.1)
     count = len(scene.observations.point_edge), len(scene.observations.line_edge), len(scene.observations.host)
-    assert (int(sizes.point_count), int(sizes.line_count), int(sizes.depth_count)) == count
+    assert tuple(int(sizes.count[name]) for name in ("points", "lines", "depth")) == count
     assert f"({count[0]})" in str(sizes)
 
 
@@ -44,7 +44,7 @@ def test_an_absent_kind_has_no_size() -> None:
     problem, state, _ = make_scene(keyframes=2, points=4, lines=0).at_truth()
     sizes = eqx.filter_jit(residual_sizes)(problem, state).to_dict()
     assert np.isnan(sizes["lines"])
-    assert sizes["line_count"] == 0
+    assert sizes["lines_count"] == 0
 
 
 def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: object) -> str:

@@ -80,7 +80,7 @@ def test_residuals_come_in_the_order_of_the_matches(solved: dict[str, Any]) -> N
     options = {**vars(seen), "edges": seen.edges[turned], "point_target": target}
     given = vg.Observations(**{**options, "point_edge": turned[seen.point_edge], "line_edge": turned[seen.line_edge]})
     problem, truth, index = vg.pack(given, window.poses, window.intrinsics, window.inverse_depth)
-    residual = index.gather_points(jax.jit(vg.residuals_at)(problem, truth).points, given)
+    residual = index.gather_points(jax.jit(vg.residuals_at)(problem, truth)["points"], given)
     expected = np.zeros_like(target)
     expected[7] = [-3.0, 2.0]
     np.testing.assert_allclose(residual, expected, atol=1e-9)

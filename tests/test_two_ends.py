@@ -43,7 +43,7 @@ def affine(problem: Problem) -> np.ndarray:
     """`B`, from the two ends of every segment (and the points) to all slots, as a dense matrix."""
     fraction = np.asarray(problem.fraction)
     hosts, segments, samples = fraction.shape
-    points = problem.num_points
+    points = problem.lines.first_slot
     matrix = np.zeros((hosts, points + segments * samples, points + 2 * segments))
     matrix[:, np.arange(points), np.arange(points)] = 1
     for segment in range(segments):

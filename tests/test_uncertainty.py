@@ -133,7 +133,7 @@ def test_scaled_by_the_variance_factor(estimated: Estimate) -> None:
     # Proves that only ratios of weights matter after scaling. Oracle: invariance under all weights times 4.
     problem, truth = packed(WELL, at_truth=True, kernel=Huber(jnp.asarray(1e6, float)), **OPTIONS)
     problem = jax.jit(monte_carlo.noisy)(problem, jax.random.key(0))
-    weights = lambda p: (p.points.weight, p.lines.weight, p.depth.weight, p.intrinsics_prior.information)
+    weights = lambda p: (p.points.weight, p.lines.weight, p.depth.weight, p.intrinsics_prior.weight)
     fourfold = eqx.tree_at(weights, problem, replace_fn=lambda weight: 4 * weight)
     plain, doubted = (estimated(p, truth).scaled() for p in (problem, fourfold))
     for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(doubted), strict=True):

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from vggtgeo.bundle.graduation import Graduation as Graduation
     from vggtgeo.bundle.marginalisation import marginalise as marginalise
     from vggtgeo.bundle.marginalisation import no_prior as no_prior
+    from vggtgeo.bundle.marginalisation import reorder as reorder
     from vggtgeo.bundle.objective import energy as energy
     from vggtgeo.bundle.objective import energy_terms as energy_terms
     from vggtgeo.bundle.packing import Observations as Observations
@@ -30,17 +31,38 @@ if TYPE_CHECKING:
     from vggtgeo.bundle.problem import Problem as Problem
     from vggtgeo.bundle.problem import State as State
     from vggtgeo.bundle.problem_file import load_problem as load_problem
-    from vggtgeo.bundle.residual_rms import Residuals as Residuals
-    from vggtgeo.bundle.residual_rms import ResidualSizes as ResidualSizes
-    from vggtgeo.bundle.residual_rms import residual_sizes as residual_sizes
-    from vggtgeo.bundle.residual_rms import residuals_at as residuals_at
+    from vggtgeo.bundle.residuals import ResidualSizes as ResidualSizes
+    from vggtgeo.bundle.residuals import residual_sizes as residual_sizes
+    from vggtgeo.bundle.residuals import residuals_at as residuals_at
     from vggtgeo.bundle.solution import Solution as Solution
     from vggtgeo.bundle.solution import solve as solve
     from vggtgeo.bundle.solver_choice import choose_reduced_solver as choose_reduced_solver
+    from vggtgeo.bundle.terms.baseline import BaselinePrior as BaselinePrior
+    from vggtgeo.bundle.terms.depth import DepthPrior as DepthPrior
+    from vggtgeo.bundle.terms.edge import EdgeTerm as EdgeTerm
+    from vggtgeo.bundle.terms.edge import ImageTerm as ImageTerm
+    from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior as IntrinsicsPrior
+    from vggtgeo.bundle.terms.line import LineTerm as LineTerm
+    from vggtgeo.bundle.terms.marginal import MarginalPrior as MarginalPrior
+    from vggtgeo.bundle.terms.node import CameraTerm as CameraTerm
+    from vggtgeo.bundle.terms.node import DenseTerm as DenseTerm
+    from vggtgeo.bundle.terms.node import PairTerm as PairTerm
+    from vggtgeo.bundle.terms.node import PoseTerm as PoseTerm
+    from vggtgeo.bundle.terms.point import PointTerm as PointTerm
+    from vggtgeo.bundle.terms.relative_pose import RelativePose as RelativePose
+    from vggtgeo.bundle.terms.rotation import RotationPrior as RotationPrior
+    from vggtgeo.bundle.terms.slot import SlotTerm as SlotTerm
+    from vggtgeo.bundle.terms.term import AbstractTerm as AbstractTerm
+    from vggtgeo.bundle.terms.term import shared_field as shared_field
+    from vggtgeo.bundle.terms.view import View as View
     from vggtgeo.datasets import Frame as Frame
     from vggtgeo.datasets import open_sequence as open_sequence
     from vggtgeo.evaluation import evaluate_trajectory as evaluate_trajectory
     from vggtgeo.geometry.camera import Camera as Camera
+    from vggtgeo.geometry.cameras import AbstractCamera as AbstractCamera
+    from vggtgeo.geometry.cameras import KannalaBrandt as KannalaBrandt
+    from vggtgeo.geometry.cameras import Pinhole as Pinhole
+    from vggtgeo.geometry.cameras import RadialTangential as RadialTangential
     from vggtgeo.geometry.trajectory import Trajectory as Trajectory
     from vggtgeo.io.errors import InputError as InputError
     from vggtgeo.paper_bench.runner import BenchReport as BenchReport
@@ -57,6 +79,7 @@ if TYPE_CHECKING:
     from vggtgeo.slam.settings import Roles as Roles
     from vggtgeo.slam.settings import SlamSettings as SlamSettings
     from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
+    from vggtgeo.solvers.kernels import AbstractKernel as AbstractKernel
     from vggtgeo.solvers.kernels import Barron as Barron
     from vggtgeo.solvers.kernels import Cauchy as Cauchy
     from vggtgeo.solvers.kernels import GemanMcClure as GemanMcClure
@@ -72,13 +95,27 @@ _HOME = {
     "io.errors": ("InputError",),
     "evaluation": ("evaluate_trajectory",),
     "bundle.graduation": ("Graduation",),
-    "bundle.marginalisation": ("marginalise", "no_prior"),
+    "bundle.terms.baseline": ("BaselinePrior",),
+    "bundle.terms.depth": ("DepthPrior",),
+    "bundle.terms.edge": ("EdgeTerm", "ImageTerm"),
+    "bundle.terms.intrinsics": ("IntrinsicsPrior",),
+    "bundle.terms.line": ("LineTerm",),
+    "bundle.terms.marginal": ("MarginalPrior",),
+    "bundle.terms.node": ("CameraTerm", "DenseTerm", "PairTerm", "PoseTerm"),
+    "bundle.terms.point": ("PointTerm",),
+    "bundle.terms.relative_pose": ("RelativePose",),
+    "bundle.terms.rotation": ("RotationPrior",),
+    "bundle.terms.slot": ("SlotTerm",),
+    "bundle.terms.term": ("AbstractTerm", "shared_field"),
+    "bundle.terms.view": ("View",),
+    "geometry.cameras": ("AbstractCamera", "KannalaBrandt", "Pinhole", "RadialTangential"),
+    "bundle.marginalisation": ("marginalise", "no_prior", "reorder"),
     "bundle.analysis.observability": ("Observability", "observability"),
     "bundle.packing": ("Observations", "PaddedSize", "pack"),
     "paper_bench.runner": ("BenchReport", "bench"),
     "bundle.problem": ("Problem", "State"),
     "bundle.problem_file": ("load_problem",),
-    "bundle.residual_rms": ("ResidualSizes", "Residuals", "residual_sizes", "residuals_at"),
+    "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),
     "results": ("Result", "evaluate", "read"),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
     "slam.run": ("finish", "frame_trajectory", "run"),
@@ -86,7 +123,7 @@ _HOME = {
     "bundle.solution": ("Solution", "solve"),
     "bundle.solver_choice": ("choose_reduced_solver",),
     "solvers.adjoint": ("ArrowAdjoint",),
-    "solvers.kernels": ("Barron", "Cauchy", "GemanMcClure", "Huber", "Square"),
+    "solvers.kernels": ("AbstractKernel", "Barron", "Cauchy", "GemanMcClure", "Huber", "Square"),
     "solvers.levenberg_marquardt": ("SchurLevenbergMarquardt",),
     "geometry.trajectory": ("Trajectory",),
     "bundle.analysis.covariances": ("Covariances", "covariances"),

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.gradient import energy_gradient
-from vggtgeo.bundle.linearise import EdgeObservations, edge_observations, fast_energy, free_coordinates, linearise
+from vggtgeo.bundle.linearise import MIN_INVERSE_DEPTH, energy_gradient, free_coordinates, linearise
+from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
@@ -16,50 +16,52 @@ from vggtgeo.solvers.problem import AbstractArrowProblem
 from vggtgeo.solvers.segments import slopes
 
 MIN_SHRINK = 0.1
-"""An inverse depth falls at most to this fraction in one step, so it stays positive."""
-MIN_INVERSE_DEPTH = 1e-6
-"""1/m: no step goes below it (1000 km), however often a depth wants to be negative; fractions alone underflow."""
+"""The depths of a segment fall at most to this fraction in one step, so they stay positive together."""
 
 
 class BundleAdjustment(AbstractArrowProblem[State]):
     """`problem` with its observations laid out for the solver."""
 
     problem: Problem
-    observations: EdgeObservations
+    """Prepared: see `objective.prepared`."""
+    start: State | None
+    """Where the iteration starts: held coordinates stay there, and a derivative by them goes through it."""
 
-    def __init__(self, problem: Problem):
-        self.problem = problem
-        self.observations = edge_observations(problem)
+    def __init__(self, problem: Problem, start: State | None = None):
+        self.problem = prepared(problem)
+        self.start = start
 
     def energy(self, point: State) -> Float[Array, ""]:
-        return fast_energy(self.problem, self.observations, point)
+        return prepared_energy(self.problem, point)
 
     def linearise(self, point: State, correction: Float[Array, ""] | None = None) -> ArrowSystem:
-        return linearise(self.problem, self.observations, point, correction)
+        return linearise(self.problem, point, correction)
 
     def gradient(self, point: State) -> ArrowVector:
-        return energy_gradient(self.problem, self.observations, point)
+        return energy_gradient(self.problem, point)
 
     def hessian(self, point: State) -> ArrowSystem:
-        return linearise(self.problem, self.observations, point, exact=True)
+        return linearise(self.problem, point, exact=True)
 
     def retract(self, point: State, step: ArrowVector) -> State:
-        """Poses move by `exp(xi) T`, intrinsics and inverse depths by addition."""
+        """Poses move by `exp(xi) T`, the camera and inverse depths by addition, those as far as their bound."""
         moved = point.inverse_depth + step.landmarks
+        poses = self.problem.num_camera - self.problem.num_parameters
         return State(
-            poses=lie.move(point.poses, step.dense[:-4].reshape(-1, 6)),
-            intrinsics=point.intrinsics + step.dense[-4:],
+            poses=lie.move(point.poses, step.dense[:poses].reshape(-1, lie.TANGENT)),
+            intrinsics=point.intrinsics + step.dense[poses:],
             inverse_depth=self._bounded(point.inverse_depth, moved) if self.problem.positive_depth else moved,
         )
 
     def _bounded(self, depth: Float[Array, "n s"], moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
         if self.problem.fraction is None:
-            return _positive(depth, moved)
-        points = self.problem.num_points
-        lines = _shortened(depth[:, points:], moved[:, points:], self.problem.fraction.shape[1])
-        return jnp.concatenate([_positive(depth[:, :points], moved[:, :points]), lines], 1)
+            return _positive(moved)
+        first = self.problem.first_segment
+        lines = _shortened(depth[:, first:], moved[:, first:], self.problem.fraction.shape[1])
+        return jnp.concatenate([_positive(moved[:, :first]), lines], 1)
 
-    def hold(self, point: State, initial: State) -> State:
+    def hold(self, point: State) -> State:
+        initial = point if self.start is None else self.start
         fixed_pose = self.problem.fixed_pose[:, None]
         poses = jnp.where(fixed_pose, initial.poses.wxyz_xyz, point.poses.wxyz_xyz)
         intrinsics = jnp.where(self.problem.fixed_intrinsics, initial.intrinsics, point.intrinsics)
@@ -72,11 +74,11 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         fraction = self.problem.fraction
         if fraction is None:
             return point
-        lines = point.inverse_depth[:, self.problem.num_points :].reshape(fraction.shape)
+        lines = point.inverse_depth[:, self.problem.first_segment :].reshape(fraction.shape)
         centre, level = (jnp.mean(values, -1, keepdims=True) for values in (fraction, lines))
         straight = level + slopes(point.inverse_depth, fraction) * (fraction - centre)
         straight = jnp.where(jnp.min(straight, -1, keepdims=True) > 0, straight, level)
-        depth = point.inverse_depth.at[:, self.problem.num_points :].set(straight.reshape(len(lines), -1))
+        depth = point.inverse_depth.at[:, self.problem.first_segment :].set(straight.reshape(len(lines), -1))
         return State(point.poses, point.intrinsics, depth)
 
     def _along_segments(self, depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
@@ -86,7 +88,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
             return depth
         moved = fraction - jax.lax.stop_gradient(fraction)
         change = slopes(depth, jax.lax.stop_gradient(fraction)) * moved
-        return depth.at[:, self.problem.num_points :].add(change.reshape(len(depth), -1))
+        return depth.at[:, self.problem.first_segment :].add(change.reshape(len(depth), -1))
 
     def fractions(self) -> Float[Array, "n g q"] | None:
         return self.problem.fraction
@@ -116,7 +118,6 @@ def _least(depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
     return jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
 
 
-def _positive(depth: Float[Array, "n s"], moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
-    least = _least(depth)
+def _positive(moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
     # Not `maximum`, whose derivative is one half where a zero step meets the bound.
-    return jnp.where(moved < least, least, moved)
+    return jnp.where(moved < MIN_INVERSE_DEPTH, MIN_INVERSE_DEPTH, moved)

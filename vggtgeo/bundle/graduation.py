@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.solvers.problem import energy_of
 
 
 class Graduation(eqx.Module):
@@ -37,9 +38,10 @@ class Graduation(eqx.Module):
         brief = eqx.tree_at(lambda s: s.max_iterations, solver, self.iterations)
 
         def stage(state: State, factor: Float[Array, ""]) -> tuple[State, None]:
-            wide = eqx.tree_at(lambda p: p.kernel, problem, problem.kernel.widened(factor))
+            widened = [eqx.tree_at(lambda t: t.kernel, term, term.kernel.widened(factor)) for term in problem.terms]
+            wide = problem.with_terms(tuple(widened))
             found: optx.Solution = optx.least_squares(
-                lambda point, ba: ba.energy(point),
+                energy_of,
                 brief,
                 state,
                 args=BundleAdjustment(wide),
@@ -52,4 +54,4 @@ class Graduation(eqx.Module):
         detached = jax.lax.stop_gradient((problem, initial))
         problem, state = detached
         state, _ = jax.lax.scan(stage, state, factors)
-        return BundleAdjustment(problem).hold(jax.lax.stop_gradient(state), initial)
+        return BundleAdjustment(problem, initial).hold(jax.lax.stop_gradient(state))

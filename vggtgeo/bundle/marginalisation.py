@@ -1,7 +1,7 @@
 """Marginalisation: what a keyframe that leaves the window has said about the others, as a Gaussian prior.
 
-The factors that go with a keyframe are the observations and depth priors of the landmarks it hosts, and the prior that
-earlier keyframes left behind. At fixed linearisation points they form the quadratic
+What goes with a keyframe are the terms on the landmarks that it hosts, on its pose, on pairs that it is part of, and
+the prior that earlier keyframes left behind. At fixed linearisation points they form the quadratic
 
     1/2 x' H x + g' x,     x = (states) boxminus (linearisation points),
 
@@ -20,15 +20,22 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.linearise import SHARED, edge_observations, linearise
-from vggtgeo.bundle.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.objective import prepared
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.marginal import MarginalPrior
+from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
+from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import reduce
 
 _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
-def no_prior(keyframes: int, dtype: np.dtype | type = np.float64) -> MarginalPrior:
-    """A prior that says nothing, of the shape of one for `keyframes` keyframes.
+def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: int = 4) -> MarginalPrior:
+    """A prior that says nothing, of the shape of one for `keyframes` keyframes and a camera of `parameters`.
 
     Example:
         >>> import vggtgeo as vg
@@ -36,64 +43,75 @@ def no_prior(keyframes: int, dtype: np.dtype | type = np.float64) -> MarginalPri
         (28, 28)
 
     """
-    size = 6 * keyframes + SHARED
+    size = lie.TANGENT * keyframes + parameters
     identity = np.tile(np.array([1.0, 0, 0, 0, 0, 0, 0], dtype), (keyframes, 1))
     return MarginalPrior(
         root=jnp.zeros((size, size), dtype),
         offset=jnp.zeros(size, dtype),
         poses=jaxlie.SE3(jnp.asarray(identity)),
-        intrinsics=jnp.zeros(SHARED, dtype),
+        intrinsics=jnp.zeros(parameters, dtype),
+        weight=jnp.ones((), dtype),
     )
 
 
 def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> MarginalPrior:
-    """The prior over poses and intrinsics that remains when keyframe `leaving` is taken out of the window.
+    """The prior over poses and camera that remains when keyframe `leaving` is taken out of the window.
 
-    `problem.marginal` must be set (`no_prior` to begin with). The result has the same shape; it says nothing about
-    the keyframe that left. Pure; `leaving` may be traced.
+    The problem must have a `marginal` term (`problem.with_term(no_prior(n))` to begin with). The result has the same
+    shape; it says nothing about the keyframe that left. Pure; `leaving` may be traced.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
-        >>> from dataclasses import replace
-        >>> window = replace(problem, marginal=vg.no_prior(4))
+        >>> window = problem.with_term(vg.no_prior(4))
         >>> prior = jax.eval_shape(vg.marginalise, window, solution.state, jax.numpy.asarray(1))
         >>> prior.root.shape
         (28, 28)
 
     """
-    prior = problem.marginal
+    prior = next((term for term in problem.terms if isinstance(term, MarginalPrior)), None)
     if prior is None:
-        raise ValueError("`problem.marginal` is None; set it to `no_prior(n)` before the first marginalisation")
+        raise ValueError(
+            "`problem` has no `marginal` term; add `problem.with_term(no_prior(n))` before the first marginalisation"
+        )
     point = _linearisation_point(prior, state)
     quadratic, gradient = _quadratic(problem, point, leaving)
-    leaving_rows = jnp.arange(len(gradient)) // 6 == leaving
-    leaving_rows = leaving_rows.at[-SHARED:].set(False)
-    held = jnp.concatenate([jnp.repeat(problem.fixed_pose, 6), problem.fixed_intrinsics])
+    leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
+    leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
+    held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics])
     quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
     root, offset = square_root(quadratic, gradient)
-    return MarginalPrior(root=root, offset=offset, poses=point.poses, intrinsics=point.intrinsics)
+    return MarginalPrior(
+        root=root, offset=offset, poses=point.poses, intrinsics=point.intrinsics, weight=jnp.ones_like(offset, shape=())
+    )
 
 
 def reorder(prior: MarginalPrior, order: np.ndarray) -> MarginalPrior:
-    """The prior with keyframe `order[i]` in place i; -1 puts a keyframe there that it says nothing about."""
+    """The prior with keyframe `order[i]` in place i; -1 puts a keyframe there that it says nothing about.
+
+    Example: the first of three keyframes has left, and a place is free at the end.
+        >>> import numpy as np, vggtgeo as vg
+        >>> vg.reorder(vg.no_prior(3), np.array([1, 2, -1])).root.shape
+        (22, 22)
+
+    """
     order = np.asarray(order)
-    known = order >= 0
-    columns = (6 * np.maximum(order, 0)[:, None] + np.arange(6)).reshape(-1)
-    shared = prior.root.shape[1] - SHARED + np.arange(SHARED)
-    mask = np.concatenate([np.repeat(known, 6), np.ones(SHARED, bool)])
+    known, tail = order >= 0, len(prior.intrinsics)
+    columns = (lie.TANGENT * np.maximum(order, 0)[:, None] + np.arange(lie.TANGENT)).reshape(-1)
+    shared = prior.root.shape[1] - tail + np.arange(tail)
+    mask = np.concatenate([np.repeat(known, lie.TANGENT), np.ones(tail, bool)])
     root = np.where(mask, np.asarray(prior.root)[:, np.concatenate([columns, shared])], 0.0)
     identity = np.array([1.0, 0, 0, 0, 0, 0, 0])
     poses = np.where(known[:, None], np.asarray(prior.poses.wxyz_xyz)[np.maximum(order, 0)], identity)
     dtype = prior.root.dtype
-    return MarginalPrior(
-        jnp.asarray(root, dtype), prior.offset, jaxlie.SE3(jnp.asarray(poses, dtype)), prior.intrinsics
+    return eqx.tree_at(
+        lambda term: (term.root, term.poses.wxyz_xyz), prior, (jnp.asarray(root, dtype), jnp.asarray(poses, dtype))
     )
 
 
 def _linearisation_point(prior: MarginalPrior, state: State) -> State:
     """The prior's own points where it says something, the current estimate elsewhere."""
-    weight = jnp.sum(prior.root**2, 0)
-    pose_known = jnp.sum(weight[:-SHARED].reshape(-1, 6), 1) > 0
-    intrinsics_known = weight[-SHARED:] > 0
+    weight, tail = jnp.sum(prior.root**2, 0), len(prior.intrinsics)
+    pose_known = jnp.sum(weight[:-tail].reshape(-1, lie.TANGENT), 1) > 0
+    intrinsics_known = weight[-tail:] > 0
     return State(
         jaxlie.SE3(jnp.where(pose_known[:, None], prior.poses.wxyz_xyz, state.poses.wxyz_xyz)),
         jnp.where(intrinsics_known, prior.intrinsics, state.intrinsics),
@@ -102,21 +120,26 @@ def _linearisation_point(prior: MarginalPrior, state: State) -> State:
 
 
 def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""]) -> _Quadratic:
-    """Hessian and gradient of the leaving factors over the dense coordinates, landmarks eliminated."""
-    hosted = problem.edges.source == leaving
-    own = jnp.arange(problem.num_keyframes) == leaving
-    factors = eqx.tree_at(
-        lambda p: (p.points.weight, p.lines.weight, p.depth.weight, p.intrinsics_prior.information),
-        problem,
-        (
-            jnp.where(hosted[:, None], problem.points.weight, 0.0),
-            jnp.where(hosted[:, None], problem.lines.weight, 0.0),
-            jnp.where(own[:, None], problem.depth.weight, 0.0),
-            jnp.zeros_like(problem.intrinsics_prior.information),
-        ),
-    )
-    reduced = reduce(linearise(factors, edge_observations(factors), point))
+    """Hessian and gradient of the leaving terms over the dense coordinates, landmarks eliminated."""
+    leaving_terms = tuple(_leaving(term, problem, leaving) for term in problem.terms)
+    reduced = reduce(linearise(prepared(problem.with_terms(leaving_terms)), point))
     return reduced.hessian - reduced.schur, reduced.gradient - reduced.schur_gradient
+
+
+def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""]) -> AbstractTerm:
+    """The part of a term that goes with a keyframe; what is about the camera alone stays in the problem."""
+    goes: Array
+    if isinstance(term, EdgeTerm):
+        goes = (problem.edges.source == leaving)[:, None]
+    elif isinstance(term, SlotTerm):
+        goes = (jnp.arange(problem.num_keyframes) == leaving)[:, None]
+    elif isinstance(term, PoseTerm):
+        goes = term.keyframe == leaving
+    elif isinstance(term, PairTerm):
+        goes = (term.first == leaving) | (term.second == leaving)
+    else:
+        goes = jnp.asarray(isinstance(term, DenseTerm) and not isinstance(term, CameraTerm))
+    return term.reweighted(jnp.where(goes, term.weight, jnp.zeros_like(term.weight)))
 
 
 def _eliminate(

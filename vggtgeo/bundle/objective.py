@@ -1,66 +1,27 @@
-"""The energy of bundle adjustment, term by term: the readable definition, built from the residuals of one observation.
+"""The energy of bundle adjustment: the sum of its terms, from the residual that each one defines.
 
-The solver has a faster form of the same numbers (`linearise.py`); the tests hold the two equal. This form is the one
-that is differentiated: implicit gradients take derivatives of it with respect to every leaf of the problem.
+This is what the solver minimises, term by term and in the same functions: there is no other definition.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.problem import MarginalPrior, Problem, State
-from vggtgeo.bundle.residuals import depth_residual, line_residual, point_residual
+from vggtgeo.bundle.fast import pinhole
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, uses_projection
+from vggtgeo.bundle.terms.node import node_residuals
+from vggtgeo.bundle.terms.term import robust_energy
 from vggtgeo.geometry import lie
+from vggtgeo.geometry.cameras import AbstractCamera
 
-
-class EnergyTerms(NamedTuple):
-    """`1/2 sum rho(w |r|^2)` of each factor kind; the two Gaussian priors have no `rho`."""
-
-    points: Float[Array, ""]
-    lines: Float[Array, ""]
-    depth: Float[Array, ""]
-    intrinsics: Float[Array, ""]
-    marginal: Float[Array, ""]
-
-
-def energy_terms(problem: Problem, state: State) -> EnergyTerms:
-    """The energy of each factor kind at `state`.
-
-    Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
-        >>> terms = jax.jit(vg.energy_terms)(problem, solution.state)
-        >>> bool(terms.lines < terms.points)
-        True
-
-    """
-    host, p = problem.edges.source, problem.num_points
-    relative = relative_poses(problem, state)
-    pixels, depths = problem.pixels[host], state.inverse_depth[host]
-    over_slots, over_edges = (None, None, 0, 0, 0), (0, None, 0, 0, 0)
-
-    def residuals(function: Callable[..., Array], slots: slice, measured: Array, weight: Array) -> Array:
-        each = jax.vmap(jax.vmap(function, over_slots), over_edges)
-        measured = jnp.where(weight[..., None] > 0, measured, 0.0)
-        return each(relative, state.intrinsics, pixels[:, slots], depths[:, slots], measured)
-
-    point = residuals(point_residual, slice(0, p), problem.points.target, problem.points.weight)
-    line = residuals(line_residual, slice(p, None), problem.lines.coefficients, problem.lines.weight)
-    known = problem.depth.weight > 0
-    mean, sigma = jnp.where(known, problem.depth.mean, 0.0), jnp.where(known, problem.depth.sigma, 1.0)
-    depth = jax.vmap(jax.vmap(depth_residual))(state.inverse_depth, mean, sigma)
-    offset = state.intrinsics - problem.intrinsics_prior.mean
-    return EnergyTerms(
-        points=_robust(problem, problem.points.weight, jnp.sum(point**2, -1)),
-        lines=_robust(problem, problem.lines.weight, line**2),
-        depth=_robust(problem, problem.depth.alpha * problem.depth.weight, depth**2),
-        intrinsics=jnp.sum(problem.intrinsics_prior.information * offset**2) / 2,
-        marginal=marginal_energy(problem.marginal, state),
-    )
+EdgeData = tuple[dict[str, Any], ...]
+"""Data and weights of each edge term, of one edge or with a leading axis of edges."""
 
 
 def energy(problem: Problem, state: State) -> Float[Array, ""]:
@@ -72,7 +33,61 @@ def energy(problem: Problem, state: State) -> Float[Array, ""]:
         True
 
     """
-    return sum(energy_terms(problem, state), jnp.zeros((), state.inverse_depth.dtype))
+    return prepared_energy(prepared(problem), state)
+
+
+def energy_terms(problem: Problem, state: State) -> dict[str, Float[Array, ""]]:
+    """The energy of each term at `state`, by its name.
+
+    Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
+        >>> terms = jax.jit(vg.energy_terms)(problem, solution.state)
+        >>> bool(terms["lines"] < terms["points"])
+        True
+
+    """
+    return {term.name: energy(problem.with_terms((term,)), state) for term in problem.terms}
+
+
+def prepared(problem: Problem) -> Problem:
+    """The problem with absent observations made harmless and laid out for the loops over edges; done once a solve."""
+    return problem.with_terms(tuple(term.prepared() for term in problem.terms))
+
+
+def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
+    """The energy of a prepared problem: one pass over the edges, and the terms without landmarks."""
+    total = _without_edges(problem, state)
+    if not problem.edge_terms:
+        return total
+
+    camera, hosts = camera_of(problem, state), hosts_of(problem, state)
+
+    def body(sum_: Array, edge: Any) -> tuple[Array, None]:
+        host, motion, data = edge
+        view = view_of(camera, hosts, host, motion)
+        return sum_ + sum(term.energy(seen) for term, seen in of_edge(problem, view, data)), None
+
+    edges = (problem.edges.source, motions_of(relative_poses(problem, state)), edge_data(problem))
+    total, _ = jax.lax.scan(body, total, edges)
+    return total
+
+
+def _without_edges(problem: Problem, state: State) -> Float[Array, ""]:
+    camera, poses = camera_of(problem, state), state.poses.wxyz_xyz
+    total = jnp.zeros((), state.inverse_depth.dtype)
+    for slot in problem.slot_terms:
+        total += robust_energy(slot.kernel, slot.weights, slot.residuals(state.inverse_depth))
+    for node in problem.node_terms:
+        total += robust_energy(node.kernel, node.weights, node_residuals(node, poses, camera))
+    for own in problem.camera_terms:
+        total += robust_energy(own.kernel, own.weights, own.residuals(state.intrinsics))
+    for dense in problem.dense_terms:
+        total += robust_energy(dense.kernel, dense.weights, dense.residual(state.poses, state.intrinsics))
+    return total
+
+
+def camera_of(problem: Problem, state: State) -> AbstractCamera:
+    """The camera with its estimated parameters."""
+    return problem.camera(state.intrinsics)
 
 
 def relative_poses(problem: Problem, state: State) -> jaxlie.SE3:
@@ -81,22 +96,54 @@ def relative_poses(problem: Problem, state: State) -> jaxlie.SE3:
     return lie.relative(jaxlie.SE3(poses[problem.edges.source]), jaxlie.SE3(poses[problem.edges.target]))
 
 
-def marginal_residual(prior: MarginalPrior, state: State) -> Float[Array, " c"]:
-    """Residual of the marginalisation prior at `state`."""
-    difference = lie.boxminus(state.poses, prior.poses).reshape(-1)
-    return prior.root @ jnp.concatenate([difference, state.intrinsics - prior.intrinsics]) + prior.offset
+class Hosts(NamedTuple):
+    """What the loops over edges read of each host, slots last; made once for all edges."""
+
+    pixels: Float[Array, "n 2 s"]
+    rays: tuple[Float[Array, "n s"], Float[Array, "n s"]] | None
+    inverse_depth: Float[Array, "n s"]
 
 
-def _robust(problem: Problem, weight: Array, squared: Array) -> Float[Array, ""]:
-    """`1/2 sum rho(w s)` where `w > 0`: an absent observation may hold anything finite or not."""
-    present = weight > 0
-    squared = jnp.where(present, squared, 0.0)
-    return jnp.sum(problem.kernel.rho(jnp.where(present, weight, 0.0) * squared)) / 2
+class Motions(NamedTuple):
+    """The relative pose of each edge, as the loops read it."""
+
+    relative: jaxlie.SE3
+    rotation: Float[Array, "e 3 3"]
+    translation: Float[Array, "e 3"]
 
 
-def marginal_energy(prior: MarginalPrior | None, state: State) -> Float[Array, ""]:
-    """Energy of the marginalisation prior; zero without one."""
-    if prior is None:
-        return jnp.zeros((), state.inverse_depth.dtype)
-    residual = marginal_residual(prior, state)
-    return residual @ residual / 2
+def hosts_of(problem: Problem, state: State) -> Hosts:
+    """The slots of all hosts; with viewing rays where the hand-written derivatives know the camera."""
+    pixels, rays = jnp.swapaxes(problem.pixels, 1, 2), None
+    if uses_projection(problem.camera):
+        fx, fy, cx, cy = state.intrinsics
+        rays = ((problem.pixels[..., 0] - cx) / fx, (problem.pixels[..., 1] - cy) / fy)
+    return Hosts(pixels, rays, state.inverse_depth)
+
+
+def motions_of(relative: jaxlie.SE3) -> Motions:
+    """Relative poses, and their matrices."""
+    return Motions(relative, relative.rotation().as_matrix(), relative.translation())
+
+
+def view_of(camera: AbstractCamera, hosts: Hosts, host: Array, motion: Motions) -> EdgeView:
+    """All slots of keyframe `host`, along an edge with that relative pose."""
+    own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, host, keepdims=False), hosts)
+    fast, projection = None, None
+    if own.rays is not None:
+        fast = pinhole.OneEdge(camera.parameters, motion.rotation, motion.translation)
+        projection = pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, fast)
+    return EdgeView(motion.relative, camera, own.pixels, own.inverse_depth, fast, projection)
+
+
+def edge_data(problem: Problem) -> EdgeData:
+    """What differs from edge to edge in the terms of a prepared problem."""
+    return tuple({**term.data(), "weight": term.weight} for term in problem.edge_terms)
+
+
+def of_edge(problem: Problem, view: EdgeView, data: EdgeData) -> list[tuple[EdgeTerm, EdgeView]]:
+    """Each edge term with the data of one edge, and the slots that it is about."""
+    found = []
+    for term, own in zip(problem.edge_terms, data, strict=True):
+        found.append((term.holding(own), view.slots(term.first_slot, term.weight.shape[-1])))
+    return found

@@ -7,7 +7,7 @@ inverse depth, and no other file asks which entries are real.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,15 +16,25 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
-from vggtgeo.bundle.problem import (
-    DepthPrior,
-    Edges,
-    IntrinsicsPrior,
-    LineObservations,
-    PointObservations,
-    Problem,
-    State,
+from vggtgeo.bundle.packing_checks import (
+    as_numbers,
+    as_poses,
+    check_camera,
+    check_edges,
+    check_fixed,
+    check_indices,
+    check_kernel,
+    check_positive,
+    check_shapes,
+    check_size,
+    check_values,
 )
+from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.terms.depth import DepthPrior
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.line import LineTerm
+from vggtgeo.bundle.terms.point import PointTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.line_segments import fractions, segment_slots, straightened
 from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
@@ -133,6 +143,8 @@ class SlotIndex:
     host: np.ndarray
     slot: np.ndarray
     edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    shape: tuple[int, int] = (0, 0)
+    """Edges and slots of the problem."""
 
     def __repr__(self) -> str:
         return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
@@ -144,6 +156,20 @@ class SlotIndex:
     def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> np.ndarray:
         """Values of the point matches, `[A, ...]`, as `observations` lists them, from an array `[e, p, ...]`."""
         return np.asarray(per_match)[self.edge[observations.point_edge], self.slot[observations.point_landmark]]
+
+    def along_edges(self, edge: np.ndarray, landmark: np.ndarray, values: np.ndarray) -> Array:
+        """Data of observations as a term on edges takes it, `[e, s, ...]`, zero where nothing is given.
+
+        Args:
+            edge: int `[k]`, as `observations.edges` lists them.
+            landmark: int `[k]`, hosted in the edge's first keyframe.
+            values: `[k, ...]`.
+
+        """
+        given = np.asarray(values)
+        whole = np.zeros((*self.shape, *given.shape[1:]), given.dtype)
+        whole[self.edge[edge], self.slot[landmark]] = given
+        return jnp.asarray(whole)
 
 
 def pack(
@@ -158,6 +184,7 @@ def pack(
     fixed_pose: np.ndarray | None = None,
     fixed_intrinsics: np.ndarray | bool = False,
     kernel: AbstractKernel | None = None,
+    terms: Sequence[AbstractTerm] = (),
     dtype: DTypeLike | None = None,
 ) -> tuple[Problem, State, SlotIndex]:
     """Pack flat observations and an initial guess into arrays.
@@ -173,12 +200,15 @@ def pack(
         fixed_pose: bool `[n]`; None holds the first pose.
         fixed_intrinsics: bool or bool `[4]`: intrinsics that are held.
         kernel: robust kernel; None = Cauchy with delta 1.5 px, the best of `benchmarks/robustness.py`.
+        terms: what else is known: terms on poses, pairs or the camera, the prior of a marginalisation. Terms on
+            landmarks are added afterwards with `problem.with_term`, see `SlotIndex.along_edges`.
         dtype: float type of all arrays; None = JAX's own, which is double where `jax_enable_x64` is on.
 
     Raises:
         InputError: an array of a wrong shape, an index out of range, a match given twice, a landmark with both points
             and lines, an observation between keyframes that its landmark is not hosted in, an inverse depth, focal
-            length or standard deviation that is not positive, or a size that is too small.
+            length or standard deviation that is not positive, weights that are negative or NaN, lines that are not
+            normalised, an edge twice or to itself, a kernel that is none, or a size that is too small.
 
     Example:
         >>> import vggtgeo as vg
@@ -190,21 +220,26 @@ def pack(
 
     """
     dtype = jnp.result_type(float) if dtype is None else dtype
+    observations, poses = _as_arrays(observations), as_poses(poses)
+    intrinsics, inverse_depth = as_numbers("intrinsics", intrinsics), as_numbers("inverse_depth", inverse_depth)
     count = len(observations.host)
-    _check_shapes(observations, poses, intrinsics)
-    _check_indices(observations, len(poses))
-    _check_positive("inverse_depth", inverse_depth, count)
-    _check_camera(poses, intrinsics, intrinsics_sigma)
+    check_kernel(kernel)
+    check_shapes(observations, poses, intrinsics)
+    check_indices(observations, len(poses))
+    check_edges(observations.edges)
+    check_values(observations)
+    check_positive("inverse_depth", inverse_depth, count)
+    check_camera(poses, intrinsics, intrinsics_sigma)
     slots = _assign_slots(observations, len(poses), size.samples if size else None)
     edges, order, ranks = _sort_edges(observations.edges, len(poses))
     needed = PaddedSize(len(poses), slots.points, slots.lines, ranks, len(edges), slots.samples)
     size = size or needed
-    _check_size(size, needed)
+    check_size(size, needed)
     lines = slots.where.slot >= slots.points
     graph, position = _pad_edges(edges, size)
     row = position[order]
     slot = np.where(lines, slots.where.slot - slots.points + size.points, slots.where.slot)
-    index = SlotIndex(slots.where.host, slot, row)
+    index = SlotIndex(slots.where.host, slot, row, (len(graph.source), size.points + size.lines))
 
     def per_slot(values: np.ndarray, empty: float) -> Array:
         array = np.full((size.keyframes, size.points + size.lines, *np.shape(values)[1:]), empty, dtype)
@@ -214,30 +249,36 @@ def pack(
     point_at = (row[observations.point_edge], index.slot[observations.point_landmark])
     line_at = (row[observations.line_edge], index.slot[observations.line_landmark] - size.points)
     num_edges = len(graph.source)
-    points = PointObservations(
-        _scatter(point_at, observations.point_target, (num_edges, size.points, 2), dtype),
-        _scatter(point_at, observations.point_weight, (num_edges, size.points), dtype),
+    kernel = kernel or Cauchy(jnp.asarray(1.5, dtype))
+    points = PointTerm(
+        target=_scatter(point_at, observations.point_target, (num_edges, size.points, 2), dtype),
+        weight=_scatter(point_at, observations.point_weight, (num_edges, size.points), dtype),
+        kernel=kernel,
     )
-    line_observations = LineObservations(
-        _scatter(line_at, observations.line_coefficients, (num_edges, size.lines, 3), dtype),
-        _scatter(line_at, observations.line_weight, (num_edges, size.lines), dtype),
+    line_term = LineTerm(
+        coefficients=_scatter(line_at, observations.line_coefficients, (num_edges, size.lines, 3), dtype),
+        weight=_scatter(line_at, observations.line_weight, (num_edges, size.lines), dtype),
+        kernel=kernel,
+        first_slot=size.points,
     )
     sigma = np.inf if intrinsics_sigma is None else np.asarray(intrinsics_sigma, dtype)
     padding = size.keyframes - len(poses)
-    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else np.asarray(fixed_pose, bool)
+    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, len(poses))
+    held = check_fixed("fixed_intrinsics", fixed_intrinsics, len(intrinsics))
     problem = Problem(
         pixels=per_slot(observations.pixel, 0.0),
         edges=graph,
-        points=points,
-        lines=line_observations,
-        depth=_depth_prior(observations, per_slot, count, dtype),
-        intrinsics_prior=IntrinsicsPrior(
-            jnp.asarray(intrinsics if intrinsics_mean is None else intrinsics_mean, dtype),
-            jnp.asarray(np.broadcast_to(1 / np.square(sigma), 4), dtype),
+        terms=(
+            *(points, line_term, _depth_prior(observations, per_slot, count, dtype, kernel)),
+            IntrinsicsPrior(
+                index=jnp.arange(len(intrinsics)),
+                mean=jnp.asarray(intrinsics if intrinsics_mean is None else intrinsics_mean, dtype),
+                weight=jnp.asarray(np.broadcast_to(1 / np.square(sigma), len(intrinsics)), dtype),
+            ),
+            *terms,
         ),
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
-        fixed_intrinsics=jnp.asarray(np.broadcast_to(fixed_intrinsics, 4)),
-        kernel=kernel or Cauchy(jnp.asarray(1.5, dtype)),
+        fixed_intrinsics=jnp.asarray(held),
     )
     depths = per_slot(inverse_depth, 1.0)
     if observations.segment is not None:
@@ -249,6 +290,13 @@ def pack(
         depths,
     )
     return problem, state, index
+
+
+def _as_arrays(observations: Observations) -> Observations:
+    """The same observations, lists turned into arrays."""
+    names = [field.name for field in fields(observations) if field.name != "alpha"]
+    given = {name: getattr(observations, name) for name in names}
+    return replace(observations, **{name: as_numbers(name, v) for name, v in given.items() if v is not None})
 
 
 def _with_segments(problem: Problem, depths: Array, present: Array, size: PaddedSize) -> tuple[Problem, Array]:
@@ -267,21 +315,23 @@ def _with_segments(problem: Problem, depths: Array, present: Array, size: Padded
 
 
 def _depth_prior(
-    observations: Observations, per_slot: Callable[[np.ndarray, float], Array], count: int, dtype: DTypeLike
+    observations: Observations,
+    per_slot: Callable[[np.ndarray, float], Array],
+    count: int,
+    dtype: DTypeLike,
+    kernel: AbstractKernel,
 ) -> DepthPrior:
-    if observations.depth_mean is None:
-        zero, one = np.zeros(count), np.ones(count)
-        return DepthPrior(
-            per_slot(one, 1.0), per_slot(one, 1.0), per_slot(zero, 0.0), jnp.asarray(observations.alpha, dtype)
-        )
-    sigma = np.ones(count) if observations.depth_sigma is None else observations.depth_sigma
-    weight = np.ones(count) if observations.depth_weight is None else observations.depth_weight
-    _check_positive("depth_sigma", sigma, count)
+    given = observations.depth_mean is not None
+    fill = lambda values, default: np.full(count, default) if values is None or not given else values
+    mean, sigma = fill(observations.depth_mean, 1.0), fill(observations.depth_sigma, 1.0)
+    weight = fill(observations.depth_weight, 1.0 if given else 0.0)
+    check_positive("depth_sigma", sigma, count)
     return DepthPrior(
-        per_slot(observations.depth_mean, 1.0),
-        per_slot(sigma, 1.0),
-        per_slot(weight, 0.0),
-        jnp.asarray(observations.alpha, dtype),
+        mean=per_slot(mean, 1.0),
+        sigma=per_slot(sigma, 1.0),
+        weight=per_slot(weight, 0.0),
+        alpha=jnp.asarray(observations.alpha, dtype),
+        kernel=kernel,
     )
 
 
@@ -359,88 +409,3 @@ def _pad_edges(edges: np.ndarray, size: PaddedSize) -> tuple[Edges, np.ndarray]:
     of_host[source, ranks] = np.arange(len(source))
     arrays = (jnp.asarray(array, jnp.int32) for array in (source, target, ranks, of_host))
     return Edges(*arrays), position
-
-
-def _check_indices(observations: Observations, keyframes: int) -> None:
-    edges, landmarks = len(observations.edges), len(observations.host)
-    limits = [
-        ("edges", observations.edges, keyframes, "keyframes"),
-        ("host", observations.host, keyframes, "keyframes"),
-        ("point_edge", observations.point_edge, edges, "edges"),
-        ("line_edge", observations.line_edge, edges, "edges"),
-        ("point_landmark", observations.point_landmark, landmarks, "landmarks"),
-        ("line_landmark", observations.line_landmark, landmarks, "landmarks"),
-    ]
-    for name, given, limit, what in limits:
-        values = np.asarray(given)
-        if values.size and (values.min() < 0 or values.max() >= limit):
-            raise InputError(
-                f"`{name}` goes from {values.min()} to {values.max()}; there are {limit} {what}: use 0 to {limit - 1}"
-            )
-    for kind in ("point", "line"):
-        edge, landmark = getattr(observations, f"{kind}_edge"), getattr(observations, f"{kind}_landmark")
-        wrong = observations.edges[edge, 0] != observations.host[landmark]
-        if np.any(wrong):
-            first = int(np.nonzero(wrong)[0][0])
-            raise InputError(
-                f"`{kind}_edge[{first}]` starts at keyframe {observations.edges[edge[first], 0]}, but its landmark is "
-                f"hosted in keyframe {observations.host[landmark[first]]}: an edge observes landmarks of its own host"
-            )
-        _, first_seen = np.unique(edge * landmarks + landmark, return_index=True)
-        if len(first_seen) < len(edge):
-            twice = np.delete(np.arange(len(edge)), first_seen)[0]
-            raise InputError(
-                f"`{kind}_edge` and `{kind}_landmark` name landmark {landmark[twice]} on edge {edge[twice]} more than "
-                "once; a landmark has one match an edge"
-            )
-
-
-def _check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.ndarray) -> None:
-    edges, landmarks = len(observations.edges), len(observations.host)
-    points, lines = len(observations.point_edge), len(observations.line_edge)
-    expected = {
-        "edges": (edges, 2),
-        "pixel": (landmarks, 2),
-        "point_landmark": (points,),
-        "point_target": (points, 2),
-        "point_weight": (points,),
-        "line_landmark": (lines,),
-        "line_coefficients": (lines, 3),
-        "line_weight": (lines,),
-    }
-    optional = ("depth_mean", "depth_sigma", "depth_weight", "segment")
-    given = {name: getattr(observations, name) for name in (*expected, *optional)}
-    expected |= {name: (landmarks,) for name in optional if given[name] is not None}
-    given |= {"poses": poses, "intrinsics": intrinsics}
-    for name, shape in {**expected, "poses": (len(poses), 7), "intrinsics": (4,)}.items():
-        if np.shape(given[name]) != shape:
-            raise InputError(f"`{name}` has shape {np.shape(given[name])}; expected {shape}")
-
-
-def _check_camera(poses: np.ndarray, intrinsics: np.ndarray, sigma: np.ndarray | float | None) -> None:
-    if np.any(np.asarray(intrinsics)[:2] <= 0):
-        raise InputError(f"`intrinsics` is {np.asarray(intrinsics)}; both focal lengths must be positive")
-    if sigma is not None and not np.all(np.asarray(sigma) > 0):
-        raise InputError(f"`intrinsics_sigma` is {sigma}; it must be positive (None = no prior)")
-    lengths = np.linalg.norm(poses[:, :4], axis=1)
-    wrong = np.nonzero(np.abs(lengths - 1) > 1e-3)[0]
-    if len(wrong):
-        raise InputError(f"`poses[{wrong[0]}]` has a quaternion of length {lengths[wrong[0]]:.3g}; expected 1")
-
-
-def _check_positive(name: str, values: np.ndarray, count: int) -> None:
-    if np.shape(values) != (count,):
-        raise InputError(f"`{name}` has shape {np.shape(values)}; expected ({count},), one a landmark")
-    bad = ~(np.isfinite(values) & (np.asarray(values) > 0))
-    if np.any(bad):
-        first = int(np.nonzero(bad)[0][0])
-        raise InputError(f"`{name}[{first}]` is {values[first]}; it must be positive and finite")
-
-
-def _check_size(size: PaddedSize, needed: PaddedSize) -> None:
-    if needed.samples is not None and size.lines % needed.samples:
-        raise InputError(f"`size.lines` is {size.lines}; it must be a multiple of `size.samples`, {needed.samples}")
-    for name in ("keyframes", "points", "lines", "ranks", "edges"):
-        have, need = getattr(size, name), getattr(needed, name)
-        if have is not None and (have < need or (name == "edges" and have != need)):
-            raise InputError(f"`size.{name}` is {have}; this problem needs {need}")

@@ -1,22 +1,28 @@
-"""The bundle-adjustment problem as arrays: state, observations, priors. All shapes are static, absence is weight 0.
+"""The bundle-adjustment problem: a state, a graph, and a sum of terms. All shapes are static, absence is weight 0.
 
-Sizes: `n` keyframes, `p` point slots and `l` line slots a keyframe (`s = p + l` inverse depths: points first), `e`
-directed edges `(i, j)`: slots of keyframe i observed in keyframe j.
+Sizes: `n` keyframes, `s` inverse depths ("slots") a keyframe, `e` directed edges `(i, j)`: slots of keyframe i observed
+in keyframe j, `q` parameters of the camera that all keyframes share.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import equinox as eqx
-import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
+from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
+from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
 
 
 class State(eqx.Module):
-    """What bundle adjustment estimates: `n` poses, the intrinsics they share, `s` inverse depths a keyframe.
+    """What bundle adjustment estimates: `n` poses, the camera they share, `s` inverse depths a keyframe.
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
@@ -31,22 +37,23 @@ class State(eqx.Module):
 
     poses: jaxlie.SE3
     """World -> camera of each keyframe, batch `[n]`."""
-    intrinsics: Float[Array, "4"]
-    """`fx, fy, cx, cy` in pixels, shared by all keyframes."""
+    intrinsics: Float[Array, " q"]
+    """Parameters of the camera: `fx, fy, cx, cy` in pixels, then those of its distortion."""
     inverse_depth: Float[Array, "n s"]
     """1/m, along the optical axis of the host keyframe, one a slot."""
 
     def moved(self, step: Float[Array, " t"]) -> State:
         """The state that a step leads to, in the coordinates of every Hessian and covariance of this package.
 
-        step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), four of the intrinsics (pixels), then the
+        step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), the camera's parameters (pixels), then the
         inverse depths (1/m), keyframe by keyframe. Pure; the derivative at a zero step is the tangent map.
         """
-        poses = 6 * len(self.inverse_depth)
+        poses = lie.TANGENT * len(self.inverse_depth)
+        dense = poses + len(self.intrinsics)
         return State(
-            lie.move(self.poses, step[:poses].reshape(-1, 6)),
-            self.intrinsics + step[poses : poses + 4],
-            self.inverse_depth + step[poses + 4 :].reshape(self.inverse_depth.shape),
+            lie.move(self.poses, step[:poses].reshape(-1, lie.TANGENT)),
+            self.intrinsics + step[poses:dense],
+            self.inverse_depth + step[dense:].reshape(self.inverse_depth.shape),
         )
 
 
@@ -63,71 +70,20 @@ class Edges(eqx.Module):
     """Index of the edge of each rank of each host, or `e` where a host has fewer than `k`: the inverse of `rank`."""
 
 
-class PointObservations(eqx.Module):
-    """Matches of point slots along edges."""
-
-    target: Float[Array, "e p 2"]
-    """Matched pixel in keyframe j."""
-    weight: Float[Array, "e p"]
-    """Confidence weight, >= 0; 0 means no match."""
-
-
-class LineObservations(eqx.Module):
-    """Lines matched to line samples along edges."""
-
-    coefficients: Float[Array, "e l 3"]
-    """`(a, b, c)` with `a^2 + b^2 = 1`, of the line in keyframe j."""
-    weight: Float[Array, "e l"]
-    """Confidence weight, >= 0; 0 means no match."""
-
-
-class DepthPrior(eqx.Module):
-    """A metric inverse depth for each slot: residual `(d - mean) / sigma`, weight `alpha * weight`."""
-
-    mean: Float[Array, "n s"]
-    """1/m; any finite number where `weight` is 0."""
-    sigma: Float[Array, "n s"]
-    """Standard deviation, 1/m, > 0 (1 where `weight` is 0)."""
-    weight: Float[Array, "n s"]
-    """Confidence, >= 0; 0 means no prior."""
-    alpha: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=2.0)
-    """Weight of all depth terms against the pixels' (the paper's alpha)."""
-
-
-class IntrinsicsPrior(eqx.Module):
-    """Gaussian prior on the shared intrinsics, without a robust kernel."""
-
-    mean: Float[Array, "4"]
-    information: Float[Array, "4"]
-    """`1 / sigma^2`, pixels^-2; 0 = no prior."""
-
-
-class MarginalPrior(eqx.Module):
-    """What marginalisation left behind: `r = root (x boxminus linearisation) + offset` over poses and intrinsics.
-
-    Coordinates: six a keyframe (left tangent `log(T T_lin^-1)`, translation first), then the four intrinsics.
-    """
-
-    root: Float[Array, "c c"]
-    offset: Float[Array, " c"]
-    poses: jaxlie.SE3
-    """Linearisation points, batch `[n]`; kept as long as the prior lives (first estimates)."""
-    intrinsics: Float[Array, "4"]
-
-
 class Problem(eqx.Module):
     """A bundle-adjustment problem; every float leaf may be differentiated. `vggtgeo.pack` makes one.
 
     Pixels, 1/m for inverse depths, poses world -> camera. Weight 0 means that an observation is not there, so that a
-    kind can be left out without another shape.
+    kind can be left out without another shape. A term is also an attribute by its name: `problem.points`.
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
-        >>> from dataclasses import replace
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
+        >>> [term.name for term in problem.terms]
+        ['points', 'lines', 'depth', 'intrinsics_prior']
         >>> problem.points.target.shape, problem.lines.weight.shape
         ((6, 10, 2), (6, 4))
-        >>> without = replace(problem, lines=replace(problem.lines, weight=jnp.zeros((6, 4))))
+        >>> without = problem.with_term(problem.lines.reweighted(jnp.zeros((6, 4))))
         >>> bool(vg.energy(without, initial) < vg.energy(problem, initial))
         True
 
@@ -136,33 +92,84 @@ class Problem(eqx.Module):
     pixels: Float[Array, "n s 2"]
     """Where slot s of keyframe i looks: point slots first, then line samples."""
     edges: Edges
-    points: PointObservations
-    lines: LineObservations
-    depth: DepthPrior
-    intrinsics_prior: IntrinsicsPrior
+    terms: tuple[AbstractTerm, ...]
+    """What is minimised: the sum of their energies."""
     fixed_pose: Bool[Array, " n"]
     """Keyframes whose pose is held (the gauge)."""
-    fixed_intrinsics: Bool[Array, "4"]
-    """Intrinsics that are held."""
-    kernel: AbstractKernel = Cauchy()
-    marginal: MarginalPrior | None = None
-    fraction: Float[Array, "n g q"] | None = None
-    """Two-ends lines: the `l = g q` line slots are `g` segments of `q` samples, and the inverse depth of a segment is
-    an affine function of this position along it (0 and 1 at its ends). It is a constant to derivatives. None: each
-    sample has its own inverse depth."""
+    fixed_intrinsics: Bool[Array, " q"]
+    """Parameters of the camera that are held."""
+    fraction: Float[Array, "n g m"] | None = None
+    """Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a segment is an
+    affine function of this position along it (0 and 1 at its ends). None: each sample has its own inverse depth."""
+    camera: type[AbstractCamera] = eqx.field(static=True, default=Pinhole)
+    """Model of the camera whose parameters the state holds."""
     positive_depth: bool = eqx.field(static=True, default=True)
     """Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver without bounds."""
+
+    def __getattr__(self, name: str) -> Any:
+        for term in vars(self).get("terms", ()):
+            if getattr(term, "name", None) == name:
+                return term
+        raise AttributeError(f"`Problem` has no attribute and no term `{name}`")
+
+    def with_term(self, term: AbstractTerm) -> Problem:
+        """The problem with `term` in place of the one of the same name, or added as the last."""
+        names = [old.name for old in self.terms]
+        terms = tuple(term if old.name == term.name else old for old in self.terms)
+        return self.with_terms(terms if term.name in names else (*terms, term))
+
+    def without_term(self, name: str) -> Problem:
+        """The problem without the term of that name, if it has one."""
+        return self.with_terms(tuple(term for term in self.terms if term.name != name))
+
+    def with_terms(self, terms: tuple[AbstractTerm, ...]) -> Problem:
+        """The problem with other terms."""
+        return eqx.tree_at(lambda problem: problem.terms, self, terms)
+
+    @property
+    def edge_terms(self) -> tuple[EdgeTerm, ...]:
+        """Terms along edges that have room for an observation."""
+        return tuple(term for term in self._of_kind(EdgeTerm) if term.weight.shape[-1])
+
+    @property
+    def slot_terms(self) -> tuple[SlotTerm, ...]:
+        """Terms on landmarks."""
+        return tuple(self._of_kind(SlotTerm))
+
+    @property
+    def node_terms(self) -> tuple[PoseTerm | PairTerm, ...]:
+        """Terms on poses and pairs of them."""
+        return tuple(term for term in self.terms if isinstance(term, PoseTerm | PairTerm))
+
+    @property
+    def camera_terms(self) -> tuple[CameraTerm, ...]:
+        """Terms on the camera."""
+        return tuple(self._of_kind(CameraTerm))
+
+    @property
+    def dense_terms(self) -> tuple[DenseTerm, ...]:
+        """Terms on everything dense."""
+        return tuple(self._of_kind(DenseTerm))
+
+    def _of_kind(self, kind: type) -> Iterator[Any]:
+        return (term for term in self.terms if isinstance(term, kind))
 
     @property
     def num_keyframes(self) -> int:
         return self.pixels.shape[0]
 
     @property
-    def num_points(self) -> int:
-        """Point slots a keyframe."""
-        return self.points.weight.shape[1]
+    def num_parameters(self) -> int:
+        """Parameters of the camera."""
+        return self.fixed_intrinsics.shape[0]
 
     @property
     def num_camera(self) -> int:
-        """Size of the dense part of the state: six a keyframe and four intrinsics."""
-        return 6 * self.num_keyframes + 4
+        """Size of the dense part of the state: six a keyframe, and the camera's parameters."""
+        return lie.TANGENT * self.num_keyframes + self.num_parameters
+
+    @property
+    def first_segment(self) -> int:
+        """First slot that belongs to a two-ends line."""
+        slots = self.pixels.shape[1]
+        return slots if self.fraction is None else slots - self.fraction.shape[1] * self.fraction.shape[2]

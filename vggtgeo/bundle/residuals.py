@@ -1,62 +1,142 @@
-"""Residuals of bundle adjustment, each written for ONE observation: no mask, no batch, no weight (the reprojection,
-line and depth terms of the VGGT-Geo paper).
-
-Notation: host camera `i` sees a point at pixel `u` with inverse depth `d`; `M = T_j T_i^-1` maps host to target camera.
-The point is carried scaled by `d`: `Y = R [(u - c) / f, 1] + d t`, which stays finite for points at infinity.
-"""
+"""The residuals of a problem, term by term, and how large they are: the first thing to look at after a solve."""
 
 from __future__ import annotations
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
-import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-MIN_RELATIVE_DEPTH = 1e-2
-"""Lower bound of `z_j / z_i`: a point nearer than this to the target's plane, or behind it, projects as if it lay
-there, far outside the image, where a robust kernel sees it as an outlier; the projection never divides by zero."""
-
-
-def project(
-    relative_pose: jaxlie.SE3,
-    intrinsics: Float[Array, "4"],
-    pixel: Float[Array, "2"],
-    inverse_depth: Float[Array, ""],
-) -> Float[Array, "2"]:
-    """Pixel in camera j of the point that camera i sees at `pixel` with `inverse_depth` (1/m)."""
-    focal, centre = intrinsics[:2], intrinsics[2:]
-    ray = jnp.concatenate([(pixel - centre) / focal, jnp.ones(1, pixel.dtype)])
-    point = relative_pose.rotation().as_matrix() @ ray + inverse_depth * relative_pose.translation()
-    return focal * point[:2] / jnp.maximum(point[2], MIN_RELATIVE_DEPTH) + centre
-
-
-def point_residual(
-    relative_pose: jaxlie.SE3,
-    intrinsics: Float[Array, "4"],
-    pixel: Float[Array, "2"],
-    inverse_depth: Float[Array, ""],
-    target: Float[Array, "2"],
-) -> Float[Array, "2"]:
-    """Projected point minus matched pixel `target`, in pixels."""
-    return project(relative_pose, intrinsics, pixel, inverse_depth) - target
+from vggtgeo.bundle.objective import (
+    camera_of,
+    edge_data,
+    hosts_of,
+    motions_of,
+    of_edge,
+    prepared,
+    relative_poses,
+    view_of,
+)
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm, node_residuals
+from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.io.readable import Readable
 
 
-def line_residual(
-    relative_pose: jaxlie.SE3,
-    intrinsics: Float[Array, "4"],
-    pixel: Float[Array, "2"],
-    inverse_depth: Float[Array, ""],
-    coefficients: Float[Array, "3"],
-) -> Float[Array, ""]:
-    """Signed distance in pixels of a projected line sample to the matched line `a u + b v + c = 0`, `a^2 + b^2 = 1`."""
-    projected = project(relative_pose, intrinsics, pixel, inverse_depth)
-    return coefficients[0] * projected[0] + coefficients[1] * projected[1] + coefficients[2]
+class ResidualSizes(Readable):
+    """Root mean square of each term's residuals, weighted as its robust kernel weighs them; NaN where a term has none.
 
+    Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
+        >>> sizes = jax.jit(vg.residual_sizes)(problem, solution.state)
+        >>> int(sizes.count["points"])
+        240
 
-def depth_residual(
-    inverse_depth: Float[Array, ""], prior: Float[Array, ""], sigma: Float[Array, ""]
-) -> Float[Array, ""]:
-    """Inverse depth minus its metric prior, in standard deviations `sigma` (1/m) of that prior.
-
-    The paper's raw difference is `sigma = 1`; `sigma = sigma_rel * prior` makes it commensurable with pixels.
     """
-    return (inverse_depth - prior) / sigma
+
+    rms: dict[str, Float[Array, ""]]
+    """By name of the term, in its unit: pixels for points and lines, standard deviations for priors."""
+    count: dict[str, Int[Array, ""]]
+    """Observations with a weight."""
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    """Of each term's residuals."""
+
+    def to_dict(self) -> dict[str, float | int]:
+        """The same as plain numbers (outside `jit`); NaN where a term has no observation."""
+        sizes = {name: float(value) for name, value in self.rms.items()}
+        return {**sizes, **{f"{name}_count": int(value) for name, value in self.count.items()}}
+
+    def __str__(self) -> str:
+        parts = [
+            f"{name} {float(self.rms[name]):.2f} {unit} ({int(self.count[name])})".replace("  ", " ")
+            for name, unit in self.units
+            if int(self.count[name])
+        ]
+        return ", ".join(parts) or "no observation"
+
+
+def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
+    """`sqrt(sum w rho' |r|^2 / sum w rho')` of each term of `problem` at `state`.
+
+    With `rho'` of the term's kernel, so that mismatches count as little as they did in the solve. Pure: works under
+    `jit` and `vmap`.
+
+    Example:
+        >>> import jax, vggtgeo as vg
+        >>> window = vg.simulate_window(noise=0.5)
+        >>> problem, initial, _ = window.pack()
+        >>> print(jax.jit(vg.residual_sizes)(problem.without_term("intrinsics_prior"), window.truth()))
+        points 0.65 px (240), lines 0.43 px (144), depth 0.71 sigma (128)
+
+    """
+    problem = prepared(problem)
+    found = {term.name: _size(term, term_residuals(problem, term, state)) for term in problem.terms}
+    return ResidualSizes(
+        {name: size for name, (size, _) in found.items()},
+        {name: count for name, (_, count) in found.items()},
+        tuple((term.name, term.unit) for term in problem.terms),
+    )
+
+
+def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."]]:
+    """Every residual of `problem` at `state`, before weights and kernel, by the name of its term.
+
+    The axes of the term's `weight` come first, then the entries of a residual where it has more than one: points
+    `[e, p, 2]`, lines `[e, l]`, depth `[n, s]`. Any finite number where an observation is absent. Pure: works under
+    `jit` and `vmap`.
+
+    Example:
+        >>> import jax, numpy as np, vggtgeo as vg
+        >>> window = vg.simulate_window(noise=0.5)
+        >>> problem, _, index = window.pack()
+        >>> found = jax.jit(vg.residuals_at)(problem, window.truth())
+        >>> matches = index.gather_points(found["points"], window.observations)
+        >>> matches.shape, round(float(np.std(matches)), 1)
+        ((240, 2), 0.5)
+
+    """
+    problem = prepared(problem)
+    found = {}
+    for term in problem.terms:
+        residual = jnp.moveaxis(term_residuals(problem, term, state), 0, -1)
+        found[term.name] = residual[..., 0] if residual.shape[-1] == 1 else residual
+    return found
+
+
+def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[Array, "m *observations"]:
+    """Residuals of one term of a prepared problem, the residual's own axis first."""
+    camera = camera_of(problem, state)
+    if isinstance(term, SlotTerm):
+        return term.residuals(state.inverse_depth)
+    if isinstance(term, PoseTerm | PairTerm):
+        return node_residuals(term, state.poses.wxyz_xyz, camera)
+    if isinstance(term, CameraTerm):
+        return term.residuals(state.intrinsics)
+    if isinstance(term, DenseTerm):
+        return term.residual(state.poses, state.intrinsics)
+    alone, hosts = problem.with_terms((term,)), hosts_of(problem, state)
+    if not alone.edge_terms:
+        return jnp.zeros((1, *term.weight.shape), state.inverse_depth.dtype)
+
+    def edge(host: Array, motion: tuple, data: tuple) -> Array:
+        ((one, view),) = of_edge(alone, view_of(camera, hosts, host, motion), data)
+        assert isinstance(one, EdgeTerm)
+        return one.residuals(view)
+
+    each = jax.vmap(edge, out_axes=1)
+    return each(problem.edges.source, motions_of(relative_poses(problem, state)), edge_data(alone))
+
+
+def count_rows(problem: Problem, term: AbstractTerm, state: State) -> Int[Array, ""]:
+    """Rows of residuals that a term of a prepared problem has, by its weights."""
+    if isinstance(term, DenseTerm):
+        return term.rows()
+    entries = jax.eval_shape(lambda: term_residuals(problem, term, state)).shape[0]
+    return entries * jnp.sum(term.present())
+
+
+def _size(term: AbstractTerm, residual: Float[Array, "m *b"]) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    squared = jnp.sum(residual**2, 0)
+    trusted = term.weights * term.kernel.weight(term.weights * squared)
+    return jnp.sqrt(jnp.sum(trusted * squared) / jnp.sum(trusted)), jnp.sum(term.present())

@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.graduation import Graduation
+from vggtgeo.bundle.linearise import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.adjoint import ArrowAdjoint
@@ -23,6 +25,7 @@ from vggtgeo.solvers.levenberg_marquardt import (
     termination_message,
     termination_name,
 )
+from vggtgeo.solvers.problem import energy_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,6 +51,14 @@ class Solution(Readable):
     gradient_norm: Float[Array, ""]
     """Largest gradient entry of the last linearisation, scaled by its curvature (unit of the root of the energy)."""
     termination: Termination
+    polished: Bool[Array, ""]
+    """Whether `state` was moved on to the optimum because it was differentiated; it is then the optimum even where the
+    iteration had not converged, and differs from what `solve` returns without differentiation."""
+    gradient_residual: Float[Array, ""]
+    """`gradient_norm` at `state` where it was polished; above `vggtgeo.solvers.adjoint.STATIONARY` the derivatives are
+    not those of an optimum."""
+    at_bound: Int[Array, ""]
+    """Landmarks that rest on the bound of positive inverse depths: they want to lie behind infinity."""
     record: IterationRecord | None = None
     """What each iteration did, with `SchurLevenbergMarquardt(record_iterations=True)`."""
 
@@ -61,6 +72,7 @@ class Solution(Readable):
             "iterations": int(self.iterations),
             "linearisations": int(self.linearisations),
             "gradient_norm": float(self.gradient_norm),
+            "at_bound": int(self.at_bound),
         }
 
     def plot(self) -> Figure:
@@ -130,10 +142,10 @@ def solve(
     if graduation is not None:
         initial = graduation.start(problem, initial, solver)
     found: optx.Solution = optx.least_squares(
-        lambda point, ba: ba.energy(point),
+        energy_of,
         solver,
         initial,
-        args=BundleAdjustment(problem),
+        args=BundleAdjustment(problem, initial),
         max_steps=solver.max_iterations,
         adjoint=adjoint,
         throw=False,
@@ -148,5 +160,14 @@ def solve(
         linearisations=last.linearisations,
         gradient_norm=last.gradient_norm,
         termination=last.termination,
+        polished=last.polished,
+        gradient_residual=last.gradient_residual,
+        at_bound=_at_bound(problem, jax.lax.stop_gradient(found.value)),
         record=last.record,
     )
+
+
+def _at_bound(problem: Problem, state: State) -> Int[Array, ""]:
+    if not problem.positive_depth:
+        return jnp.asarray(0)
+    return jnp.sum(state.inverse_depth[:, : problem.first_segment] <= MIN_INVERSE_DEPTH)

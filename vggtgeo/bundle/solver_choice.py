@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vggtgeo.bundle.problem import Problem
+from vggtgeo.bundle.terms.node import PairTerm
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
@@ -32,7 +33,7 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
         DenseCholesky()
 
     """
-    if problem.num_keyframes <= DENSE_LIMIT or problem.marginal is not None:
+    if problem.num_keyframes <= DENSE_LIMIT or problem.dense_terms:
         return DenseCholesky()
     lengths = edge_lengths(problem)
     reach = int(lengths.max(initial=1))
@@ -45,6 +46,15 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
 
 
 def edge_lengths(problem: Problem) -> np.ndarray:
-    """`|i - j|` of every edge that observes anything, `int[e']`."""
-    seen = np.any(np.asarray(problem.points.weight) > 0, 1) | np.any(np.asarray(problem.lines.weight) > 0, 1)
-    return np.abs(np.asarray(problem.edges.source) - np.asarray(problem.edges.target))[seen]
+    """`|i - j|` of every edge that observes anything, and half that of every pair (a band of reach `r` holds blocks
+    `2 r` apart), `int[e']`.
+    """
+    seen = np.zeros(len(problem.edges.source), bool)
+    for term in problem.edge_terms:
+        seen |= np.any(np.asarray(term.present()), 1)
+    lengths = [np.abs(np.asarray(problem.edges.source) - np.asarray(problem.edges.target))[seen]]
+    for pair in problem.node_terms:
+        if isinstance(pair, PairTerm):
+            apart = np.abs(np.asarray(pair.first) - np.asarray(pair.second))[np.asarray(pair.present())]
+            lengths.append((apart + 1) // 2)
+    return np.concatenate(lengths)

@@ -10,13 +10,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 
 from vggtgeo.bundle.analysis.covariances import Covariances
-from vggtgeo.bundle.analysis.observability import KINDS, WEAK, Observability
+from vggtgeo.bundle.analysis.observability import WEAK, Observability
 from vggtgeo.bundle.analysis.observability_report import lost_shares
 from vggtgeo.bundle.problem import State
 from vggtgeo.figures.plots import Picture
 from vggtgeo.geometry import rigid
 
-COLOURS = {"points": "#1f5fbf", "lines": "#e07b1a", "depth": "#3a8f5c", "priors": "#8a8f98"}
+COLOURS = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8a8f98", "#8e5fb0", "#b0413e")
+"""Of the terms of a problem, in their order, then from the first again."""
 _INK, _GRID = "#333333", "#e3e3e3"
 _FACTORS = (1, 3, 10, 30, 100, 300, 1000)
 """Standard deviations that the ellipses may reach."""
@@ -71,7 +72,7 @@ def observability_figure(found: Observability) -> Picture:
     free = int(np.sum(found.free))
     floor = 0.1 * float(np.finfo(found.whole.values.dtype).eps)
     rows = [("all", found.whole.values[0], _INK)]
-    rows += [(f"without {kind}", found.without.values[k], COLOURS[kind]) for k, kind in enumerate(KINDS)]
+    rows += [(f"without {kind}", found.without.values[k], _colour(k)) for k, kind in enumerate(found.terms)]
     for name, values, colour in rows:
         style = {"lw": 2.2, "zorder": 3} if name == "all" else {"lw": 1.2}
         left.semilogy(np.maximum(np.asarray(values)[:free], floor), ".-", ms=4, color=colour, label=name, **style)
@@ -82,9 +83,9 @@ def observability_figure(found: Observability) -> Picture:
     left.legend(frameon=False, fontsize=8)
     shares = lost_shares(found)
     names = [name for name in shares if not name.startswith("keyframe")]
-    for k, kind in enumerate(KINDS):
+    for k, kind in enumerate(found.terms):
         heights = [100 * shares[name][kind] for name in names]
-        right.bar(np.arange(len(names)) + 0.2 * (k - 1.5), heights, 0.2, color=COLOURS[kind], label=kind)
+        right.bar(np.arange(len(names)) + 0.2 * (k - 1.5), heights, 0.2, color=_colour(k), label=kind)
     right.set_xticks(range(len(names)), [name.replace("translation ", "") for name in names], rotation=30, ha="right")
     right.set_ylabel("information lost [%]")
     right.set_title("Without a kind of observation", loc="left", fontsize=10)
@@ -94,6 +95,10 @@ def observability_figure(found: Observability) -> Picture:
     for axes in (left, right):
         _tidy(axes)
     return figure
+
+
+def _colour(k: int) -> str:
+    return COLOURS[k % len(COLOURS)]
 
 
 def _figure(width: float, height: float) -> tuple[Picture, Any]:

@@ -6,11 +6,13 @@ keeps the dtype of the first argument. Tangents are left tangents, translation f
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
+
+TANGENT = 6
+"""Coordinates of a tangent."""
 
 
 def cast(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
@@ -47,15 +49,35 @@ def move(pose: jaxlie.SE3, tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
     return cast((exp(tangent) @ pose).normalize(), pose.wxyz_xyz.dtype)
 
 
+def log(pose: jaxlie.SE3) -> Float[Array, "*n 6"]:
+    """The tangent of a motion, the inverse of `exp` up to a rotation of pi; all its derivatives are finite at identity.
+
+    jaxlie's own logarithm has NaN second derivatives there, where a prior is linearised and usually evaluated.
+    """
+    wxyz, t = pose.wxyz_xyz[..., :4], pose.wxyz_xyz[..., 4:]
+    wxyz = jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
+    cosine, axis = wxyz[..., :1], wxyz[..., 1:]
+    squared = jnp.sum(axis * axis, -1, keepdims=True)
+    tiny = squared < 1e-3
+    sine = jnp.sqrt(jnp.where(tiny, 1.0, squared))
+    # atan(x) / x as a series, x = sin / cos of half the angle.
+    ratio = jnp.where(tiny, squared, 0.0) / cosine**2
+    series = 1 - ratio / 3 + ratio**2 / 5 - ratio**3 / 7 + ratio**4 / 9
+    w = 2 * axis * jnp.where(tiny, series / jnp.where(tiny, cosine, 1.0), jnp.arctan2(sine, cosine) / sine)
+    angle2 = jnp.sum(w * w, -1, keepdims=True)
+    small = angle2 < 4e-3
+    angle = jnp.sqrt(jnp.where(small, 1.0, angle2))
+    # V^-1 = I - [w] / 2 + c [w]^2 with c = (1 - a / 2 cot(a / 2)) / a^2 (Barfoot, State Estimation, 7.1).
+    near = 1 / 12 + angle2 / 720 + angle2**2 / 30240 + angle2**3 / 1209600
+    far = (1 - angle / 2 / jnp.tan(angle / 2)) / jnp.where(small, 1.0, angle2)
+    turned = jnp.cross(w, t)
+    v = t - turned / 2 + jnp.where(small, near, far) * jnp.cross(w, turned)
+    return jnp.concatenate([v, w], -1)
+
+
 def boxminus(pose: jaxlie.SE3, base: jaxlie.SE3) -> Float[Array, "*n 6"]:
     """`log(T T_base^-1)`: the left tangent that moves `base` to `pose`."""
-    return (pose @ base.inverse()).log().astype(pose.wxyz_xyz.dtype)
-
-
-def boxminus_jacobian(difference: Float[Array, "n 6"]) -> Float[Array, "n 6 6"]:
-    """Derivative of `boxminus(exp(x) T, base)` by `x` at zero: the inverse left Jacobian at `difference`."""
-    inverse_motion = exp(-difference).wxyz_xyz
-    return jax.vmap(lambda motion: jaxlie.SE3(motion).jlog())(inverse_motion).astype(difference.dtype)
+    return log(cast(pose @ base.inverse(), pose.wxyz_xyz.dtype))
 
 
 def adjoint(pose: jaxlie.SE3) -> Float[Array, "*n 6 6"]:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vggtgeo.bundle.packing import Observations, PaddedSize, SlotIndex, pack
-from vggtgeo.bundle.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.covisibility import Directed
@@ -24,6 +25,8 @@ LEAST_INVERSE_DEPTH = 1e-3
 class Adjustment:
     """A packed problem and the way back: local host and slot number of each landmark (points, then line samples)."""
 
+    keyframes: tuple[int, ...]
+    """Numbers of the keyframes, in the order of the problem's."""
     problem: Problem
     initial: State
     index: SlotIndex
@@ -44,9 +47,11 @@ def build(
     given_intrinsics: np.ndarray,
     intrinsics_sigma: np.ndarray,
     fixed_pose: np.ndarray,
-    marginal: MarginalPrior | None = None,
+    terms: Sequence[AbstractTerm] = (),
 ) -> Adjustment:
     """Pack `keyframes` (at most `size.keyframes`) and the directed edges between them.
+
+    terms: what else is known, of poses and pairs, by the position of a keyframe in `keyframes`.
 
     Of each host at most `point_slots` key points (those with the most observations) and `line_slots` line samples
     (of the segments with the most) take part.
@@ -87,9 +92,10 @@ def build(
         intrinsics_sigma=intrinsics_sigma,
         fixed_pose=fixed_pose,
         kernel=settings.kernel,
+        terms=terms,
     )
-    problem = replace(problem, marginal=marginal)
     return Adjustment(
+        keyframes=tuple(keyframe.number for keyframe in keyframes),
         problem=problem,
         initial=initial,
         index=index,

@@ -3,23 +3,20 @@ without texture speak in the adjustment too (Chen & Medioni 1991; Newcombe et al
 
 At the current poses every pair (i, j) gives residuals `n . (T_ji p - q)` in standard deviations of the sensor, where
 `q, n` is the surface of j at the pixel that `p` of i falls on. Their normal equations `H, g` over the left tangent
-`eta` of `T_ji` are carried to the two poses by `eta = x_j - Ad(T_ji) x_i`, added up over all pairs, and enter the
-adjustment as a Gaussian prior linearised at the current poses. Relinearising after each adjustment makes it
-Gauss-Newton on the sum of both.
+`eta` of `T_ji` enter the adjustment as a term on the pair. Relinearising after each adjustment makes it Gauss-Newton on
+the sum of both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
 
-from vggtgeo.bundle.marginalisation import square_root
-from vggtgeo.bundle.problem import MarginalPrior
+from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.factors import surface_term
 from vggtgeo.slam.keyframe import Keyframe
 
 CELL = 4
@@ -100,31 +97,20 @@ def align(
     return Alignment(first, second, (rows * weight[:, None]).T @ rows, rows.T @ (weight * residual), len(points))
 
 
-def depth_prior(
+def align_pairs(
     keyframes: Sequence[Keyframe],
-    pairs: Iterable[tuple[int, int]],
+    pairs: Sequence[tuple[int, int]],
     surfaces: Sequence[Surface],
-    intrinsics: np.ndarray,
     effective: float,
-) -> MarginalPrior:
-    """The sum of all pairs' alignments at the current poses, over the poses of `keyframes` and the intrinsics."""
-    size = 6 * len(keyframes) + 4
-    hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    for i, j in pairs:
-        relative = keyframes[j].pose @ rigid.invert(keyframes[i].pose)
-        found = align(i, j, surfaces, relative, effective)
-        if found is None:
-            continue
-        jacobian = np.zeros((6, size))
-        jacobian[:, 6 * j : 6 * j + 6] = np.eye(6)
-        jacobian[:, 6 * i : 6 * i + 6] = -rigid.adjoint(relative)
-        rows = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
-        local = jacobian[:, rows]
-        hessian[np.ix_(rows, rows)] += local.T @ found.hessian @ local
-        gradient[rows] += local.T @ found.gradient
-    root, offset = square_root(jnp.asarray(hessian), jnp.asarray(gradient))
-    poses = rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes]))
-    return MarginalPrior(root, offset, jaxlie.SE3(jnp.asarray(poses)), jnp.asarray(intrinsics))
+) -> SurfaceAlignment:
+    """All pairs' alignments at the current poses, as one term; pairs that do not overlap have no weight."""
+    relative = np.array([keyframes[j].pose @ rigid.invert(keyframes[i].pose) for i, j in pairs]).reshape(-1, 4, 4)
+    hessians, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
+    for row, (i, j) in enumerate(pairs):
+        found = align(i, j, surfaces, relative[row], effective)
+        if found is not None:
+            hessians[row], gradients[row] = found.hessian, found.gradient
+    return surface_term(pairs, relative, hessians, gradients)
 
 
 def _normals(points: np.ndarray) -> np.ndarray:

@@ -8,15 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from vggtgeo.bundle.problem import MarginalPrior
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
 from vggtgeo.slam.adjustment import build, write_back
 from vggtgeo.slam.covisibility import Directed, Pair, directions, overlap, some_points
-from vggtgeo.slam.depth_alignment import Surface, depth_prior
+from vggtgeo.slam.depth_alignment import Surface, align_pairs
+from vggtgeo.slam.factors import factor_terms
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.prior_rows import with_ties
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window import solve_jit, window_size
@@ -55,7 +55,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             given_intrinsics=slam.given_intrinsics,
             intrinsics_sigma=slam.intrinsics_sigma,
             fixed_pose=fixed,
-            marginal=with_ties(_surface_prior(slam, surfaces, settings), slam),
+            terms=_terms(slam, surfaces, settings),
         )
         solver = SchurLevenbergMarquardt(
             max_iterations=settings.global_iterations,
@@ -70,11 +70,17 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     return slam
 
 
-def _surface_prior(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> MarginalPrior | None:
+def _terms(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> tuple[AbstractTerm, ...]:
+    """What is known about poses beyond matches: factors of the run, and aligned surfaces."""
+    places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
+    room: dict[type, int] = {}
+    for factor in slam.factors:
+        room[type(factor)] = room.get(type(factor), 0) + 1
+    terms = factor_terms(slam.factors, places, room)
     if not surfaces or settings.surface_points <= 0:
-        return None  # an empty prior would still fill the matrix
-    pairs = [pair.key for pair in slam.pairs]
-    return depth_prior(slam.keyframes, pairs, surfaces, slam.intrinsics, settings.surface_points)
+        return terms
+    pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
+    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.surface_points))
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:

@@ -8,19 +8,20 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vggtgeo.bundle.problem import MarginalPrior
+from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.prior_rows import hold_pose
+from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.relocalisation import relocalise
-from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.state import Slam, Tie
+from vggtgeo.slam.settings import Roles
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking import Sight, Track
+from vggtgeo.slam.window_prior import WindowPrior
 
 TRIED = 2
 """Keyframes of the other pieces that are verified for each new keyframe."""
 
 
-def join_pieces(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Slam:
+def join_pieces(slam: Slam, sight: Sight, roles: Roles) -> Slam:
     """Where the newest keyframe, seen as `sight`, shows a place of an earlier piece, move its piece there.
 
     Only where lengths are metres: two pieces of free scale would need a similarity, which no one keyframe pair tells
@@ -29,10 +30,10 @@ def join_pieces(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) 
     if len(slam.origins) < 2 or not slam.metric:
         return slam
     place = relocalise(sight, slam.keyframes[: slam.origins[-1]], slam, roles, TRIED)
-    return slam if place is None else _joined(slam, place, settings)
+    return slam if place is None else _joined(slam, place)
 
 
-def _joined(slam: Slam, place: Track, settings: SlamSettings) -> Slam:
+def _joined(slam: Slam, place: Track) -> Slam:
     """The last piece carried by one rigid motion of the world, so that the newest keyframe is where it was found."""
     origin, newest = slam.origins[-1], slam.keyframes[-1]
     carried = rigid.invert(newest.pose) @ place.pose
@@ -44,16 +45,18 @@ def _joined(slam: Slam, place: Track, settings: SlamSettings) -> Slam:
         f"the piece of map that began at frame {slam.keyframes[origin].frame} is joined to the one before at frame "
         f"{newest.frame}"
     )
-    slam = replace(
+    tie = MeasuredRelativePose(place.keyframe.number, newest.number, place.relative, place.information)
+    prior = slam.prior
+    return replace(
         slam,
         keyframes=keyframes,
         origins=slam.origins[:-1],
-        ties=(*slam.ties, Tie(place.keyframe.number, newest.number, place.relative, place.information)),
-        prior=None if slam.prior is None else _carried_prior(slam.prior, carried),
+        held=(slam.window[0],),
+        factors=(*slam.factors, tie),
+        prior=None if prior is None else WindowPrior(prior.keyframes, _carried_prior(prior.prior, carried)),
         solved=None,
         notes=(*slam.notes, note),
     )
-    return hold_pose(slam, slam.window[0], settings)
 
 
 def _carried_prior(prior: MarginalPrior, carried: np.ndarray) -> MarginalPrior:

@@ -12,15 +12,15 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.covisibility import without_matches
+from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pieces import join_pieces
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.prior_rows import add_tie, hold_pose
 from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, sight_of, view_of, wait
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
-from vggtgeo.slam.state import FramePose, Slam, Tie
+from vggtgeo.slam.state import FramePose, Slam
 from vggtgeo.slam.tracking import Expectation, Sight, Track, tie_between, track
 from vggtgeo.slam.window import adjust, enter
 
@@ -70,6 +70,7 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
         keyframes=(*slam.keyframes, keyframe),
         window=(number,),
         prior=None,
+        held=(),
         solved=None,
         origins=(*slam.origins, number),
         axes=(),
@@ -134,26 +135,24 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     with clock.measure("keyframe"):
         keyframe = make_keyframe(number, frame, found.pose, sight.features, roles, settings, slam.intrinsics)
     with clock.measure("match keyframes"):
-        tie = Tie(found.keyframe.number, number, found.relative, found.information)
+        tie = MeasuredRelativePose(found.keyframe.number, number, found.relative, found.information)
         if found.keyframe.number not in slam.window:
             slam = _window_around(slam, found.keyframe.number, settings)
         slam = enter(slam, keyframe, roles, settings)
-        slam = replace(slam, ties=(*slam.ties, tie), reference=(number, sight.view))
-        if tie.first in slam.window:
-            slam = add_tie(slam, tie, settings)
+        slam = replace(slam, factors=(*slam.factors, tie), reference=(number, sight.view))
         slam = _with_pair(slam, tie)
         slam = constrain_rotation(slam, settings)
     with clock.measure("adjust window"):
         slam = adjust(slam, settings)
     with clock.measure("relocalise"):
-        slam = join_pieces(slam, sight, roles, settings)
+        slam = join_pieces(slam, sight, roles)
     arrival = (found.keyframe.number, found.relative)
     evidence = found.evidence
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)
     return replace(slam, frames=(*slam.frames, record))
 
 
-def _with_pair(slam: Slam, tie: Tie) -> Slam:
+def _with_pair(slam: Slam, tie: MeasuredRelativePose) -> Slam:
     """A pair for the tie, if without a match, so that the surfaces of both are compared in the last adjustment."""
     if any(pair.key == (tie.first, tie.second) for pair in slam.pairs):
         return slam
@@ -170,8 +169,7 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     """A window of the keyframes around an old one, held where it is: the camera has come back to it."""
     low = max(max((origin for origin in slam.origins if origin <= number), default=0), number - NEIGHBOURS)
     window = tuple(range(low, min(number + NEIGHBOURS + 1, len(slam.keyframes))))[-(settings.window - 1) :]
-    slam = replace(slam, window=window, prior=None, solved=None)
-    return hold_pose(slam, number, settings)
+    return replace(slam, window=window, held=(number,), prior=None, solved=None)
 
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:
@@ -220,9 +218,10 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
     if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
         return slam, found
-    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
+    numbers = {found.keyframe.number, near.number}
+    if any(set(factor.keyframes) == numbers for factor in slam.factors):
         return slam, again
-    return replace(slam, ties=(*slam.ties, tie_between(found, again))), again
+    return replace(slam, factors=(*slam.factors, tie_between(found, again))), again
 
 
 def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | None:

@@ -79,7 +79,7 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
     number = len(keyframes)
     second = make_keyframe(number, frame, relative @ first.pose, features, roles, settings, slam.intrinsics)
     slam = enter(slam, second, roles, settings)
-    slam = adjust(replace(slam, prior=scale_anchor(slam, settings)), settings)
+    slam = adjust(replace(slam, factors=(*slam.factors, scale_anchor(slam))), settings)
     slam = _place_waiting(slam, slam.keyframes[first.number], roles)
     inliers = int(np.count_nonzero(guess.inliers))
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, inliers)

@@ -6,13 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vggtgeo.bundle.problem import MarginalPrior, State
+from vggtgeo.bundle.problem import State
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.adjustment import Adjustment
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.factors import Factor
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.rgbd_alignment import RgbdView
+from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 
@@ -37,20 +39,6 @@ class FramePose:
 
 
 @dataclass(frozen=True, eq=False)
-class Tie:
-    """The motion between two keyframes as it was tracked, by their numbers.
-
-    motion: float64 [4, 4], camera `first` -> camera `second`. information: float64 [6, 6] over its left tangent,
-    translation first, 1/m^2 and 1/rad^2.
-    """
-
-    first: int
-    second: int
-    motion: np.ndarray
-    information: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Waiting:
     """A frame without a pose so far: seen before there was a map, or while tracking was lost. It is placed as soon as
     there is a map that it fits into.
@@ -70,12 +58,14 @@ class Slam:
     intrinsics: current fx, fy, cx, cy. given_intrinsics, intrinsics_sigma: mean and standard deviation of their prior,
     pixels. keyframes: all, by number. pairs: all matches between them. window: numbers of
     the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
+    factors: what is known about poses beyond matches; the tracked motion of each keyframe from the one it was tracked
+    against is there, and holds the map together.
     solved: the last window problem and its solution. energies: `1/2 sum rho` of that window before its first and after
     each iteration; iterations: what else each did, where the settings ask for it. frames: every frame's pose.
     velocity: last motion from frame to frame, camera -> camera. waiting: frames without a pose so far.
-    reference: number of the keyframe that frames are tracked against, and its view for the alignment. ties: the tracked
-    motion of each keyframe from the one it was tracked against; they hold the map together. lost: frames since tracking
-    was lost. origins: the first keyframe of each piece of the map; pieces are tied to nothing else.
+    reference: number of the keyframe that frames are tracked against, and its view for the alignment. lost: frames
+    since tracking was lost. origins: the first keyframe of each piece of the map; pieces are tied to nothing else.
+    held: a keyframe that the window may not move, since those that held it have been left behind.
     metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
     world), as the first keyframes saw them. notes: what the user should know.
     """
@@ -87,7 +77,8 @@ class Slam:
     keyframes: tuple[Keyframe, ...] = ()
     pairs: tuple[Pair, ...] = ()
     window: tuple[int, ...] = ()
-    prior: MarginalPrior | None = None
+    prior: WindowPrior | None = None
+    factors: tuple[Factor, ...] = ()
     solved: tuple[Adjustment, State] | None = None
     energies: np.ndarray | None = None
     iterations: IterationRecord | None = None
@@ -98,7 +89,7 @@ class Slam:
     origins: tuple[int, ...] = ()
     axes: tuple[np.ndarray, ...] = ()
     reference: tuple[int, RgbdView | None] | None = None
-    ties: tuple[Tie, ...] = ()
+    held: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

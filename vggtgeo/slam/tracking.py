@@ -14,10 +14,10 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import pose_information
 from vggtgeo.models.roles import Features, GeometryResult, PointMatches, PoseGuess, PoseQuery
 from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, tangent, worst_sigma
+from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.rgbd_alignment import Aligned, RgbdView
 from vggtgeo.slam.settings import Roles
-from vggtgeo.slam.state import Tie
 
 PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
@@ -98,13 +98,14 @@ def track(
     return _fused(keyframe, guess, matches, points, dense, expected, intrinsics)
 
 
-def tie_between(first: Track, second: Track) -> Tie:
+def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
     """What two tracks of one frame say of the motion between their keyframes."""
     motion = rigid.invert(second.relative) @ first.relative
     # Both errors are tangents at the frame; carried to the second keyframe by the adjoint of its motion.
     carry = rigid.adjoint(rigid.invert(second.relative))
     noise = np.linalg.inv(first.information) + np.linalg.inv(second.information)
-    return Tie(first.keyframe.number, second.keyframe.number, motion, np.linalg.inv(carry @ noise @ carry.T))
+    information = np.linalg.inv(carry @ noise @ carry.T)
+    return MeasuredRelativePose(first.keyframe.number, second.keyframe.number, motion, information)
 
 
 def _by_points(

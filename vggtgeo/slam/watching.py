@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.residual_rms import residual_sizes
+from vggtgeo.bundle.residuals import residual_sizes
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.slam.state import Slam
 
+_SHOWN = ("points", "lines", "depth")
 _sizes_jit = eqx.filter_jit(residual_sizes)
 
 
@@ -47,7 +49,7 @@ class WindowRecord:
     points: float
     lines: float
     depth: float
-    counts: tuple[int, int, int]
+    counts: tuple[int, ...]
     iterations: int
     energy: tuple[float, float]
 
@@ -61,7 +63,7 @@ class WindowRecorder:
 
     def warm_up(self, problem: Problem, state: State) -> None:
         """Compile for windows of the shape of `problem`."""
-        _sizes_jit(problem, state).points.block_until_ready()
+        jax.block_until_ready(_sizes_jit(problem, state).rms)
 
     def see(self, slam: Slam, frame: Frame) -> None:
         if slam.solved is None or slam.solved is self._last:
@@ -74,10 +76,8 @@ class WindowRecorder:
             WindowRecord(
                 frame.index,
                 frame.timestamp,
-                float(sizes.points),
-                float(sizes.lines),
-                float(sizes.depth),
-                (int(sizes.point_count), int(sizes.line_count), int(sizes.depth_count)),
+                *(float(sizes.rms.get(name, np.nan)) for name in _SHOWN),
+                tuple(int(sizes.count.get(name, 0)) for name in _SHOWN),
                 len(energies) - 1,
                 (float(energies[0]), float(energies[-1])),
             )

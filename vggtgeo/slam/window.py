@@ -8,17 +8,19 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior, reorder
+from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior
 from vggtgeo.bundle.packing import Observations, PaddedSize, pack
-from vggtgeo.bundle.problem import MarginalPrior, Problem, State
+from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
+from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 solve_jit = eqx.filter_jit(solve)
@@ -36,7 +38,7 @@ def window_size(settings: SlamSettings) -> PaddedSize:
 
 
 @in_double_precision
-def warm_up(settings: SlamSettings) -> tuple[Problem, State]:
+def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State]:
     """Compile what every window needs, on a problem of the right shape that holds one observation.
 
     Returns that problem and its solution, for whoever has more to compile.
@@ -53,8 +55,10 @@ def warm_up(settings: SlamSettings) -> tuple[Problem, State]:
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
     intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
-    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=window_size(settings), kernel=settings.kernel)
-    problem = replace(problem, marginal=no_prior(settings.window))
+    terms = (no_prior(settings.window), *factor_terms((), {}, factor_room(settings, metric)))
+    problem, initial, _ = pack(
+        one, poses, intrinsics, np.ones(1), size=window_size(settings), kernel=settings.kernel, terms=terms
+    )
     solution = solve_jit(problem, initial, solver=window_solver(settings))
     marginalise_jit(problem, solution.state, jnp.asarray(0)).root.block_until_ready()
     return problem, solution.state
@@ -68,15 +72,15 @@ def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
 
 
 def make_room(slam: Slam, settings: SlamSettings) -> Slam:
-    """Marginalise the oldest keyframe of a full window."""
+    """Marginalise the oldest keyframe of a full window, by the last window that was solved with it."""
     if len(slam.window) < settings.window:
         return slam
-    if slam.solved is None:
-        return replace(slam, window=slam.window[1:])
+    leaving, staying = slam.window[0], slam.window[1:]
+    if slam.solved is None or leaving not in slam.solved[0].keyframes:
+        return replace(slam, window=staying)
     adjustment, state = slam.solved
-    prior = marginalise_jit(adjustment.problem, state, jnp.asarray(0))
-    order = np.append(np.arange(1, settings.window), -1)
-    return replace(slam, window=slam.window[1:], prior=reorder(prior, order))
+    prior = marginalise_jit(adjustment.problem, state, jnp.asarray(adjustment.keyframes.index(leaving)))
+    return replace(slam, window=staying, prior=WindowPrior(adjustment.keyframes, prior))
 
 
 def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings) -> Slam:
@@ -118,7 +122,9 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
 
 def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> Adjustment:
     """The problem of the current window."""
-    fixed = np.isin([keyframe.number for keyframe in members], slam.origins)
+    numbers = tuple(keyframe.number for keyframe in members)
+    places = {number: row for row, number in enumerate(numbers)}
+    prior = no_prior(settings.window) if slam.prior is None else slam.prior.aligned(numbers, settings.window)
     return build(
         members,
         window_edges(slam),
@@ -127,9 +133,17 @@ def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) 
         size=window_size(settings),
         given_intrinsics=slam.given_intrinsics,
         intrinsics_sigma=slam.intrinsics_sigma,
-        fixed_pose=fixed,
-        marginal=slam.prior if slam.prior is not None else no_prior(settings.window),
+        fixed_pose=np.isin(numbers, (*slam.origins, *slam.held)),
+        terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric))),
     )
+
+
+def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
+    """How many factors of each kind a window holds: one static shape for all windows of a run."""
+    room: dict[type, int] = {MeasuredRelativePose: 2 * settings.window}
+    if not metric:
+        room[MeasuredBaseline] = 1
+    return room | ({MeasuredRotation: settings.window} if settings.manhattan else {})
 
 
 def window_edges(slam: Slam) -> list[Directed]:
@@ -140,20 +154,8 @@ def window_edges(slam: Slam) -> list[Directed]:
     return [edge for pair in pairs for edge in directions(pair, by_number)]
 
 
-def scale_anchor(slam: Slam, settings: SlamSettings) -> MarginalPrior:
-    """A prior that holds the distance between the first two keyframes: the unit of a map without metric depth."""
-    prior = no_prior(settings.window)
-    pose = slam.keyframes[slam.window[1]].pose
-    length = np.linalg.norm(pose[:3, 3])
-    row = np.zeros(prior.root.shape[1])
-    row[6:9] = pose[:3, 3] / (1e-3 * length**2)
-    members = np.array([slam.keyframes[number].pose for number in slam.window])
-    return _with_row(prior, row, members)
-
-
-def _with_row(prior: MarginalPrior, row: np.ndarray, poses: np.ndarray) -> MarginalPrior:
-    points = np.asarray(prior.poses.wxyz_xyz).copy()
-    points[: len(poses)] = rigid.to_quaternion(poses)
-    return eqx.tree_at(
-        lambda p: (p.root, p.poses.wxyz_xyz), prior, (prior.root.at[0].set(jnp.asarray(row)), jnp.asarray(points))
-    )
+def scale_anchor(slam: Slam) -> MeasuredBaseline:
+    """What holds the distance between the first two keyframes: the unit of a map without metric depth."""
+    first, second = slam.window[:2]
+    centres = [rigid.centre(slam.keyframes[number].pose) for number in (first, second)]
+    return MeasuredBaseline(first, second, float(np.linalg.norm(centres[1] - centres[0])), 1e-3)

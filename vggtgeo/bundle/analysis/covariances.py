@@ -12,14 +12,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.linearise import SHARED, edge_observations, linearise
-from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.residuals import count_rows
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry import lie
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 
@@ -116,29 +119,29 @@ def covariances(problem: Problem, state: State) -> Covariances:
         True
 
     """
-    found = covariance(linearise(problem, edge_observations(problem), state))
-    keyframes, camera = problem.num_keyframes, problem.num_camera - SHARED
-    blocks = found.dense[:camera, :camera].reshape(keyframes, 6, keyframes, 6)
+    ready = prepared(problem)
+    found = covariance(linearise(ready, state))
+    keyframes, camera = problem.num_keyframes, problem.num_camera - problem.num_parameters
+    blocks = found.dense[:camera, :camera].reshape(keyframes, lie.TANGENT, keyframes, lie.TANGENT)
     return Covariances(
         poses=jnp.einsum("iaib->iab", blocks),
         intrinsics=found.dense[camera:, camera:],
         inverse_depth=found.landmarks,
-        variance_factor=_variance_factor(problem, state, found),
+        variance_factor=_variance_factor(ready, state, found),
     )
 
 
 def _variance_factor(problem: Problem, state: State, found: ArrowCovariance) -> Float[Array, ""]:
     """`2 E / (m - u)`: `m` rows that may change, `u` unknowns that they determine."""
-    moving = jnp.where(problem.fixed_intrinsics, 0.0, problem.intrinsics_prior.information)
-    problem = eqx.tree_at(lambda p: p.intrinsics_prior.information, problem, moving)
-    rows = (
-        2 * jnp.sum(problem.points.weight > 0)
-        + jnp.sum(problem.lines.weight > 0)
-        + jnp.sum(problem.depth.alpha * problem.depth.weight > 0)
-        + jnp.sum(moving > 0)
-    )
-    if problem.marginal is not None:
-        rows = rows + jnp.sum(jnp.any(problem.marginal.root != 0, 1))
+    terms = tuple(_moving(term, problem) for term in problem.terms)
+    rows = jnp.asarray(sum(count_rows(problem, term, state) for term in terms))
     redundancy = rows - found.rank
-    factor = 2 * energy(problem, state) / jnp.maximum(redundancy, 1)
+    factor = 2 * prepared_energy(problem.with_terms(terms), state) / jnp.maximum(redundancy, 1)
     return jnp.where(redundancy > 0, factor, jnp.ones_like(factor))
+
+
+def _moving(term: AbstractTerm, problem: Problem) -> AbstractTerm:
+    """A term without what speaks of held parameters alone: such rows never change."""
+    if isinstance(term, IntrinsicsPrior):
+        return term.reweighted(jnp.where(problem.fixed_intrinsics[term.index], 0.0, term.weight))
+    return term

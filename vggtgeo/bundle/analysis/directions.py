@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.linearise import SHARED
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie
 
@@ -22,10 +21,11 @@ MOTIONS = ("translation along x", "translation along y", "translation along z", 
 INTRINSICS = ("focal length", "aspect ratio", "principal point u", "principal point v")
 
 
-def direction_names(keyframes: int) -> tuple[str, ...]:
-    """Names of the rows of `named_directions`: the global ones first."""
+def direction_names(keyframes: int, parameters: int = 4) -> tuple[str, ...]:
+    """Names of the rows of `named_directions`, for a camera of so many parameters: the global ones first."""
+    distortion = tuple(f"distortion {number}" for number in range(1, parameters - len(INTRINSICS) + 1))
     each = tuple(f"keyframe {i}: {motion}" for i in range(keyframes) for motion in MOTIONS)
-    return ("scale", *MOTIONS, *INTRINSICS, *each)
+    return ("scale", *MOTIONS, *INTRINSICS, *distortion, *each)
 
 
 def named_directions(problem: Problem, state: State) -> Float[Array, "m c"]:
@@ -33,14 +33,14 @@ def named_directions(problem: Problem, state: State) -> Float[Array, "m c"]:
 
     Held coordinates are not masked. The aspect ratio changes `fx` by 100 % and `fy` by -100 %.
     """
-    keyframes = problem.num_keyframes
+    keyframes, tail = problem.num_keyframes, problem.num_parameters
     common = jnp.concatenate([_scale(problem, state)[None], _common(problem, state)])
-    common = jnp.concatenate([common, jnp.zeros((7, SHARED), common.dtype)], 1)
+    common = jnp.concatenate([common, jnp.zeros((len(common), tail), common.dtype)], 1)
     fx, fy = state.intrinsics[0], state.intrinsics[1]
-    shared = jnp.eye(SHARED, dtype=common.dtype).at[0, :2].set(jnp.stack([fx, fy]))
+    shared = jnp.eye(tail, dtype=common.dtype).at[0, :2].set(jnp.stack([fx, fy]))
     shared = shared.at[1, :2].set(jnp.stack([fx, -fy]))
-    shared = jnp.concatenate([jnp.zeros((SHARED, 6 * keyframes), common.dtype), shared], 1)
-    single = jnp.eye(6 * keyframes, problem.num_camera, dtype=common.dtype)
+    shared = jnp.concatenate([jnp.zeros((tail, lie.TANGENT * keyframes), common.dtype), shared], 1)
+    single = jnp.eye(lie.TANGENT * keyframes, problem.num_camera, dtype=common.dtype)
     return jnp.concatenate([common, shared, single])
 
 

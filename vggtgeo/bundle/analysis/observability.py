@@ -2,17 +2,17 @@
 
 The landmarks are eliminated: the information about poses and intrinsics is the Schur complement
 
-    S = H - W V^-1 W',      for all factors, for one kind alone (`S_k`), and for all but one kind (`S_-k`),
+    S = H - W V^-1 W',      for all terms, for one term alone (`S_k`), and for all but one (`S_-k`),
 
-each from the Hessian of just those factors (a landmark that they do not determine stays where it is). The kinds do not
-add up: `S >= S_k + S_-k`, since a depth prior alone says nothing about a pose and a match alone nothing about the
-scale, but both together do. So what a kind is worth along a direction `d` is what would be lost without it:
-`1 - d' S_-k d / d' S d`, between 0 and 1; the shares of several kinds may add up to more than 1.
+each from the Hessian of just those terms (a landmark that they do not determine stays where it is).
+They do not add up: `S >= S_k + S_-k`, since a depth prior alone says nothing about a pose and a match alone nothing
+about the scale, but both together do. So what a term is worth along a direction `d` is what would be lost without it:
+`1 - d' S_-k d / d' S d`, between 0 and 1; the shares of several terms may add up to more than 1.
 
 Spectra are those of `D^-1/2 S D^-1/2` with `D = diag(H)` of all factors: metres, radians and pixels become one unit,
 and an eigenvalue is the share of a direction's information that is left once everything else is estimated too. A
-direction is *weak* below `WEAK` and *undetermined* below the rounding error `10 c eps`. Cost: three
-linearisations, nine Schur complements and symmetric eigenvalue problems of size `c = 6 n + 4`.
+direction is *weak* below `WEAK` and *undetermined* below the rounding error `10 c eps`. Cost: one
+linearisation a term, and for `k` terms `2 k + 1` Schur complements and symmetric eigenvalue problems of size `c`.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.analysis.directions import named_directions
-from vggtgeo.bundle.linearise import edge_observations, linearise
+from vggtgeo.bundle.analysis.directions import direction_names, named_directions
+from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.solvers.arrow import ArrowSystem, reduce
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.geometry import lie
+from vggtgeo.solvers.arrow import ArrowSystem, NodeFactors, reduce
 from vggtgeo.solvers.covariance import balance, rank_tolerance
 from vggtgeo.solvers.segments import join_segments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-KINDS = ("points", "lines", "depth", "priors")
-"""Factor kinds; `priors` are those on the intrinsics and the one that marginalisation left."""
 WEAK = 1e-6
 """Eigenvalue below which a direction is weak: its standard deviation is a thousand times what it were if all else were
 known. Well-posed windows lie above 1e-4 (tests/test_observability.py)."""
@@ -59,7 +60,7 @@ class Observability(eqx.Module):
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.eval_shape(vg.observability, problem, solution.state)
-        >>> found.without.values.shape  # one row a kind: points, lines, depth, priors
+        >>> found.without.values.shape  # one row a term: points, lines, depth, intrinsics_prior
         (4, 28)
         >>> vg.observability(problem, solution.state)
         Observability(18 coordinates free, 10 held, weak: none)
@@ -69,16 +70,23 @@ class Observability(eqx.Module):
     whole: Spectra
     """All factors (one row)."""
     alone: Spectra
-    """Each kind of `KINDS` alone."""
+    """Each term alone."""
     without: Spectra
-    """All factors but each kind of `KINDS`."""
+    """All terms but each one."""
     named: Float[Array, "m c"]
-    """The named directions in balanced coordinates, unit length; zero where held. Names: `direction_names(n)`."""
+    """The named directions in balanced coordinates, unit length; zero where held. Names: `direction_names()`."""
     free: Bool[Array, " c"]
     landmark_information: Float[Array, "n s"]
     """`V d^2`: 1 / (relative variance of the inverse depth if poses and intrinsics were known)."""
     landmark_used: Bool[Array, "n s"]
-    """Whether any factor has weight on the slot."""
+    """Whether any term has weight on the slot."""
+    terms: tuple[str, ...] = eqx.field(static=True)
+    """Names of the terms, in the order of the rows of `alone` and `without`."""
+    keyframes: int = eqx.field(static=True)
+
+    def direction_names(self) -> tuple[str, ...]:
+        """Names of the rows of `named`."""
+        return direction_names(self.keyframes, len(self.free) - lie.TANGENT * self.keyframes)
 
     def report(self) -> str:
         """The findings in words (outside `jit`, for one problem)."""
@@ -126,58 +134,57 @@ def observability(problem: Problem, state: State) -> Observability:
         True
 
     """
-    kinds = _linearise_each(problem, state)
-    everything = _combine(kinds, jnp.ones(len(KINDS), state.inverse_depth.dtype), problem.fraction)
+    ready = prepared(problem)
+    systems = [linearise(replace(ready.with_terms((term,)), fraction=None), state) for term in ready.terms]
+    count = len(systems)
+    everything = _combine(systems, jnp.ones(count, state.inverse_depth.dtype), problem.fraction)
     scale = balance(everything, reduce(everything))
     free = everything.free
     directions = jnp.where(free, named_directions(problem, state), 0.0)
-    selections = jnp.concatenate([jnp.ones((1, 4)), jnp.eye(4), 1 - jnp.eye(4)]).astype(scale.dtype)
+    selections = jnp.concatenate([jnp.ones((1, count)), jnp.eye(count), 1 - jnp.eye(count)]).astype(scale.dtype)
 
-    def spectrum(keep: Float[Array, " kinds"]) -> Spectra:
-        reduced = reduce(_combine(kinds, keep, problem.fraction))
+    def spectrum(keep: Float[Array, " k"]) -> Spectra:
+        reduced = reduce(_combine(systems, keep, problem.fraction))
         return _spectrum(reduced.hessian - reduced.schur, free, scale, directions)
 
     spectra = jax.lax.map(spectrum, selections)
-    part = lambda rows: jax.tree.map(lambda leaf: leaf[rows], spectra)
+    part = lambda start, end: jax.tree.map(lambda leaf: leaf[start:end], spectra)
     balanced = directions * scale
     size = jnp.linalg.norm(balanced, axis=1, keepdims=True)
     return Observability(
-        whole=part(slice(0, 1)),
-        alone=part(slice(1, 5)),
-        without=part(slice(5, 9)),
+        whole=part(0, 1),
+        alone=part(1, 1 + count),
+        without=part(1 + count, None),
         named=balanced / jnp.where(size > 0, size, 1.0),
         free=free,
-        landmark_information=jnp.sum(kinds.cross[:, :, -1], 0) * state.inverse_depth**2,
+        landmark_information=sum(system.landmark_hessian for system in systems) * state.inverse_depth**2,
         landmark_used=_used(problem),
+        terms=tuple(term.name for term in problem.terms),
+        keyframes=problem.num_keyframes,
     )
 
 
-def _linearise_each(problem: Problem, state: State) -> ArrowSystem:
-    """The system of the points, of the lines and of the depth priors alone, stacked; each holds all dense priors.
-
-    One after the other, so that one linearisation is compiled. They add up: the kernel sees one residual at a time.
-    """
-    observations = edge_observations(problem)
-
-    def one(keep: Float[Array, "3"]) -> ArrowSystem:
-        weights = (observations.point_weight * keep[0], observations.line_weight * keep[1])
-        chosen = eqx.tree_at(lambda o: (o.point_weight, o.line_weight), observations, weights)
-        slots = eqx.tree_at(lambda p: p.depth.weight, problem, problem.depth.weight * keep[2])
-        # The systems of the samples add up, those of their segments do not.
-        slots = replace(slots, fraction=None)
-        return linearise(slots, chosen, state)
-
-    return jax.lax.map(one, jnp.eye(3, dtype=state.inverse_depth.dtype))
-
-
-def _combine(kinds: ArrowSystem, keep: Float[Array, " kinds"], fraction: Float[Array, "n g q"] | None) -> ArrowSystem:
-    """The system of the kinds that `keep` holds a 1 for."""
-    first = jax.tree.map(lambda leaf: leaf[0], kinds)
-    add = lambda stacked: jnp.tensordot(keep[:3], stacked, 1)
+def _combine(
+    systems: list[ArrowSystem], keep: Float[Array, " k"], fraction: Float[Array, "n g q"] | None
+) -> ArrowSystem:
+    """The system of the terms that `keep` holds a 1 for: a kernel sees one residual at a time, so terms add up."""
+    total = lambda leaves: jnp.tensordot(keep, jnp.stack(leaves), 1)
+    largest = max(len(system.prior_hessian) for system in systems)
+    priors = [jnp.pad(system.prior_hessian, (largest - len(system.prior_hessian), 0)) for system in systems]
+    factors = [
+        NodeFactors(own.first, own.second, kept * own.hessian, kept * own.gradient)
+        for kept, own in zip(keep, (system.factors for system in systems), strict=True)
+        if own is not None
+    ]
     system = eqx.tree_at(
-        lambda system: (system.gram, system.cross, system.prior_hessian),
-        first,
-        (add(kinds.gram), add(kinds.cross), first.prior_hessian * keep[3]),
+        lambda s: (s.gram, s.cross, s.prior_hessian, s.factors, s.held),
+        systems[0],
+        (
+            *(total([system.gram for system in systems]), total([system.cross for system in systems])),
+            *(total(priors), jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *factors) if factors else None),
+            None,
+        ),
+        is_leaf=lambda leaf: leaf is None,
     )
     return system if fraction is None else join_segments(system, fraction)
 
@@ -207,7 +214,16 @@ def _spectrum(
 
 
 def _used(problem: Problem) -> Bool[Array, "n s"]:
-    """Slots with a match, a line or a depth prior."""
-    seen = jnp.concatenate([problem.points.weight, problem.lines.weight], 1) > 0
-    used = problem.depth.alpha * problem.depth.weight > 0
-    return used.at[problem.edges.source].max(seen)
+    """Slots that any term speaks of."""
+    used = jnp.zeros(problem.pixels.shape[:2], bool)
+    for slot in problem.slot_terms:
+        used = used | slot.present()
+    for term in problem.edge_terms:
+        seen = _at_slots(term, used.shape[1])
+        used = used.at[problem.edges.source].max(seen)
+    return used
+
+
+def _at_slots(term: EdgeTerm, slots: int) -> Bool[Array, "e s"]:
+    present = term.present()
+    return jnp.pad(present, ((0, 0), (term.first_slot, slots - term.first_slot - present.shape[1])))

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.bundle.analysis.directions import direction_names
-from vggtgeo.bundle.analysis.observability import KINDS, WEAK, Observability, undetermined_below
+from vggtgeo.bundle.analysis.observability import WEAK, Observability, undetermined_below
 
 ALIGNED = 0.9
 """Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""
@@ -38,17 +37,17 @@ class WeakDirection:
 
 
 def weak_directions(found: Observability, without: str | None = None) -> list[WeakDirection]:
-    """Directions weaker than `WEAK` by all factors, or by all but one kind (a name of `KINDS`), the best named first.
+    """Directions weaker than `WEAK` by all terms, or by all but one (a name of `found.terms`), the best named first.
 
     A weak subspace has no eigenvectors of its own, so it is taken apart by names: the first name of
     `direction_names` (the global motions come first) that lies in it is taken out of it, then the next that also lies
     in it and says something new, and so on; what is left in the end goes by the nearest name.
     """
-    spectra, row = (found.whole, 0) if without is None else (found.without, _index_of(without))
+    spectra, row = (found.whole, 0) if without is None else (found.without, _index_of(found, without))
     values, vectors = np.asarray(spectra.values[row], float), np.asarray(spectra.vectors[row], float)
     floor = undetermined_below(len(values), spectra.values.dtype)
     weak = values < max(WEAK, floor)
-    names, named = direction_names(len(values) // 6), np.asarray(found.named, float)
+    names, named = found.direction_names(), np.asarray(found.named, float)
     basis, sizes = vectors[:, weak], np.maximum(values[weak], 0.0)
     within, rest = np.sum((named @ basis) ** 2, 1), np.eye(basis.shape[1])
     result = []
@@ -76,12 +75,12 @@ def report(found: Observability) -> str:
     values = np.asarray(found.whole.values[0])[:free]
     lost, used = undetermined_landmarks(found)
     lines = [
-        f"Observability of {size // 6} keyframes: {free} coordinates free, {size - free} held",
+        f"Observability of {found.keyframes} keyframes: {free} coordinates free, {size - free} held",
         f"weakest eigenvalues: {'  '.join(f'{max(value, 0):.1e}' for value in values[:6])}",
         f"weak directions: {_spell(weak_directions(found), free)}",
         f"inverse depths in use: {used}, undetermined even with all else known: {lost}",
     ]
-    for kind in KINDS:
+    for kind in found.terms:
         weak = weak_directions(found, kind)
         more = len(weak) > len(weak_directions(found))
         lines.append(f"weak without {kind}: {_spell(weak, free) if more else 'no more than with all'}")
@@ -93,12 +92,12 @@ def as_dict(found: Observability) -> dict[str, Any]:
     free, size = int(np.sum(found.free)), len(found.free)
     lost, used = undetermined_landmarks(found)
     return {
-        "keyframes": size // 6,
+        "keyframes": found.keyframes,
         "free": free,
         "held": size - free,
         "eigenvalues": [float(value) for value in np.asarray(found.whole.values[0])[:free]],
         "weak": [str(direction) for direction in weak_directions(found)],
-        "weak_without": {kind: [str(direction) for direction in weak_directions(found, kind)] for kind in KINDS},
+        "weak_without": {kind: [str(direction) for direction in weak_directions(found, kind)] for kind in found.terms},
         "inverse_depths": used,
         "inverse_depths_undetermined": lost,
         "lost_without": lost_shares(found),
@@ -107,23 +106,29 @@ def as_dict(found: Observability) -> dict[str, Any]:
 
 def lost_shares(found: Observability) -> dict[str, dict[str, float]]:
     """Of the information along each free named direction, the share in [0, 1] that would be lost without each kind."""
-    names = direction_names(len(found.free) // 6)
+    names = found.direction_names()
     along, without = np.asarray(found.whole.along[0], float), np.asarray(found.without.along, float)
     shares = 1 - without / np.where(along > 0, along, 1.0)
     shares = np.where(along > 0, np.clip(shares, 0.0, 1.0), 0.0)
     present = np.nonzero(np.any(np.asarray(found.named) != 0, 1))[0]
-    return {names[i]: dict(zip(KINDS, map(float, shares[:, i]), strict=True)) for i in present}
+    return {names[i]: dict(zip(found.terms, map(float, shares[:, i]), strict=True)) for i in present}
 
 
 def _table(found: Observability) -> list[str]:
     """Information along each free named direction, and the share of it that would be lost without each kind."""
-    names = direction_names(len(found.free) // 6)
+    names = found.direction_names()
     along = dict(zip(names, np.asarray(found.whole.along[0], float), strict=True))
     width = max(len(name) for name in names)
-    lines = [f"{'information along':{width}}  {'all':>9}   lost without {'  '.join(f'{kind:>7}' for kind in KINDS)}"]
+    lines = [
+        f"{'information along':{width}}  {'all':>9}   lost without {'  '.join(f'{kind:>7}' for kind in found.terms)}"
+    ]
     for name, shares in lost_shares(found).items():
-        lines.append(f"{name:{width}}  {along[name]:9.2e}   {'':12} {'  '.join(f'{s:7.0%}' for s in shares.values())}")
+        lines.append(f"{name:{width}}  {along[name]:9.2e}   {'':12} {_cells(shares)}")
     return lines
+
+
+def _cells(shares: dict[str, float]) -> str:
+    return "  ".join(f"{share:{max(len(kind), 7)}.0%}" for kind, share in shares.items())
 
 
 def _spell(weak: list[WeakDirection], free: int) -> str:
@@ -140,7 +145,7 @@ def _complement(vector: np.ndarray) -> np.ndarray:
     return np.linalg.svd(vector[None])[2][1:].T
 
 
-def _index_of(kind: str) -> int:
-    if kind not in KINDS:
-        raise ValueError(f"`without` is {kind!r}; expected one of {', '.join(KINDS)}, or None")
-    return KINDS.index(kind)
+def _index_of(found: Observability, kind: str) -> int:
+    if kind not in found.terms:
+        raise ValueError(f"`without` is {kind!r}; expected one of {', '.join(found.terms)}, or None")
+    return found.terms.index(kind)

@@ -1,12 +1,19 @@
-"""What the exact Hessian of one edge adds to its Gauss-Newton matrix, by hand-written second derivatives.
+"""Derivatives of a pinhole projection along one edge, by hand: what `ImageTerm` uses in place of automatic ones.
 
-For `1/2 rho(w |r|^2)` with `r = (u', v') - target` (or its product with a line's normal), let `(a, b) = rho' w r` be
-the force on the projected pixel, and `D` the row of first derivatives of `a u' + b v'` (see `linearise.py`). Then
+For a landmark of host i on edge (i, j), with `Y = R ray + d t`, `X = Y_x / Y_z`, `y = Y_y / Y_z` and a residual whose
+image gradient is `(a, b)`, put
+
+    G = (a f_x / Y_z,  b f_y / Y_z,  -(G_0 X + G_1 y)),      c = R' G.
+
+The row's derivatives are: relative translation `d G`, relative rotation `Y x G`, focal lengths `a X - c_0 ray_x / f_x`
+and `b y - c_1 ray_y / f_y`, centre `a - c_0 / f_x` and `b - c_1 / f_y`, inverse depth `G . t`.
+
+Second derivatives: with `(a, b) = rho' w r` the force on the projected pixel and `D` the row of `a u' + b v'`,
 
     H - H_GN = (2 rho'' / rho'^2) D D'  +  d2(a u' + b v').
 
-With `Y` the scaled point, `G = d(a u' + b v') / dY`, `P` the row of derivatives of `Y_z`, over `Y_z`, and `y_0, y_1`
-those of the first two entries of `Y`, the second part is
+With `G` as above for that force, `P` the row of derivatives of `Y_z`, over `Y_z`, and `y_0, y_1` those of the first two
+entries of `Y`, the second part is
 
     -(P D~' + D~ P') + (a / Y_z) (y_0 e_fx' + e_fx y_0') + (b / Y_z) (y_1 e_fy' + e_fy y_1') + G . d2Y,
 
@@ -15,6 +22,8 @@ those of the first two entries of `Y`, the second part is
     rotation, rotation:    1/2 (G Y' + Y G') - (G . Y) I        rotation, depth:       t x G
     rotation, translation: -1/2 d [G]x                          translation, depth:    G
     rotation, intrinsics:  dY/dk x G                            focal, focal / centre: 2 c ray / f^2, c / f^2.
+
+Layout (chosen by measurement on CPU): one array a quantity, slots contiguous.
 """
 
 from __future__ import annotations
@@ -25,12 +34,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Camera = tuple[Float[Array, "4"], Float[Array, "3 3"], Float[Array, "3"]]
-"""Intrinsics, rotation and translation of an edge's relative pose."""
+from vggtgeo.geometry.cameras import MIN_RELATIVE_DEPTH
 
 
 class Projection(NamedTuple):
-    """Projection of slots into the target camera of one edge."""
+    """Projection of slots into the target camera of one edge, each `[p]`."""
 
     ray_x: Array
     ray_y: Array
@@ -44,39 +52,79 @@ class Projection(NamedTuple):
     """Derivative of the bounded `Y_z`: 1, or 0 where the bound holds."""
 
 
+class OneEdge(NamedTuple):
+    """What all slots of an edge share; rotation and translation are those of its relative pose."""
+
+    intrinsics: Float[Array, "4"]
+    rotation: Float[Array, "3 3"]
+    translation: Float[Array, "3"]
+
+
+def project(ray_x: Array, ray_y: Array, depth: Array, edge: OneEdge) -> Projection:
+    """Project the slots of one host along one edge."""
+    rotation, translation = edge.rotation, edge.translation
+    rows = tuple(
+        rotation[i, 0] * ray_x + rotation[i, 1] * ray_y + rotation[i, 2] + depth * translation[i] for i in range(3)
+    )
+    z = jnp.maximum(rows[2], MIN_RELATIVE_DEPTH)
+    inverse_z = 1 / z
+    in_front = jnp.where(rows[2] > MIN_RELATIVE_DEPTH, 1.0, 0.0).astype(z.dtype)
+    point = (rows[0], rows[1], rows[2])
+    return Projection(ray_x, ray_y, depth, point, inverse_z, rows[0] * inverse_z, rows[1] * inverse_z, in_front)
+
+
+def row(edge: OneEdge, at: Projection, a: Array, b: Array) -> list[Array]:
+    """Derivatives of one residual row with image gradient `(a, b)`: 6 relative pose, 4 intrinsics, inverse depth."""
+    fx, fy = edge.intrinsics[:2]
+    rotation, translation = edge.rotation, edge.translation
+    g0, g1 = a * fx * at.inverse_z, b * fy * at.inverse_z
+    g2 = -(g0 * at.x + g1 * at.y) * at.in_front
+    y0, y1, y2 = at.point
+    c0 = g0 * rotation[0, 0] + g1 * rotation[1, 0] + g2 * rotation[2, 0]
+    c1 = g0 * rotation[0, 1] + g1 * rotation[1, 1] + g2 * rotation[2, 1]
+    return [
+        *(g0 * at.depth, g1 * at.depth, g2 * at.depth),
+        *(y1 * g2 - g1 * y2, g0 * y2 - y0 * g2, g1 * y0 - g0 * y1),
+        *(a * at.x - c0 * at.ray_x / fx, b * at.y - c1 * at.ray_y / fy),
+        *(a - c0 / fx, b - c1 / fy),
+        g0 * translation[0] + g1 * translation[1] + g2 * translation[2],
+    ]
+
+
 def second_order(
-    derivative: Float[Array, "11 s"], bend: Array, camera: Camera, at: Projection, force: tuple[Array, Array]
-) -> tuple[Float[Array, "10 10"], Float[Array, "11 s"]]:
-    """Additions to the Gram matrix (summed over slots) and to the cross terms with inverse depth (the last row is the
-    depth's own curvature).
+    edge: OneEdge, at: Projection, force: Float[Array, "2 p"], bend: Float[Array, " p"]
+) -> tuple[Float[Array, "10 10"], Float[Array, "11 p"]]:
+    """What the exact Hessian adds to the Gauss-Newton one: by the shared coordinates (summed over slots), and their
+    mixed derivatives with inverse depth (the last row is the depth's own).
 
     Args:
-        derivative: `D`, in the order 6 relative pose, 4 intrinsics, inverse depth.
-        bend: `2 rho'' / rho'^2`, `[s]`.
-        camera: intrinsics, rotation and translation of the edge.
+        edge: its relative pose and camera.
         at: projection of the slots.
-        force: `(a, b)`.
+        force: `(a, b) = w rho' r` on the projected pixel.
+        bend: `2 rho'' / rho'^2`.
     """
-    (fx, fy, _, _), _, translation = camera
+    fx, fy = edge.intrinsics[:2]
+    translation = edge.translation
     a, b = force
-    centre = jnp.stack(force)
-    inverse = _row_of_third(camera, at)
+    derivative = jnp.stack(row(edge, at, a, b))
+    inverse = _row_of_third(edge, at)
     half = (0.5 * bend * derivative - inverse) @ derivative.T
-    half = half.at[:, 8:10].add(inverse @ centre.T)
+    half = half.at[:, 8:10].add(inverse @ force.T)
     g = (a * fx * at.inverse_z, b * fy * at.inverse_z, -(a * fx * at.x + b * fy * at.y) * at.inverse_z * at.in_front)
     moments = _moments(g, at)
-    half = half.at[:10, 6:8].add(_focal_products(moments, camera))
+    half = half.at[:10, 6:8].add(_focal_products(moments, edge))
     cross = (bend * derivative[10] - inverse[10]) * derivative - inverse * derivative[10]
-    cross = cross.at[8:10].add(inverse[10] * centre)
+    cross = cross.at[8:10].add(inverse[10] * force)
     # `y_0` and `y_1` move with inverse depth by the translation.
     cross = cross.at[6].add(g[0] * translation[0] / fx).at[7].add(g[1] * translation[1] / fy)
     cross = cross.at[:3].add(jnp.stack(g)).at[3:6].add(jnp.stack(_cross_product(translation, g)))
-    return (half + half.T)[:10, :10] + _curvature_of_point(moments, camera), cross
+    return (half + half.T)[:10, :10] + _curvature_of_point(moments, edge), cross
 
 
-def _row_of_third(camera: Camera, at: Projection) -> Float[Array, "11 s"]:
+def _row_of_third(edge: OneEdge, at: Projection) -> Float[Array, "11 p"]:
     """`P`: the derivatives of `Y_z`, over `Y_z`."""
-    (fx, fy, _, _), rotation, translation = camera
+    fx, fy = edge.intrinsics[:2]
+    rotation, translation = edge.rotation, edge.translation
     zero, ones = jnp.zeros_like(at.depth), jnp.ones_like(at.depth)
     c0, c1 = rotation[2, 0], rotation[2, 1]
     entries = [zero, zero, at.depth, at.point[1], -at.point[0], zero]
@@ -100,9 +148,10 @@ def _moments(g: Sequence[Array], at: Projection) -> _Moments:
     return _Moments(whole[:, :3], whole[:, 3], whole[:, 4], whole[:, 5], whole[:, 6])
 
 
-def _focal_products(moments: _Moments, camera: Camera) -> Float[Array, "10 2"]:
+def _focal_products(moments: _Moments, edge: OneEdge) -> Float[Array, "10 2"]:
     """`sum (a / Y_z) y_0` and `sum (b / Y_z) y_1` over relative pose and intrinsics."""
-    (fx, fy, _, _), rotation, _ = camera
+    fx, fy = edge.intrinsics[:2]
+    rotation = edge.rotation
     columns = []
     for axis, focal in enumerate((fx, fy)):
         y0, y1, y2 = moments.point[axis]
@@ -115,9 +164,10 @@ def _focal_products(moments: _Moments, camera: Camera) -> Float[Array, "10 2"]:
     return jnp.stack(columns, 1)
 
 
-def _curvature_of_point(moments: _Moments, camera: Camera) -> Float[Array, "10 10"]:
+def _curvature_of_point(moments: _Moments, edge: OneEdge) -> Float[Array, "10 10"]:
     """`G . d2Y` over relative pose and intrinsics, summed over slots."""
-    (fx, fy, _, _), rotation, _ = camera
+    fx, fy = edge.intrinsics[:2]
+    rotation = edge.rotation
     outer = moments.point
     rotations = (outer + outer.T) / 2 - jnp.trace(outer) * jnp.eye(3, dtype=outer.dtype)
     lever = -0.5 * _skew(moments.depth)
@@ -136,21 +186,10 @@ def _curvature_of_point(moments: _Moments, camera: Camera) -> Float[Array, "10 1
     return jnp.block([[zero3, lever.T, zero34], [lever, rotations, turned], [zero34.T, turned.T, intrinsics]])
 
 
-def twist(gradient: Float[Array, "e 6"]) -> Float[Array, "e 6 6"]:
-    """Curvature of the relative tangent in the two poses: `B_ab = 1/2 <gradient by eta, [e_a, e_b]>`.
-
-    `exp(x_j) M exp(-x_i) = exp(eta) M` with `eta = x_j - A x_i + 1/2 [x_j, -A x_i] + O(3)` (Baker-Campbell-Hausdorff),
-    and the bracket of se(3) is `[(v, w), (v', w')] = (w x v' + v x w', w x w')`.
-    """
-    force, torque = (jnp.moveaxis(_skew(half.T), -1, 0) for half in (gradient[:, :3], gradient[:, 3:]))
-    upper = jnp.concatenate([jnp.zeros_like(force), force], 2)
-    return -0.5 * jnp.concatenate([upper, jnp.concatenate([force, torque], 2)], 1)
-
-
-def _skew(v: Sequence[Array] | Array) -> Float[Array, "3 3 *n"]:
+def _skew(v: Sequence[Array] | Array) -> Float[Array, "3 3"]:
     x, y, z = v
     zero = jnp.zeros_like(x)
-    return jnp.stack([jnp.stack(row) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])])
+    return jnp.stack([jnp.stack(line) for line in ([zero, -z, y], [z, zero, -x], [-y, x, zero])])
 
 
 def _cross_product(u: Array, v: Sequence[Array]) -> tuple[Array, Array, Array]:

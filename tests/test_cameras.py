@@ -1,0 +1,95 @@
+"""Camera models of the adjustment against OpenCV, and their derivatives against finite differences."""
+
+from collections.abc import Callable
+from functools import partial
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vggtgeo.geometry.cameras import AbstractCamera, KannalaBrandt, Pinhole, RadialTangential
+
+FOCAL = (310.0, 290.0, 321.5, 238.25)
+MATRIX = np.array([[FOCAL[0], 0, FOCAL[2]], [0, FOCAL[1], FOCAL[3]], [0, 0, 1.0]])
+BENT, FISHEYE = (-0.28, 0.07, 6e-4, -8e-4), (0.03, -0.012, 0.004, -0.0007)
+CAMERAS: dict[str, tuple[type[AbstractCamera], tuple[float, ...]]] = {
+    "pinhole": (Pinhole, FOCAL),
+    "radial-tangential": (RadialTangential, FOCAL + BENT),
+    "fisheye": (KannalaBrandt, FOCAL + FISHEYE),
+}
+AXIS = np.array([FOCAL[2:]])
+PIXELS = np.concatenate([AXIS, AXIS + 1e-3, AXIS + [[3.0, -2.0], [150, 90], [-200, 60], [40, -170]]])
+
+
+def camera_of(name: str) -> AbstractCamera:
+    kind, parameters = CAMERAS[name]
+    return kind(jnp.asarray(parameters))
+
+
+def points(widest: float) -> np.ndarray:
+    """Points before a camera up to `widest` from its axis (as a tangent), the axis itself among them."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-1, 1, (40, 2)) * widest / np.sqrt(2)
+    flat[0], flat[1] = 0.0, 1e-7
+    return np.concatenate([flat, np.ones((40, 1))], 1) * rng.uniform(0.3, 6.0, (40, 1))
+
+
+def by_opencv(name: str, seen: np.ndarray) -> np.ndarray:
+    zero, given = np.zeros(3), np.array(CAMERAS[name][1][4:])
+    if name == "fisheye":
+        return cv2.fisheye.projectPoints(seen[:, None], zero, zero, MATRIX, given)[0][:, 0]
+    return cv2.projectPoints(seen, zero, zero, MATRIX, given if len(given) else None)[0][:, 0]
+
+
+@pytest.mark.parametrize(("name", "widest"), [("pinhole", 2.0), ("radial-tangential", 0.9), ("fisheye", 3.0)])
+def test_projection_is_that_of_opencv(name: str, widest: float) -> None:
+    # Proves `project`, on the axis and far from it (the fisheye up to 72 degrees). Oracle: OpenCV.
+    seen = points(widest)
+    found = jax.vmap(camera_of(name).project)(jnp.asarray(seen))
+    np.testing.assert_allclose(found, by_opencv(name, seen), atol=1e-8)
+
+
+@pytest.mark.parametrize(("name", "widest"), [("pinhole", 2.0), ("radial-tangential", 0.9), ("fisheye", 3.0)])
+def test_unprojection_is_the_inverse(name: str, widest: float) -> None:
+    # Proves `unproject`, of pixels that OpenCV drew. Oracle: the direction of the points that they are of.
+    seen = points(widest)
+    rays = jax.vmap(camera_of(name).unproject)(jnp.asarray(by_opencv(name, seen)))
+    np.testing.assert_allclose(rays, seen / seen[:, 2:], atol=1e-9)
+
+
+def orders(function: Callable, x: jax.Array) -> tuple[jax.Array, ...]:
+    """Value, first and second derivative."""
+    return function(x), jax.jacfwd(function)(x), jax.jacfwd(jax.jacfwd(function))(x)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_derivatives_are_finite_differences(name: str) -> None:
+    # Proves first and second derivatives of both directions by pixel (or point) and parameters, on the axis too.
+    # Oracle: central differences of the values, and of the first derivatives.
+    kind, given = CAMERAS[name]
+    steps = np.concatenate([np.full(2, 1e-3), np.full(4, 1e-3), np.full(len(given) - 4, 1e-6)])
+    there = lambda x: kind(x[2:]).project(jnp.concatenate([(x[:2] - AXIS[0]) / 300, jnp.ones(1)]))
+    back = lambda x: kind(x[2:]).unproject(x[:2])[:2]
+    for function in (there, back):
+        evaluate = jax.jit(jax.vmap(partial(orders, function)))
+        at = np.stack([np.concatenate([pixel, given]) for pixel in PIXELS])
+        _, first, second = evaluate(jnp.asarray(at))
+        for column, step in enumerate(steps):
+            moved = step * np.eye(len(steps))[column]
+            ahead, behind = evaluate(jnp.asarray(at + moved)), evaluate(jnp.asarray(at - moved))
+            for order, found in enumerate((first, second)):
+                expected = (np.asarray(ahead[order]) - np.asarray(behind[order])) / (2 * step)
+                error = np.abs(found[..., column] - expected).max() / (1e-3 + np.abs(expected).max())
+                assert error < 1e-5, (function, order, column, error)
+
+
+def test_without_distortion_they_are_what_they_generalise() -> None:
+    # Proves the meaning of the first parameters. Oracle: the pinhole, and the equidistant law `r = f t`.
+    pixel = jnp.array([400.0, 300.0])
+    straight = Pinhole(jnp.asarray(FOCAL)).unproject(pixel)
+    np.testing.assert_allclose(RadialTangential(jnp.asarray(FOCAL + (0.0,) * 4)).unproject(pixel), straight, rtol=1e-12)
+    ray = KannalaBrandt(jnp.asarray(FOCAL + (0.0,) * 4)).unproject(pixel)
+    radius = np.linalg.norm((np.asarray(pixel) - FOCAL[2:]) / FOCAL[:2])
+    assert np.arctan(np.linalg.norm(ray[:2])) == pytest.approx(radius, rel=1e-12)

@@ -1,0 +1,167 @@
+"""A user's own residuals: each is one small class, and everything that is done with a problem works with it."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from scenes import make_scene
+from vggtgeo.solvers.arrow import multiply, reduce
+
+import vggtgeo as vg
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+
+
+class PositionFix(vg.PoseTerm):
+    """A measured camera centre, as GPS gives it."""
+
+    position: jax.Array  # [m, 3], metres
+
+    def residual(self, pose, camera):
+        return pose.inverse().translation() - self.position
+
+
+class StepOfWheels(vg.PairTerm):
+    """A measured motion between two keyframes."""
+
+    measured: jax.Array  # [m, 3], metres, in the second camera
+
+    def residual(self, first, second):
+        return (second @ first.inverse()).translation() - self.measured
+
+
+class PointToPlane(vg.EdgeTerm):
+    """A landmark that lies on a plane known in the target camera."""
+
+    normal: jax.Array  # [e, s, 3]
+    distance: jax.Array  # [e, s], metres
+
+    def residual(self, view):
+        return self.normal @ view.point - self.distance
+
+
+class LogCosh(vg.AbstractKernel):
+    """A kernel of one's own: only `rho` is needed."""
+
+    def rho(self, s):
+        root = jnp.sqrt(s + 1e-9)
+        return 2 * (jnp.logaddexp(root, -root) - jnp.log(2.0))
+
+
+SCENE = make_scene(3, 6, 1, 2, noise=0.5, depth_error=0.05, seed=6)
+SOLVER = vg.SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
+
+
+def with_own_terms() -> tuple[vg.Problem, vg.State, vg.State]:
+    """A problem with one term of each kind above; its start and the truth."""
+    problem, initial, index = SCENE.pack()
+    _, truth, _ = SCENE.at_truth()
+    centres = truth.poses.inverse().translation()
+    rotation, translation = truth.poses.rotation().as_matrix(), truth.poses.translation()
+    step = translation[1] - rotation[1] @ rotation[0].T @ translation[0]
+    seen = SCENE.observations
+    edge, landmark = seen.point_edge, seen.point_landmark
+    host, target = seen.edges[edge].T
+    # The true point of each match in its target camera, and a plane through it.
+    ray = np.concatenate([(seen.pixel - SCENE.intrinsics[2:]) / SCENE.intrinsics[:2], np.ones((len(seen.pixel), 1))], 1)
+    own = (ray / SCENE.inverse_depth[:, None])[landmark]
+    world = np.einsum("nba,nb->na", np.asarray(rotation)[host], own - np.asarray(translation)[host])
+    there = np.einsum("nab,nb->na", np.asarray(rotation)[target], world) + np.asarray(translation)[target]
+    normal = np.tile([0.6, 0.0, 0.8], (len(edge), 1))
+    place = lambda values: index.along_edges(edge, landmark, values)
+    fix = PositionFix(keyframe=[1, 2], position=centres[1:], weight=jnp.full(2, 1e6), kernel=LogCosh())
+    wheels = StepOfWheels(first=[0], second=[1], measured=step[None], weight=jnp.full(1, 1e5))
+    planes = PointToPlane(
+        normal=place(normal), distance=place((there * normal).sum(1)), weight=place(np.full(len(edge), 1e4))
+    )
+    for term in (fix, wheels, planes):
+        problem = problem.with_term(term)
+    return problem, initial, truth
+
+
+@pytest.fixture(scope="module")
+def own() -> tuple[vg.Problem, vg.State, vg.State]:
+    return with_own_terms()
+
+
+@pytest.fixture(scope="module")
+def solved(own: tuple[vg.Problem, vg.State, vg.State]) -> vg.Solution:
+    return eqx.filter_jit(vg.solve)(own[0], own[1], solver=SOLVER)
+
+
+def test_a_residual_that_is_written_is_the_residual_that_is_solved(own, solved) -> None:
+    # Proves that own terms move the optimum: from 1 cm off, exact fixes bring the centres to the truth. Oracle: truth.
+    problem, initial, truth = own
+    off = lambda state: float(jnp.abs(state.poses.inverse().translation() - truth.poses.inverse().translation()).max())
+    assert off(initial) > 5e-3
+    assert off(solved.state) < 1.5e-3, off(solved.state)
+    lone = problem.without_term("position_fix").without_term("point_to_plane").without_term("step_of_wheels")
+    assert off(eqx.filter_jit(vg.solve)(lone, initial, solver=SOLVER).state) > 2 * off(solved.state)
+
+
+def test_second_derivatives_are_derived(own) -> None:
+    # Proves gradient and exact Hessian with own terms of three kinds and an own kernel. Oracle: automatic
+    # differentiation of the energy after a retraction.
+    problem, state, _ = own
+    ba = BundleAdjustment(problem)
+    flat, unflat = ravel_pytree(ba.zero_step(state))
+
+    @jax.jit
+    def both(problem, state):
+        ba = BundleAdjustment(problem)
+        total = lambda step: vg.energy(problem, ba.retract(state, unflat(step)))
+        system = ba.hessian(state)
+        matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
+        gradients = ravel_pytree(ba.gradient(state))[0], reduce(system).gradient
+        return matrix, gradients, jax.hessian(total)(flat), jax.grad(total)(flat)
+
+    matrix, (gradient, dense), hessian, expected = both(problem, state)
+    unit = 1 / np.sqrt(np.abs(np.diag(hessian)) + 1.0)
+    error = float(np.abs((matrix - hessian) * np.outer(unit, unit)).max())
+    assert error < 1e-9, error
+    size = float(np.abs(expected * unit).max())
+    for found in (gradient, np.concatenate([dense, gradient[len(dense) :]])):
+        error = float(np.abs((found - expected) * unit).max())
+        assert error < 1e-10 * size, error
+
+
+def test_gradient_by_own_data(own) -> None:
+    # Proves that the optimum is differentiated by the data of a user's term, under `vmap` too. Oracle: finite
+    # differences of the solve.
+    problem, initial, _ = own
+    get = lambda p: p.position_fix.position
+
+    def loss(position: jax.Array) -> jax.Array:
+        moved = eqx.tree_at(get, problem, position)
+        return jnp.sum(jnp.sin(3 * vg.solve(moved, initial, solver=SOLVER).state.poses.wxyz_xyz))
+
+    value_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(loss)))
+    along = np.random.default_rng(0).normal(size=get(problem).shape)
+    steps = jnp.asarray([0.0, 1e-4, -1e-4])
+    values, gradients = value_and_gradient(get(problem) + steps[:, None, None] * along)
+    difference = float(values[1] - values[2]) / 2e-4
+    found = float(jnp.sum(gradients[0] * along))
+    assert abs(found - difference) < 1e-5 * abs(difference), (found, difference)
+
+
+def test_own_terms_are_known_everywhere(own, solved) -> None:
+    # Proves that covariances shrink by an own fix, that observability and statistics name it, and that marginalisation
+    # takes it along. Oracle: the same problem without it; what is named.
+    problem, _, _ = own
+    known = eqx.filter_jit(vg.covariances)
+    without = problem.without_term("position_fix")
+    sigma = lambda p: np.sqrt(np.trace(np.asarray(known(p, solved.state).poses)[2, :3, :3]))
+    assert sigma(problem) < 0.9 * sigma(without)
+    sizes = eqx.filter_jit(vg.residual_sizes)(problem, solved.state)
+    assert int(sizes.count["position_fix"]) == 2
+    assert "position_fix" in str(sizes)
+    found = eqx.filter_jit(vg.observability)(problem, solved.state)
+    assert "position_fix" in found.report()
+    gone = jax.jit(vg.marginalise)
+    prior = gone(problem.with_term(vg.no_prior(3)), solved.state, jnp.asarray(1))
+    less = gone(without.with_term(vg.no_prior(3)), solved.state, jnp.asarray(1))
+    information = lambda p: float(jnp.trace(p.root[:, 12:18].T @ p.root[:, 12:18]))
+    assert information(prior) > 1.01 * information(less)

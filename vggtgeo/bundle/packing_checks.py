@@ -1,0 +1,195 @@
+"""What `pack` asks of its arguments: every wrong one ends in a sentence that names it, what it is, and what to do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jaxlie
+import numpy as np
+
+from vggtgeo.io.errors import InputError
+from vggtgeo.solvers.kernels import AbstractKernel
+
+if TYPE_CHECKING:
+    from vggtgeo.bundle.packing import Observations, PaddedSize
+
+UNIT = 1e-3
+"""How far a quaternion's length and a line's normal may be from 1: what single precision and text files leave."""
+
+
+def as_poses(poses: Any) -> np.ndarray:
+    """`[n, 7]` from an array, nested lists, or `jaxlie.SE3`."""
+    if isinstance(poses, jaxlie.SE3):
+        poses = poses.wxyz_xyz
+    found = as_numbers("poses", poses)
+    if found.ndim != 2 or found.shape[1] != len("wxyzxyz"):
+        raise InputError(
+            f"`poses` has shape {found.shape}; expected (n, 7): qw, qx, qy, qz, tx, ty, tz of each, world -> camera"
+        )
+    return found
+
+
+def as_numbers(name: str, given: Any) -> np.ndarray:
+    """An array of numbers from whatever was given."""
+    try:
+        found = np.asarray(given)
+    except ValueError as error:
+        raise InputError(f"`{name}` cannot be read as an array: {error}") from error
+    if not (np.issubdtype(found.dtype, np.number) or found.dtype == bool):
+        raise InputError(f"`{name}` is {given!r:.60}; expected numbers")
+    return found
+
+
+def check_kernel(kernel: Any) -> None:
+    """A robust kernel with a width, not its name."""
+    if kernel is None:
+        return
+    if not isinstance(kernel, AbstractKernel):
+        raise InputError(f"`kernel` is {kernel!r}; expected a kernel object, as `vggtgeo.Huber(1.5)`, or None")
+    width = getattr(kernel, "delta", None)
+    if width is not None and not np.all(np.asarray(width) > 0):
+        raise InputError(f"`kernel` has the width {width}; it must be positive")
+
+
+def check_fixed(name: str, given: Any, count: int) -> np.ndarray:
+    """`bool [count]` from one bool or so many."""
+    found = np.asarray(given)
+    if found.dtype != bool or found.shape not in ((), (count,)):
+        raise InputError(f"`{name}` is {given!r:.60}; expected True, False, or {count} of them")
+    return np.broadcast_to(found, count)
+
+
+def check_values(observations: Observations) -> None:
+    """Weights that are weights, normals that are normals, depths that are depths."""
+    for name in ("point_weight", "line_weight", "depth_weight"):
+        weight = getattr(observations, name)
+        if weight is not None:
+            _refuse(name, weight, ~(np.isfinite(weight) & (np.asarray(weight) >= 0)), "finite and not negative")
+    if not (np.isfinite(observations.alpha) and observations.alpha >= 0):
+        raise InputError(f"`alpha` is {observations.alpha}; it must be finite and not negative")
+    used = lambda weight: np.asarray(weight) > 0
+    finite = lambda values: np.isfinite(np.asarray(values, float)).reshape(len(values), -1).all(1)
+    for name, weight in (("point_target", observations.point_weight), ("line_coefficients", observations.line_weight)):
+        values = getattr(observations, name)
+        _refuse(name, values, used(weight) & ~finite(values), "finite where its weight is positive")
+    _refuse("pixel", observations.pixel, ~finite(observations.pixel), "finite")
+    normal = np.linalg.norm(np.asarray(observations.line_coefficients, float)[:, :2], axis=1)
+    off = used(observations.line_weight) & (np.abs(normal - 1) > UNIT)
+    _refuse(
+        "line_coefficients", observations.line_coefficients, off, "divided by its root of a^2 + b^2, which must be 1"
+    )
+    if observations.depth_mean is not None:
+        mean = np.asarray(observations.depth_mean, float)
+        there = np.ones(len(mean), bool) if observations.depth_weight is None else used(observations.depth_weight)
+        _refuse("depth_mean", mean, there & ~(np.isfinite(mean) & (mean > 0)), "positive and finite")
+
+
+def check_edges(edges: np.ndarray) -> None:
+    """No edge to itself, none twice."""
+    loops = np.nonzero(edges[:, 0] == edges[:, 1])[0]
+    if len(loops):
+        raise InputError(
+            f"`edges[{loops[0]}]` goes from keyframe {edges[loops[0], 0]} to itself; an edge joins two keyframes"
+        )
+    _, first = np.unique(edges, axis=0, return_index=True)
+    if len(first) < len(edges):
+        twice = int(np.delete(np.arange(len(edges)), first)[0])
+        raise InputError(
+            f"`edges[{twice}]` joins {tuple(map(int, edges[twice]))} once more; give each direction of a pair one edge"
+        )
+
+
+def _refuse(name: str, values: Any, wrong: np.ndarray, must: str) -> None:
+    if np.any(wrong):
+        first = int(np.nonzero(wrong)[0][0])
+        raise InputError(f"`{name}[{first}]` is {np.asarray(values)[first]}; it must be {must}")
+
+
+def check_indices(observations: Observations, keyframes: int) -> None:
+    """Indices in range, each match once, landmarks hosted where their edges start."""
+    edges, landmarks = len(observations.edges), len(observations.host)
+    limits = [
+        ("edges", observations.edges, keyframes, "keyframes"),
+        ("host", observations.host, keyframes, "keyframes"),
+        ("point_edge", observations.point_edge, edges, "edges"),
+        ("line_edge", observations.line_edge, edges, "edges"),
+        ("point_landmark", observations.point_landmark, landmarks, "landmarks"),
+        ("line_landmark", observations.line_landmark, landmarks, "landmarks"),
+    ]
+    for name, given, limit, what in limits:
+        values = np.asarray(given)
+        if values.size and (values.min() < 0 or values.max() >= limit):
+            raise InputError(
+                f"`{name}` goes from {values.min()} to {values.max()}; there are {limit} {what}: use 0 to {limit - 1}"
+            )
+    for kind in ("point", "line"):
+        edge, landmark = getattr(observations, f"{kind}_edge"), getattr(observations, f"{kind}_landmark")
+        wrong = observations.edges[edge, 0] != observations.host[landmark]
+        if np.any(wrong):
+            first = int(np.nonzero(wrong)[0][0])
+            raise InputError(
+                f"`{kind}_edge[{first}]` starts at keyframe {observations.edges[edge[first], 0]}, but its landmark is "
+                f"hosted in keyframe {observations.host[landmark[first]]}: an edge observes landmarks of its own host"
+            )
+        _, first_seen = np.unique(edge * landmarks + landmark, return_index=True)
+        if len(first_seen) < len(edge):
+            twice = np.delete(np.arange(len(edge)), first_seen)[0]
+            raise InputError(
+                f"`{kind}_edge` and `{kind}_landmark` name landmark {landmark[twice]} on edge {edge[twice]} more than "
+                "once; a landmark has one match an edge"
+            )
+
+
+def check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.ndarray) -> None:
+    """Arrays of the lengths that belong together."""
+    edges, landmarks = len(observations.edges), len(observations.host)
+    points, lines = len(observations.point_edge), len(observations.line_edge)
+    expected = {
+        "edges": (edges, 2),
+        "pixel": (landmarks, 2),
+        "point_landmark": (points,),
+        "point_target": (points, 2),
+        "point_weight": (points,),
+        "line_landmark": (lines,),
+        "line_coefficients": (lines, 3),
+        "line_weight": (lines,),
+    }
+    optional = ("depth_mean", "depth_sigma", "depth_weight", "segment")
+    given = {name: getattr(observations, name) for name in (*expected, *optional)}
+    expected |= {name: (landmarks,) for name in optional if given[name] is not None}
+    given |= {"poses": poses, "intrinsics": intrinsics}
+    for name, shape in {**expected, "poses": (len(poses), 7), "intrinsics": (4,)}.items():
+        if np.shape(given[name]) != shape:
+            raise InputError(f"`{name}` has shape {np.shape(given[name])}; expected {shape}")
+
+
+def check_camera(poses: np.ndarray, intrinsics: np.ndarray, sigma: np.ndarray | float | None) -> None:
+    """Focal lengths, their standard deviations and unit quaternions."""
+    if np.any(np.asarray(intrinsics)[:2] <= 0):
+        raise InputError(f"`intrinsics` is {np.asarray(intrinsics)}; both focal lengths must be positive")
+    if sigma is not None and not np.all(np.asarray(sigma) > 0):
+        raise InputError(f"`intrinsics_sigma` is {sigma}; it must be positive (None = no prior)")
+    lengths = np.linalg.norm(poses[:, :4], axis=1)
+    wrong = np.nonzero(np.abs(lengths - 1) > 1e-3)[0]
+    if len(wrong):
+        raise InputError(f"`poses[{wrong[0]}]` has a quaternion of length {lengths[wrong[0]]:.3g}; expected 1")
+
+
+def check_positive(name: str, values: np.ndarray, count: int) -> None:
+    """One positive number a landmark."""
+    if np.shape(values) != (count,):
+        raise InputError(f"`{name}` has shape {np.shape(values)}; expected ({count},), one a landmark")
+    bad = ~(np.isfinite(values) & (np.asarray(values) > 0))
+    if np.any(bad):
+        first = int(np.nonzero(bad)[0][0])
+        raise InputError(f"`{name}[{first}]` is {values[first]}; it must be positive and finite")
+
+
+def check_size(size: PaddedSize, needed: PaddedSize) -> None:
+    """A padded size that is large enough."""
+    if needed.samples is not None and size.lines % needed.samples:
+        raise InputError(f"`size.lines` is {size.lines}; it must be a multiple of `size.samples`, {needed.samples}")
+    for name in ("keyframes", "points", "lines", "ranks", "edges"):
+        have, need = getattr(size, name), getattr(needed, name)
+        if have is not None and (have < need or (name == "edges" and have != need)):
+            raise InputError(f"`size.{name}` is {have}; this problem needs {need}")

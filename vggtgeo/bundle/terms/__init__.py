@@ -1,0 +1,13 @@
+"""The terms of the energy, one a file: a residual of ONE observation, its data, its weights, its robust kernel.
+
+| kind, by what it touches | residual | terms of the package |
+|---|---|---|
+| `SlotTerm`: a landmark | `residual(inverse_depth)` | `DepthPrior` |
+| `EdgeTerm`: a landmark seen along an edge | `residual(view)` | `PointTerm`, `LineTerm` |
+| `PairTerm`: two poses | `residual(pose_i, pose_j)` | `RelativePose`, `BaselinePrior` |
+| `PoseTerm`: a pose and the camera | `residual(pose, camera)` | `RotationPrior` |
+| `CameraTerm`: the camera | `residual(parameters)` | `IntrinsicsPrior` |
+| `DenseTerm`: all poses and the camera | `residual(poses, parameters)` | `MarginalPrior` |
+
+`vggtgeo/bundle/linearise.py` makes the normal equations of any tuple of them.
+"""

@@ -1,0 +1,26 @@
+"""A known distance between two cameras: the unit of a map without metric depth."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from vggtgeo.bundle.terms.node import PairTerm
+from vggtgeo.geometry import lie
+
+
+class BaselinePrior(PairTerm):
+    """`r = log(|t_ij| / length) / sigma`: the distance of two camera centres."""
+
+    length: Float[Array, " m"]
+    """Metres, or the map's own unit."""
+    sigma: Float[Array, " m"]
+    """Relative standard deviation."""
+
+    name = "baselines"
+    unit = "sigma"
+
+    def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, ""]:
+        squared = jnp.sum(lie.relative(first, second).translation() ** 2)
+        return jnp.log(jnp.maximum(squared, 1e-24) / self.length**2) / (2 * self.sigma)

@@ -1,0 +1,228 @@
+"""Terms on a landmark seen along an edge: what makes the arrow's cross terms.
+
+Local coordinates of one edge: the left tangent `eta` of the relative pose (6), the camera's parameters (q), and the
+inverse depth of each landmark. Slots come last in every array, so that each quantity is contiguous: columns are
+`[6 + q + 2, m p]`, in the order eta, camera, residual, inverse depth, for `m` residual rows after one another.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import NamedTuple, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from vggtgeo.bundle.fast import pinhole
+from vggtgeo.bundle.fast.pinhole import Projection
+from vggtgeo.bundle.terms.term import AbstractTerm, reweighted_rows, reweighting, robust_energy, squared_norm
+from vggtgeo.bundle.terms.view import View
+from vggtgeo.geometry import lie
+from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
+
+Rows = tuple[Float[Array, " p"], ...]
+"""Entries of a residual, one array each: a stacked one keeps XLA from vectorising the loop around it."""
+
+
+class EdgeView(eqx.Module):
+    """All slots of one edge's host, as the edge sees them; `projection` only for the pinhole's fast path."""
+
+    relative: jaxlie.SE3
+    camera: AbstractCamera
+    pixels: Float[Array, "2 p"]
+    inverse_depth: Float[Array, " p"]
+    fast: pinhole.OneEdge | None
+    projection: Projection | None
+
+    @property
+    def size(self) -> int:
+        """Coordinates that all slots of the edge share: relative pose and camera."""
+        return lie.TANGENT + len(self.camera.parameters)
+
+    def slots(self, first: int, count: int) -> EdgeView:
+        """The same for some of the slots."""
+        part = lambda leaf: leaf[..., first : first + count]
+        projection = jax.tree.map(part, self.projection)
+        return EdgeView(self.relative, self.camera, part(self.pixels), part(self.inverse_depth), self.fast, projection)
+
+
+class LocalModel(NamedTuple):
+    """Exact second-order model of one edge's energy; `d = 6 + q`."""
+
+    gram: Float[Array, "d+1 d+1"]
+    """Hessian by the shared coordinates, with the gradient as last row and column (the corner is unused)."""
+    coupled: Float[Array, "d+2 p"]
+    """Mixed derivatives with each inverse depth, then its gradient and its curvature."""
+
+
+class EdgeTerm(AbstractTerm):
+    """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its host."""
+
+    first_slot: int = eqx.field(static=True, kw_only=True, default=0)
+    """Slot of the host that the first column is about."""
+
+    structure = frozenset({"weight", "kernel", "first_slot"})
+
+    @abc.abstractmethod
+    def residual(self, view: View) -> Float[Array, "*m"]:
+        """Of one landmark seen along one edge."""
+
+    def restricted(self, of_edge: Float[Array, " e"] | Array) -> Self:
+        """The same term without the observations of some edges, where `of_edge` is False."""
+        return self.reweighted(jnp.where(of_edge[:, None], self.weight, 0.0))
+
+    def prepared(self) -> Self:
+        safe = super().prepared()
+        return safe.holding(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, -1), safe.data()))
+
+    def residuals(self, view: EdgeView) -> Float[Array, "m p"]:
+        """Of all slots of one edge; `self` holds the prepared data of that edge."""
+        return self._moved(view, jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth)
+
+    def energy(self, view: EdgeView) -> Float[Array, ""]:
+        """Of one edge."""
+        return robust_energy(self.kernel, self.weights, self.residuals(view))
+
+    def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "c mp"]:
+        """Weighted derivatives, residual and depth derivative of one edge: their products are its normal equations."""
+        zero = jnp.zeros(view.size, view.inverse_depth.dtype)
+        by_shared = lambda tangent: jax.jvp(lambda x: self._moved(view, x, view.inverse_depth), (zero,), (tangent,))[1]
+        shared = jax.vmap(by_shared)(jnp.eye(view.size, dtype=zero.dtype))
+        ones = jnp.ones_like(view.inverse_depth)
+        residual, depth = jax.jvp(lambda d: self._moved(view, zero, d), (view.inverse_depth,), (ones,))
+        jacobian = jnp.concatenate([shared, depth[None]])
+        rows, pull = reweighted_rows(self.kernel, self.weights, residual, jacobian, correction)
+        return jnp.concatenate([rows[:-1], pull[None], rows[-1:]]).reshape(len(rows) + 1, -1)
+
+    def gradient(self, view: EdgeView) -> tuple[Float[Array, " d"], Float[Array, " p"]]:
+        """Gradient of one edge's energy by relative pose and camera, and by each inverse depth."""
+        zero = jnp.zeros(view.size, view.inverse_depth.dtype)
+        return jax.grad(self._energy_at, (1, 2))(view, zero, view.inverse_depth)
+
+    def model(self, view: EdgeView) -> LocalModel:
+        """Exact Hessian and gradient of one edge."""
+        zero, depth = jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth
+        gradient = lambda x, d: jax.grad(self._energy_at, (1, 2))(view, x, d)
+        along = lambda tangent: jax.jvp(lambda x: gradient(x, depth), (zero,), (tangent,))[1]
+        hessian, mixed = jax.vmap(along)(jnp.eye(view.size, dtype=zero.dtype))
+        (shared, own), (_, curvature) = jax.jvp(lambda d: gradient(zero, d), (depth,), (jnp.ones_like(depth),))
+        gram = jnp.pad(hessian, (0, 1)).at[-1, :-1].set(shared).at[:-1, -1].set(shared)
+        return LocalModel(gram, jnp.concatenate([mixed, own[None], curvature[None]]))
+
+    def _energy_at(self, view: EdgeView, shared: Array, depth: Array) -> Float[Array, ""]:
+        return robust_energy(self.kernel, self.weights, self._moved(view, shared, depth))
+
+    def _moved(self, view: EdgeView, shared: Float[Array, " d"], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
+        """Residuals after a step of the shared coordinates, at the given depths."""
+        relative = lie.move(view.relative, shared[: lie.TANGENT])
+        parameters = view.camera.parameters + shared[lie.TANGENT :]
+        camera = eqx.tree_at(lambda camera: camera.parameters, view.camera, parameters)
+
+        def one(data: dict, pixel: Array, inverse_depth: Array) -> Array:
+            return jnp.atleast_1d(self.holding(data).residual(View(relative, camera, pixel, inverse_depth)))
+
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(self.data(), view.pixels, depth)
+
+
+_WITH_ENTRIES = 3
+"""Axes of prepared data that have entries beside edge and slot."""
+
+
+class ImageTerm(EdgeTerm):
+    """A residual that is an affine function of the landmark's pixel in the target: a match, a line.
+
+    With the pinhole, its derivatives come from `fast/pinhole.py`, written by hand; with other cameras from automatic
+    differentiation. The tests hold the two equal.
+    """
+
+    @abc.abstractmethod
+    def image_residual(self, u: Float[Array, ""], v: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
+        """Entries of the residual of one observation, given the projected pixel `(u, v)`.
+
+        Data of an observation are read entry by entry (`self.target[0]`): in the loops each entry is an array of its
+        own, which XLA vectorises; a small axis inside them would keep it from that (1.9 times slower).
+        """
+
+    def prepared(self) -> Self:
+        safe = super().prepared()
+        split = lambda leaf: tuple(jnp.unstack(leaf, axis=1)) if leaf.ndim == _WITH_ENTRIES else leaf
+        return safe.holding(jax.tree.map(split, safe.data()))
+
+    def residual(self, view: View) -> Float[Array, " m"]:
+        return jnp.stack(self.image_residual(*view.projected))
+
+    def energy(self, view: EdgeView) -> Float[Array, ""]:
+        if view.fast is None or view.projection is None:
+            return super().energy(view)
+        return robust_energy(self.kernel, self.weights, self._image(view, view.projection)[0])
+
+    def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "c mp"]:
+        if view.fast is None or view.projection is None:
+            return super().columns(view, correction)
+        residual, normal = self._image(view, view.projection)
+        scale = reweighting(self.kernel, self.weights, squared_norm(residual), correction)
+        along = [scale.share * sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]
+        parts = []
+        for i, r in enumerate(residual):
+            a, b = (scale.root * (of[i] - pulled * r) for of, pulled in zip(normal, along, strict=True))
+            row = pinhole.row(view.fast, view.projection, a, b)
+            parts.append(jnp.stack([*row[:-1], scale.root * r / scale.soft, row[-1]]))
+        return jnp.concatenate(parts, 1)
+
+    def gradient(self, view: EdgeView) -> tuple[Float[Array, " d"], Float[Array, " p"]]:
+        if view.fast is None or view.projection is None:
+            return super().gradient(view)
+        force, _ = self._force(view, view.projection)
+        row = pinhole.row(view.fast, view.projection, *force)
+        return jnp.stack([jnp.sum(column) for column in row[:-1]]), row[-1]
+
+    def model(self, view: EdgeView) -> LocalModel:
+        if view.fast is None or view.projection is None:
+            return super().model(view)
+        columns = self.columns(view, None)
+        coupled = times_depth_column(columns, len(view.inverse_depth))
+        flat = columns[:-1]
+        force, bend = self._force(view, view.projection)
+        added, mixed = pinhole.second_order(view.fast, view.projection, force, bend)
+        gram = (flat @ flat.T).at[:-1, :-1].add(added)
+        return LocalModel(gram, coupled.at[:-2].add(mixed[:-1]).at[-1].add(mixed[-1]))
+
+    def _image(self, view: EdgeView, at: Projection) -> tuple[Rows, tuple[Rows, Rows]]:
+        """Residuals, and their derivatives by the projected pixel's coordinates, row by row."""
+        fx, fy, cx, cy = view.camera.parameters
+        pixel = (fx * at.x + cx, fy * at.y + cy)
+
+        def each(u: Array, v: Array) -> Rows:
+            return jax.vmap(lambda data, u, v: tuple(self.holding(data).image_residual(u, v)), in_axes=-1)(
+                self.data(), u, v
+            )
+
+        one, zero = jnp.ones_like(at.x), jnp.zeros_like(at.x)
+        residual, right = jax.jvp(each, pixel, (one, zero))
+        return residual, (right, jax.jvp(each, pixel, (zero, one))[1])
+
+    def _force(self, view: EdgeView, at: Projection) -> tuple[Float[Array, "2 p"], Float[Array, " p"]]:
+        """`w rho' r` on the projected pixel, and `2 rho'' / rho'^2`, the bend of the kernel; zero where absent."""
+        residual, normal = self._image(view, at)
+        s = self.weights * squared_norm(residual)
+        first, second = self.kernel.weight(s), self.kernel.curvature(s)
+        pulled = (first > 0) & (self.weights > 0)
+        bend = jnp.where(pulled, 2 * second / jnp.where(pulled, first, 1.0) ** 2, 0.0)
+        pull = self.weights * first
+        return jnp.stack([pull * sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]), bend
+
+
+def times_depth_column(columns: Float[Array, "c mp"], slots: int) -> Float[Array, "c p"]:
+    """Each column times the depth column, the rows of an observation added; gradient and curvature come last."""
+    depth, total = columns[-1], 0.0
+    for start in range(0, columns.shape[1], slots):
+        total = total + columns[:, start : start + slots] * depth[start : start + slots]
+    return total
+
+
+def uses_projection(camera: type[AbstractCamera]) -> bool:
+    """Whether the hand-written derivatives know this camera."""
+    return camera is Pinhole

@@ -1,0 +1,22 @@
+"""A Gaussian prior on the camera's parameters: a calibration and how far it is trusted."""
+
+from __future__ import annotations
+
+from jaxtyping import Array, Float, Int
+
+from vggtgeo.bundle.terms.node import CameraTerm
+
+
+class IntrinsicsPrior(CameraTerm):
+    """`r = k - mean` for each parameter, weight `1 / sigma^2`; without a robust kernel."""
+
+    index: Int[Array, " q"]
+    """Which parameter each observation is about, from 0."""
+    mean: Float[Array, " q"]
+    """Pixels (distortion: no unit)."""
+
+    name = "intrinsics_prior"
+    unit = "px"
+
+    def residual(self, parameters: Float[Array, " q"]) -> Float[Array, ""]:
+        return parameters[self.index] - self.mean

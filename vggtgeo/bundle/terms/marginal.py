@@ -1,0 +1,57 @@
+"""What marginalisation left behind: a Gaussian prior on all poses and the camera."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int
+
+from vggtgeo.bundle.terms.node import DenseTerm
+from vggtgeo.bundle.terms.term import local_model
+from vggtgeo.geometry import lie
+
+
+class MarginalPrior(DenseTerm):
+    """`r = root (x boxminus linearisation) + offset` over poses and camera parameters.
+
+    Coordinates: six a keyframe (left tangent `log(T T_lin^-1)`, translation first), then the camera's.
+    """
+
+    root: Float[Array, "c c"]
+    offset: Float[Array, " c"]
+    poses: jaxlie.SE3
+    """Linearisation points, batch `[n]`; kept as long as the prior lives (first estimates)."""
+    intrinsics: Float[Array, " q"]
+
+    name = "marginal"
+    unit = "sigma"
+
+    def residual(self, poses: jaxlie.SE3, parameters: Float[Array, " q"]) -> Float[Array, " c"]:
+        difference = lie.boxminus(poses, self.poses).reshape(-1)
+        return self.root @ jnp.concatenate([difference, parameters - self.intrinsics]) + self.offset
+
+    def rows(self) -> Int[Array, ""]:
+        return jnp.sum(jnp.any(self.root != 0, 1))
+
+    def model(
+        self, poses: jaxlie.SE3, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
+    ) -> tuple[Float[Array, "c c"], Float[Array, " c"]]:
+        """By the chain rule, pose by pose: automatic differentiation of the whole would move all poses for each
+        coordinate.
+        """
+        if exact:
+            return super().model(poses, parameters, correction, exact)
+        size = len(parameters)
+
+        def difference(pose: Array, base: Array) -> Array:
+            moved = lambda x: lie.boxminus(lie.move(jaxlie.SE3(pose), x), jaxlie.SE3(base))
+            return jax.jacfwd(moved)(jnp.zeros(lie.TANGENT, pose.dtype))
+
+        blocks = jax.vmap(difference)(poses.wxyz_xyz, self.poses.wxyz_xyz)
+        by_pose = self.root[:, :-size].reshape(len(self.root), -1, lie.TANGENT)
+        by_pose = jnp.einsum("cnb,nbd->cnd", by_pose, blocks).reshape(len(self.root), -1)
+        jacobian = jnp.concatenate([by_pose, self.root[:, -size:]], 1)
+        residual = self.residual(poses, parameters)
+        linear = lambda step: residual + jacobian @ step
+        return local_model(self, self.weights, linear, len(self.offset), correction, exact)

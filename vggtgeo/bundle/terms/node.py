@@ -1,0 +1,164 @@
+"""Terms on poses and the camera: no landmark takes part, so they live in the dense part of the arrow."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int
+
+from vggtgeo.bundle.terms.term import AbstractTerm, Local, local_model
+from vggtgeo.geometry import lie
+from vggtgeo.geometry.cameras import AbstractCamera
+
+_Index = Int[Array, " m"]
+_indices: Callable[[object], Array] = lambda given: jnp.asarray(given, jnp.int32)
+
+
+class PoseTerm(AbstractTerm):
+    """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`."""
+
+    keyframe: _Index = eqx.field(converter=_indices, kw_only=True)
+    """Which pose each observation is about."""
+
+    structure = frozenset({"weight", "kernel", "keyframe"})
+
+    @abc.abstractmethod
+    def residual(self, pose: jaxlie.SE3, camera: AbstractCamera) -> Float[Array, "*m"]:
+        """Of one observation; `pose` is world -> camera."""
+
+    def local(self, data: dict, poses: tuple[Array, ...], camera: AbstractCamera) -> Local:
+        """The residual of one observation as a function of `(xi, camera parameters)`."""
+
+        def function(step: Array) -> Array:
+            pose = lie.move(jaxlie.SE3(poses[0]), step[: lie.TANGENT])
+            return jnp.atleast_1d(self.holding(data).residual(pose, _moved(camera, step[lie.TANGENT :])))
+
+        return function
+
+    def touched(self) -> tuple[_Index, ...]:
+        """Keyframes of each observation."""
+        return (self.keyframe,)
+
+    def local_size(self, camera: AbstractCamera) -> int:
+        """Number of local coordinates."""
+        return lie.TANGENT + len(camera.parameters)
+
+
+class PairTerm(AbstractTerm):
+    """Observations of two poses: `weight` and data have the axis `[m]`."""
+
+    first: _Index = eqx.field(converter=_indices, kw_only=True)
+    """Keyframe i of each observation."""
+    second: _Index = eqx.field(converter=_indices, kw_only=True)
+    """Keyframe j."""
+
+    structure = frozenset({"weight", "kernel", "first", "second"})
+
+    @abc.abstractmethod
+    def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, "*m"]:
+        """Of one observation; poses are world -> camera, so `second @ first.inverse()` maps camera i to camera j."""
+
+    def local(self, data: dict, poses: tuple[Array, ...], camera: AbstractCamera) -> Local:
+        """The residual of one observation as a function of `(xi_i, xi_j)`."""
+
+        def function(step: Array) -> Array:
+            first = lie.move(jaxlie.SE3(poses[0]), step[: lie.TANGENT])
+            second = lie.move(jaxlie.SE3(poses[1]), step[lie.TANGENT :])
+            return jnp.atleast_1d(self.holding(data).residual(first, second))
+
+        return function
+
+    def touched(self) -> tuple[_Index, ...]:
+        """Keyframes of each observation."""
+        return self.first, self.second
+
+    def local_size(self, camera: AbstractCamera) -> int:
+        """Number of local coordinates."""
+        return 2 * lie.TANGENT
+
+
+NodeTerm = PoseTerm | PairTerm
+
+
+class CameraTerm(AbstractTerm):
+    """Observations of the camera's parameters: `weight` and data have the axis `[m]`."""
+
+    @abc.abstractmethod
+    def residual(self, parameters: Float[Array, " q"]) -> Float[Array, "*m"]:
+        """Of one observation."""
+
+    def residuals(self, parameters: Float[Array, " q"]) -> Float[Array, "m k"]:
+        """Of all of them, the residual's own axis first."""
+        one = lambda data, _: jnp.atleast_1d(self.holding(data).residual(parameters))
+        return jax.vmap(one, out_axes=-1)(self.data(), self.weight)
+
+    def model(
+        self, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
+    ) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
+        """Hessian and gradient of the energy."""
+
+        def one(data: dict, weight: Array) -> tuple[Array, Array]:
+            residual = lambda step: jnp.atleast_1d(self.holding(data).residual(parameters + step))
+            return local_model(self, weight, residual, len(parameters), correction, exact)
+
+        hessians, gradients = jax.vmap(one)(self.data(), self.weights)
+        return hessians.sum(0), gradients.sum(0)
+
+
+class DenseTerm(AbstractTerm):
+    """One observation of all poses and the camera together; it fills the matrix. `weight` is a scalar."""
+
+    @abc.abstractmethod
+    def residual(self, poses: jaxlie.SE3, parameters: Float[Array, " q"]) -> Float[Array, " m"]:
+        """Of the whole dense state: `poses` has a batch axis `[n]`."""
+
+    @abc.abstractmethod
+    def rows(self) -> Int[Array, ""]:
+        """Entries of the residual that say anything."""
+
+    def model(
+        self, poses: jaxlie.SE3, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
+    ) -> tuple[Float[Array, "c c"], Float[Array, " c"]]:
+        """Hessian and gradient of the energy by all tangents, then the camera."""
+        split = lie.TANGENT * len(poses.wxyz_xyz)
+
+        def residual(step: Array) -> Array:
+            moved = lie.move(poses, step[:split].reshape(-1, lie.TANGENT))
+            return self.residual(moved, parameters + step[split:])
+
+        return local_model(self, self.weights, residual, split + len(parameters), correction, exact)
+
+
+def node_residuals(term: NodeTerm, poses: Float[Array, "n 7"], camera: AbstractCamera) -> Float[Array, "k m"]:
+    """Residuals of all observations of a pose or pair term, the residual's own axis first."""
+
+    def one(data: dict, touched: tuple[Array, ...]) -> Array:
+        size = term.local_size(camera)
+        return term.local(data, tuple(poses[i] for i in touched), camera)(jnp.zeros(size, poses.dtype))
+
+    return jax.vmap(one, out_axes=-1)(term.data(), term.touched())
+
+
+def node_models(
+    term: NodeTerm,
+    poses: Float[Array, "n 7"],
+    camera: AbstractCamera,
+    correction: Float[Array, ""] | None,
+    exact: bool,
+) -> tuple[Float[Array, "m d d"], Float[Array, "m d"]]:
+    """Hessian and gradient of each observation of a pose or pair term by its local coordinates."""
+
+    def one(data: dict, weight: Array, touched: tuple[Array, ...]) -> tuple[Array, Array]:
+        residual = term.local(data, tuple(poses[i] for i in touched), camera)
+        return local_model(term, weight, residual, term.local_size(camera), correction, exact)
+
+    return jax.vmap(one)(term.data(), term.weights, term.touched())
+
+
+def _moved(camera: AbstractCamera, step: Array) -> AbstractCamera:
+    return eqx.tree_at(lambda camera: camera.parameters, camera, camera.parameters + step)

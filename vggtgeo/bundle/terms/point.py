@@ -1,0 +1,20 @@
+"""Matches of key points: the reprojection error."""
+
+from __future__ import annotations
+
+from jaxtyping import Array, Float
+
+from vggtgeo.bundle.terms.edge import ImageTerm
+
+
+class PointTerm(ImageTerm):
+    """`r = pi(T_j T_i^-1 pi^-1(u_i, d_i)) - u_j`, pixels (equation 5 of the paper)."""
+
+    target: Float[Array, "e p 2"]
+    """Matched pixel in keyframe j."""
+
+    name = "points"
+    unit = "px"
+
+    def image_residual(self, u: Float[Array, ""], v: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
+        return u - self.target[0], v - self.target[1]

@@ -1,0 +1,55 @@
+"""A measured relative pose of two keyframes: odometry, a loop, an alignment of surfaces."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from vggtgeo.bundle.terms.node import PairTerm
+from vggtgeo.geometry import lie
+
+
+class RelativePose(PairTerm):
+    """`r = root log(T_j T_i^-1 M^-1)` with `root^T root` the information of the measured `M`.
+
+    A quadratic `1/2 eta' H eta + g' eta` about a linearisation point `L` (normal equations of an alignment of surfaces)
+    is the same term with `M = exp(-H^+ g) L`, see `quadratic`.
+    """
+
+    measured: Float[Array, "m 7"]
+    """`M`: camera i -> camera j, `(qw, qx, qy, qz, tx, ty, tz)`."""
+    root: Float[Array, "m 6 6"]
+    """Square root of the information, translation first: 1/m and 1/rad."""
+
+    name = "relative_poses"
+    unit = "sigma"
+
+    def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, "6"]:
+        return self.root @ lie.boxminus(lie.relative(first, second), jaxlie.SE3(self.measured))
+
+
+def quadratic(
+    linearised_at: Float[Array, "m 7"], hessian: Float[Array, "m 6 6"], gradient: Float[Array, "m 6"]
+) -> tuple[Float[Array, "m 7"], Float[Array, "m 6 6"]]:
+    """`measured` and `root` of quadratics in the left tangent of relative poses about `linearised_at`.
+
+    Directions that the Hessian does not determine stay free: they have no row in the root.
+    """
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(hessian, axis1=-2, axis2=-1), 0.0))
+    safe = jnp.where(scale > 0, scale, 1.0)
+    # Metres and radians differ in size: balance before cutting off what is rounding error.
+    values, vectors = jnp.linalg.eigh(hessian / safe[..., :, None] / safe[..., None, :])
+    kept = values > 1e-12
+    roots = jnp.sqrt(jnp.where(kept, values, 1.0))
+    rows = jnp.swapaxes(vectors, -1, -2)
+    root = jnp.where(kept[..., None], roots[..., None] * rows * safe[..., None, :], 0.0)
+    pulled = jnp.where(kept, jnp.einsum("...ab,...b->...a", rows, gradient / safe) / roots**2, 0.0)
+    best = -jnp.einsum("...ba,...b->...a", rows, pulled) / safe
+    return lie.move(jaxlie.SE3(linearised_at), best).wxyz_xyz, root
+
+
+class SurfaceAlignment(RelativePose):
+    """What aligned surfaces of two keyframes say about their relative pose: a quadratic, made by `quadratic`."""
+
+    name = "surfaces"

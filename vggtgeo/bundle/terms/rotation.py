@@ -1,0 +1,27 @@
+"""A measured rotation of a keyframe: the directions of a Manhattan world, gravity and a compass."""
+
+from __future__ import annotations
+
+import jaxlie
+from jaxtyping import Array, Float
+
+from vggtgeo.bundle.terms.node import PoseTerm
+from vggtgeo.geometry import lie
+from vggtgeo.geometry.cameras import AbstractCamera
+
+
+class RotationPrior(PoseTerm):
+    """`r = root Log(R M^T)` with `root^T root` the information of the measured rotation `M`."""
+
+    measured: Float[Array, "m 4"]
+    """`M`: world -> camera, unit quaternion `(w, x, y, z)`."""
+    root: Float[Array, "m 3 3"]
+    """Square root of the information, 1/rad."""
+
+    name = "rotations"
+    unit = "sigma"
+
+    def residual(self, pose: jaxlie.SE3, camera: AbstractCamera) -> Float[Array, "3"]:
+        measured = jaxlie.SE3.from_rotation(jaxlie.SO3(self.measured))
+        rotation = jaxlie.SE3.from_rotation(pose.rotation())
+        return self.root @ lie.boxminus(rotation, measured)[3:]

@@ -1,0 +1,46 @@
+"""Terms on a single landmark: the diagonal of the arrow."""
+
+from __future__ import annotations
+
+import abc
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vggtgeo.bundle.terms.term import AbstractTerm, reweighted_rows
+
+Derivatives = tuple[Float[Array, "n s"], Float[Array, "n s"]]
+
+
+class SlotTerm(AbstractTerm):
+    """Observations of inverse depths: `weight` and data have the axes `[n, s]`, keyframe and slot."""
+
+    @abc.abstractmethod
+    def residual(self, inverse_depth: Float[Array, ""]) -> Float[Array, "*m"]:
+        """Of one landmark, 1/m."""
+
+    def residuals(self, inverse_depth: Float[Array, "n s"]) -> Float[Array, "m n s"]:
+        """Of all of them, the residual's own axis first."""
+        each = lambda data, depth: jnp.atleast_1d(self.holding(data).residual(depth))
+        return jax.vmap(jax.vmap(each, out_axes=-1), out_axes=1)(self.data(), inverse_depth)
+
+    def derivatives(
+        self, inverse_depth: Float[Array, "n s"], correction: Float[Array, ""] | None, exact: bool
+    ) -> Derivatives:
+        """First and second derivatives of the energy; of a prepared term."""
+        ones = jnp.ones_like(inverse_depth)
+        if exact:
+            return jax.jvp(self._gradient, (inverse_depth,), (ones,))
+        residual, slope = jax.jvp(self.residuals, (inverse_depth,), (ones,))
+        rows, pull = reweighted_rows(self.kernel, self.weights, residual, slope[None], correction)
+        return jnp.sum(rows[0] * pull, 0), jnp.sum(rows[0] * rows[0], 0)
+
+    def gradient(self, inverse_depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
+        """First derivative of the energy, differentiable once more."""
+        return self._gradient(inverse_depth)
+
+    def _gradient(self, inverse_depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
+        residual, slope = jax.jvp(self.residuals, (inverse_depth,), (jnp.ones_like(inverse_depth),))
+        pull = self.weights * self.kernel.weight(self.weights * jnp.sum(residual**2, 0))
+        return pull * jnp.sum(residual * slope, 0)

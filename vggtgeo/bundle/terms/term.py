@@ -1,0 +1,192 @@
+"""What all terms share: data with leading axes of observations, weights that say which are there, a robust kernel.
+
+The energy of a term is `1/2 sum rho(w |r|^2)` over its observations. A subclass writes `residual` for ONE observation,
+with no mask, no batch and no weight: there `self` holds the data of that observation alone. Everything else (energy,
+gradient, normal equations, exact Hessian) is derived from it by automatic differentiation in local coordinates.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vggtgeo.solvers.kernels import AbstractKernel, Square
+
+Local = Callable[[Array], Array]
+"""A residual as a function of local coordinates."""
+
+
+def shared_field(**options: Any) -> Any:
+    """A field of a term that all its observations share (a scale, a calibration), not data with an axis of its own."""
+    return eqx.field(metadata={"shared": True}, **options)
+
+
+class AbstractTerm(eqx.Module):
+    """One kind of observation; see the kinds beside this file for what `residual` takes.
+
+    The fields that a subclass adds are data: every array in them has the axes of `weight` first. What all observations
+    share is declared with `vggtgeo.shared_field()`.
+    """
+
+    weight: Float[Array, "*observations"] = eqx.field(converter=jnp.asarray, kw_only=True, default=1.0)
+    """Of each observation, 1 / variance of its residual; 0 means that it is not there."""
+    kernel: AbstractKernel = eqx.field(kw_only=True, default=Square())
+
+    unit: ClassVar[str] = ""
+    """Of the residual, for reports: `px`, say."""
+    structure: ClassVar[frozenset[str]] = frozenset({"weight", "kernel"})
+    """Fields that are no data of an observation: what it touches, and what this class holds itself."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "name" not in vars(cls):
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+
+    name: ClassVar[str] = "term"
+    """By which a problem finds it; a class without one of its own is called after itself, `PositionFix` is
+    `position_fix`."""
+
+    @property
+    def weights(self) -> Float[Array, "*observations"]:
+        """What the energy multiplies squared residuals with."""
+        return self.weight
+
+    def reweighted(self, weight: Float[Array, "*observations"]) -> Self:
+        """The same term with other weights."""
+        return eqx.tree_at(lambda term: term.weight, self, weight)
+
+    def present(self) -> Bool[Array, "*observations"]:
+        """Which observations are there."""
+        return self.weights > 0
+
+    def data(self) -> dict[str, Any]:
+        """The fields that hold data of observations."""
+        names = [field.name for field in dataclasses.fields(self) if not field.metadata.get("shared", False)]
+        return {name: getattr(self, name) for name in names if name not in self.structure}
+
+    def holding(self, data: dict[str, Any]) -> Self:
+        """The term with other data, one observation's in particular: what `residual` sees as `self`."""
+        one = object.__new__(type(self))
+        for field in dataclasses.fields(self):
+            object.__setattr__(one, field.name, data.get(field.name, getattr(self, field.name)))
+        return one
+
+    def prepared(self) -> Self:
+        """Zero weights and harmless data where nothing was observed, so that padding never makes a NaN.
+
+        Ones, not zeros: they may be divided by, normalised, and taken the logarithm of.
+        """
+        present = self.present()
+
+        def safe(leaf: Any) -> Any:
+            if not eqx.is_inexact_array(leaf):
+                return leaf
+            mask = present.reshape(present.shape + (1,) * (leaf.ndim - present.ndim))
+            return jnp.where(mask, leaf, 1.0)
+
+        kept = self.holding(jax.tree.map(safe, self.data()))
+        return kept.reweighted(jnp.where(present, self.weight, 0.0))
+
+
+def squared_norm(residual: Float[Array, "m *b"] | tuple[Array, ...]) -> Float[Array, "*b"]:
+    """`|r|^2`; the residual's own axis comes first, or its entries are given one by one."""
+    if isinstance(residual, tuple):
+        first, *others = (row * row for row in residual)
+        return sum(others, first)
+    return jnp.sum(residual * residual, 0)
+
+
+def robust_energy(
+    kernel: AbstractKernel, weight: Array, residual: Float[Array, "m *b"] | tuple[Array, ...]
+) -> Float[Array, ""]:
+    """`1/2 sum rho(w |r|^2)`; the residual as in `squared_norm`."""
+    return jnp.sum(kernel.rho(weight * squared_norm(residual))) / 2
+
+
+class Reweighting(NamedTuple):
+    """How residuals and derivatives of one observation are scaled; see `reweighting`."""
+
+    root: Array
+    """`a`."""
+    share: Array
+    """`(1 - b) / |r|^2`."""
+    soft: Array
+    """`b`."""
+
+
+def reweighting(
+    kernel: AbstractKernel, weight: Float[Array, "*b"], squared: Float[Array, "*b"], correction: Float[Array, ""] | None
+) -> Reweighting:
+    """What makes rows `J' = a (I - (1 - b) r r^T / |r|^2) J` and residuals `r' = a r / b` whose normal equations
+    `J'^T J'`, `J'^T r'` are those of the robust energy: exact in the gradient, reweighted in the Hessian, with a part
+    `correction` of the kernel's own curvature (Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999, 4.3).
+
+    `a^2 = w rho'`, and `b` is that of `softened`, 1 without a correction.
+    """
+    root = _root(weight * kernel.weight(weight * squared))
+    soft = jnp.ones_like(root) if correction is None else softened(kernel, weight * squared, correction)
+    return Reweighting(root, (1 - soft) / jnp.where(squared > 0, squared, 1.0), soft)
+
+
+def reweighted_rows(
+    kernel: AbstractKernel,
+    weight: Float[Array, "*b"],
+    residual: Float[Array, "m *b"],
+    jacobian: Float[Array, "d m *b"],
+    correction: Float[Array, ""] | None,
+) -> tuple[Float[Array, "d m *b"], Float[Array, "m *b"]]:
+    """The rows and residuals of `reweighting`."""
+    scale = reweighting(kernel, weight, squared_norm(residual), correction)
+    if correction is None:
+        return scale.root * jacobian, scale.root * residual
+    along = scale.share * jnp.sum(jacobian * residual, 1)
+    return scale.root * (jacobian - along[:, None] * residual), scale.root * residual / scale.soft
+
+
+def softened(kernel: AbstractKernel, s: Array, correction: Float[Array, ""]) -> Array:
+    """Root of the ratio of the second derivative of `rho / 2` along the residual to that across it, which is all that
+    reweighting knows: `1 + 2 s rho'' / rho'` for the whole correction, here for a part of it and never below what the
+    same part leaves of 0.
+    """
+    weight = kernel.weight(s)
+    pulled = weight > 0
+    lost = -2 * s * kernel.curvature(s) / jnp.where(pulled, weight, 1.0)
+    return jnp.sqrt(1 - correction * jnp.clip(lost, 0.0, 1.0))
+
+
+def local_model(
+    term: AbstractTerm,
+    weight: Float[Array, ""],
+    residual: Local,
+    size: int,
+    correction: Float[Array, ""] | None,
+    exact: bool,
+) -> tuple[Float[Array, "d d"], Float[Array, " d"]]:
+    """Hessian and gradient of one observation's energy by its local coordinates, at zero."""
+    zero = jnp.zeros(size, weight.dtype)
+    if exact:
+        energy: Local = lambda local: term.kernel.rho(weight * jnp.sum(residual(local) ** 2)) / 2
+        gradient, hessian = jax.grad(energy), jax.jacfwd(jax.grad(energy))
+        return hessian(zero), gradient(zero)
+    value, jacobian = residual(zero), jax.jacfwd(residual)(zero)
+    rows, pull = reweighted_rows(term.kernel, weight, value, jacobian.T, correction)
+    return rows @ rows.T, rows @ pull
+
+
+@jax.custom_jvp
+def _root(value: Array) -> Array:
+    """Square root whose derivative at zero is zero, so that an absent observation makes no NaN in it."""
+    return jnp.sqrt(value)
+
+
+@_root.defjvp
+def _root_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    root = _root(*primals)
+    return root, jnp.where(root > 0, tangents[0] / jnp.where(root > 0, 2 * root, 1.0), 0.0)

@@ -1,0 +1,45 @@
+"""What a residual along an edge is given: one landmark of keyframe i, as keyframe j should see it."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jaxlie
+from jaxtyping import Array, Float
+
+from vggtgeo.geometry.cameras import AbstractCamera
+
+
+class View(eqx.Module):
+    """A landmark of host camera i in target camera j.
+
+    The landmark is carried scaled by its inverse depth, `R ray + d t`, which stays finite for points at infinity.
+    """
+
+    relative: jaxlie.SE3
+    """`M = T_j T_i^-1`: host to target camera."""
+    camera: AbstractCamera
+    """Shared by both."""
+    pixel: Float[Array, "2"]
+    """In the host."""
+    inverse_depth: Float[Array, ""]
+    """1/m, in the host."""
+
+    @property
+    def ray(self) -> Float[Array, "3"]:
+        """Viewing ray in the host, `z = 1`."""
+        return self.camera.unproject(self.pixel)
+
+    @property
+    def scaled_point(self) -> Float[Array, "3"]:
+        """The landmark in target coordinates times its inverse depth."""
+        return self.relative.rotation().as_matrix() @ self.ray + self.inverse_depth * self.relative.translation()
+
+    @property
+    def point(self) -> Float[Array, "3"]:
+        """The landmark in target coordinates, metres."""
+        return self.scaled_point / self.inverse_depth
+
+    @property
+    def projected(self) -> Float[Array, "2"]:
+        """Its pixel in the target (equation 5 of the paper)."""
+        return self.camera.project(self.scaled_point)

@@ -1,0 +1,172 @@
+"""Camera models as differentiable functions of their parameters: from a point in front of the camera to its pixel, and
+back to its viewing ray.
+
+Each model is a module that holds one vector of parameters, so that bundle adjustment can move, hold or differentiate
+it. A point is given up to a positive factor, `z > 0`; a ray has `z = 1`, so fields of view stay below 180 degrees.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+MIN_RELATIVE_DEPTH = 1e-2
+"""Lower bound of `z` in `project`, in units of the point's depth in its own camera: a point nearer than this to the
+camera's plane, or behind it, projects as if it lay there, far outside the image, where a robust kernel sees it as an
+outlier; the projection never divides by zero."""
+
+_NEWTON_STEPS = 8
+"""To undo a distortion: quadratic convergence reaches the last digits long before."""
+
+
+class AbstractCamera(eqx.Module):
+    """A camera model: `fx, fy, cx, cy` first, then what the model adds."""
+
+    parameters: Float[Array, " q"]
+
+    names: ClassVar[tuple[str, ...]]
+    """Of the parameters, in their order."""
+
+    @abc.abstractmethod
+    def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
+        """Pixel of a point in camera coordinates (any positive multiple of it), pixels."""
+
+    @abc.abstractmethod
+    def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+        """Viewing ray of a pixel, with `z = 1`."""
+
+
+class Pinhole(AbstractCamera):
+    """`u = fx x / z + cx`, `v = fy y / z + cy`.
+
+    Example:
+        >>> import jax.numpy as jnp, vggtgeo as vg
+        >>> vg.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.0, 1.0])).tolist()
+        [370.0, 240.0]
+
+    """
+
+    names = ("fx", "fy", "cx", "cy")
+
+    def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
+        return self.parameters[:2] * _flat(point) + self.parameters[2:]
+
+    def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+        return _ray((pixel - self.parameters[2:]) / self.parameters[:2])
+
+
+class RadialTangential(AbstractCamera):
+    """The pinhole after Brown-Conrady distortion, as OpenCV has it:
+
+    `x' = x (1 + k1 r2 + k2 r2^2) + 2 p1 x y + p2 (r2 + 2 x^2)`,
+    `y' = y (1 + k1 r2 + k2 r2^2) + p1 (r2 + 2 y^2) + 2 p2 x y`.
+
+    Example: without distortion it is the pinhole.
+        >>> import jax.numpy as jnp, vggtgeo as vg
+        >>> camera = vg.RadialTangential(jnp.array([500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0]))
+        >>> camera.unproject(camera.project(jnp.array([0.1, 0.2, 1.0]))).tolist()
+        [0.1, 0.2, 1.0]
+
+    """
+
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+    def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
+        return self.parameters[:2] * self._distort(_flat(point)) + self.parameters[2:4]
+
+    def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+        return _ray(_inverted(self._distort, (pixel - self.parameters[2:4]) / self.parameters[:2]))
+
+    def _distort(self, flat: Float[Array, "2"]) -> Float[Array, "2"]:
+        k1, k2, p1, p2 = self.parameters[4:]
+        x, y = flat
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        return jnp.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ]
+        )
+
+
+class KannalaBrandt(AbstractCamera):
+    """The fisheye of Kannala and Brandt (2006), as OpenCV has it: the angle `t` from the axis is drawn at radius
+    `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
+
+    Example:
+        >>> import jax.numpy as jnp, vggtgeo as vg
+        >>> camera = vg.KannalaBrandt(jnp.array([300.0, 300.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0]))
+        >>> [round(float(value), 9) for value in camera.unproject(camera.project(jnp.array([0.4, 0.2, 1.0])))]
+        [0.4, 0.2, 1.0]
+
+    """
+
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+
+    def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
+        return self.parameters[:2] * self._distort(_flat(point)) + self.parameters[2:4]
+
+    def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+        drawn = (pixel - self.parameters[2:4]) / self.parameters[:2]
+        radius = _norm(drawn)
+        angle = _inverted(lambda angle: angle * self._stretch(angle), radius)
+        near = radius < 1e-4
+        # tan(t) / (t stretch) near the axis is 1 + (1/3 - k1) t^2, and the radius may be zero there.
+        straight = jnp.tan(angle) / jnp.where(near, 1.0, radius)
+        return _ray(drawn * jnp.where(near, 1 + (1 / 3 - self.parameters[4]) * jnp.sum(drawn**2), straight))
+
+    def _distort(self, flat: Float[Array, "2"]) -> Float[Array, "2"]:
+        radius = _norm(flat)
+        near = radius < 1e-4
+        angle = jnp.arctan(radius)
+        factor = angle * self._stretch(angle) / jnp.where(near, 1.0, radius)
+        # atan(r) stretch / r near the axis is 1 + (k1 - 1/3) r^2.
+        return flat * jnp.where(near, 1 + (self.parameters[4] - 1 / 3) * jnp.sum(flat**2), factor)
+
+    def _stretch(self, angle: Float[Array, ""]) -> Float[Array, ""]:
+        k1, k2, k3, k4 = self.parameters[4:]
+        t2 = angle * angle
+        return 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+
+
+def _flat(point: Float[Array, "3"]) -> Float[Array, "2"]:
+    return point[:2] / jnp.maximum(point[2], MIN_RELATIVE_DEPTH)
+
+
+def _ray(flat: Float[Array, "2"]) -> Float[Array, "3"]:
+    return jnp.concatenate([flat, jnp.ones(1, flat.dtype)])
+
+
+def _norm(flat: Float[Array, "2"]) -> Float[Array, ""]:
+    """Length of a vector; its derivatives at zero are zero, not NaN."""
+    squared = jnp.sum(flat * flat)
+    somewhere = squared > 1e-12
+    return jnp.where(somewhere, jnp.sqrt(jnp.where(somewhere, squared, 1.0)), 0.0)
+
+
+def _inverted(function: Callable[[Array], Array], value: Float[Array, "*d"]) -> Float[Array, "*d"]:
+    """`x` with `function(x) = value`, by Newton's method from `x = value`.
+
+    The iterations carry no derivative; two more steps from where they end give the first and second derivatives of the
+    inverse exactly (each step of Newton's method doubles the order that is right).
+    """
+
+    def step(x: Array, function: Callable[[Array], Array], value: Array) -> Array:
+        jacobian = jax.jacfwd(function)(x)
+        off = function(x) - value
+        return x - (off / jacobian if off.ndim == 0 else jnp.linalg.solve(jacobian, off))
+
+    x = value
+    for _ in range(_NEWTON_STEPS):
+        x = step(x, function, value)
+    x = jax.lax.stop_gradient(x)
+    for _ in range(2):
+        x = step(x, function, value)
+    return x

@@ -1,0 +1,148 @@
+"""What is known about the poses of keyframes beyond matches: kept by the keyframes' numbers, packed as terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vggtgeo.bundle.terms.baseline import BaselinePrior
+from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment, quadratic
+from vggtgeo.bundle.terms.rotation import RotationPrior
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry import rigid
+from vggtgeo.solvers.kernels import Cauchy
+
+RELATIVE_POSE_SCALE = 3.5
+"""Standard deviations, of all six together, at which a measured relative pose counts half: the 95 % level of chi with 6
+degrees of freedom. What everything else contradicts (a false loop) gives way."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRotation:
+    """A keyframe's rotation, world -> camera float64 [3, 3], and its information float64 [3, 3], 1/rad^2."""
+
+    keyframe: int
+    rotation: np.ndarray
+    information: np.ndarray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        return (self.keyframe,)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredBaseline:
+    """The distance between two keyframes' centres, and its relative standard deviation."""
+
+    first: int
+    second: int
+    length: float
+    sigma: float
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        return self.first, self.second
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRelativePose:
+    """Camera `first` -> camera `second`, float64 [4, 4], and its information float64 [6, 6], translation first."""
+
+    first: int
+    second: int
+    pose: np.ndarray
+    information: np.ndarray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        return self.first, self.second
+
+
+Factor = MeasuredRotation | MeasuredBaseline | MeasuredRelativePose
+
+
+def factor_terms(
+    factors: Sequence[Factor], places: Mapping[int, int], capacity: Mapping[type, int]
+) -> tuple[AbstractTerm, ...]:
+    """One term a kind of `capacity`, padded to that many observations: those between keyframes that have a place.
+
+    places: row of each keyframe in the problem, by its number. Of more factors than there is room for, the last stay.
+    """
+    makers = {MeasuredRotation: _rotations, MeasuredBaseline: _baselines, MeasuredRelativePose: _relative_poses}
+    inside = [factor for factor in factors if all(number in places for number in factor.keyframes)]
+    terms = []
+    for kind, room in capacity.items():
+        own = [factor for factor in inside if isinstance(factor, kind)]
+        terms.append(makers[kind](own[max(len(own) - room, 0) :], places, room))
+    return tuple(terms)
+
+
+def surface_term(
+    pairs: Sequence[tuple[int, int]], relative: np.ndarray, hessians: np.ndarray, gradients: np.ndarray
+) -> SurfaceAlignment:
+    """Alignments of surfaces as a term: their normal equations `[m, 6, 6]`, `[m, 6]` over the left tangent of the
+    relative poses `[m, 4, 4]`, for pairs of rows of the problem. A zero Hessian is a pair that was not aligned.
+    """
+    at = jnp.asarray(rigid.to_quaternion(relative))
+    measured, root = quadratic(at, jnp.asarray(hessians), jnp.asarray(gradients))
+    first, second = np.asarray(pairs, int).reshape(-1, 2).T
+    aligned = np.any(hessians != 0, (1, 2)).astype(np.float64)
+    return SurfaceAlignment(first=first, second=second, measured=measured, root=root, weight=aligned)
+
+
+def _rotations(own: Sequence[MeasuredRotation], places: Mapping[int, int], room: int) -> RotationPrior:
+    measured = np.tile([1.0, 0, 0, 0], (room, 1))
+    for row, factor in enumerate(own):
+        measured[row] = Rotation.from_matrix(factor.rotation).as_quat(scalar_first=True)
+    return RotationPrior(
+        keyframe=_padded([places[factor.keyframe] for factor in own], room),
+        measured=jnp.asarray(measured),
+        root=_roots([factor.information for factor in own], 3, room),
+        weight=_present(own, room),
+    )
+
+
+def _baselines(own: Sequence[MeasuredBaseline], places: Mapping[int, int], room: int) -> BaselinePrior:
+    read = lambda name: jnp.asarray([*(getattr(factor, name) for factor in own), *[1.0] * (room - len(own))])
+    return BaselinePrior(
+        first=_padded([places[factor.first] for factor in own], room),
+        second=_padded([places[factor.second] for factor in own], room),
+        length=read("length"),
+        sigma=read("sigma"),
+        weight=_present(own, room),
+    )
+
+
+def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, int], room: int) -> RelativePose:
+    poses = np.tile(np.eye(4), (room, 1, 1))
+    for row, factor in enumerate(own):
+        poses[row] = factor.pose
+    return RelativePose(
+        first=_padded([places[factor.first] for factor in own], room),
+        second=_padded([places[factor.second] for factor in own], room),
+        measured=jnp.asarray(rigid.to_quaternion(poses)),
+        root=_roots([factor.information for factor in own], 6, room),
+        weight=_present(own, room),
+        kernel=Cauchy(jnp.asarray(RELATIVE_POSE_SCALE)),
+    )
+
+
+def _padded(rows: list[int], room: int) -> np.ndarray:
+    return np.array([*rows, *[0] * (room - len(rows))], int)
+
+
+def _present(own: Sequence[Factor], room: int) -> jnp.ndarray:
+    return jnp.asarray((np.arange(room) < len(own)).astype(np.float64))
+
+
+def _roots(information: Sequence[np.ndarray], size: int, room: int) -> jnp.ndarray:
+    """Square roots `R' R` of information matrices, which may be singular."""
+    whole = np.zeros((room, size, size))
+    if len(information):
+        values, vectors = np.linalg.eigh(np.asarray(information))
+        whole[: len(information)] = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
+    return jnp.asarray(whole)
