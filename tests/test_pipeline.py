@@ -132,7 +132,8 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
     middle, settings = len(tracked.keyframes) // 2, replace(SETTINGS, global_iterations=20, surface_points=0.0)
     apart = _shaken(tracked, 0.05, 2.0, from_keyframe=middle, together=True)
     within = [pair for pair in apart.pairs if (pair.first < middle) == (pair.second < middle)]
-    apart = replace(apart, pairs=tuple(within))
+    tied = [f for f in apart.factors if len({number < middle for number in f.keyframes}) == 1]
+    apart = replace(apart, pairs=tuple(within), factors=tuple(tied))
     assert len(within) < len(tracked.pairs)
     closed = close_loops(apart, ROLES, settings)
     assert any(pair.first < middle <= pair.second for pair in closed.pairs[len(within) :])

@@ -22,6 +22,7 @@ from vggtgeo.report import map_view, write_page
 from vggtgeo.slam.outputs import write_summary
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.finding import Verdict
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
@@ -53,7 +54,9 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     truth = run.sequence.ground_truth()
     report = evaluate_trajectory(frame_trajectory(slam), truth)
     facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
-    summary = write_summary(folder, slam, {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}, report, **facts)
+    verdict = options.setdefault("verdict", Verdict("good"))
+    settings, seconds = {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}
+    summary = write_summary(folder, slam, settings, seconds, report, verdict, **facts)
     given = {"title": "a <room>", "truth": truth, "cloud": run.cloud, "records": run.recorder.records}
     write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
     return (folder / "report.html").read_text()

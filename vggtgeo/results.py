@@ -14,11 +14,13 @@ from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.slam.trust.finding import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vggtgeo.slam.state import Slam
+    from vggtgeo.slam.trust.evidence import Evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,7 @@ class Result:
         cloud: the map, world frame.
         intrinsics: fx, fy, cx, cy, pixels, as adjusted.
         metric: whether lengths are metres; without metric depth they have no unit.
+        verdict: how far all this can be trusted, by segment of time.
         summary: counts, times and settings, as `summary.json` has them; empty for a result that is made from a state.
 
     Example:
@@ -46,17 +49,24 @@ class Result:
     cloud: PointCloud
     intrinsics: tuple[float, float, float, float]
     metric: bool
+    verdict: Verdict
     summary: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, slam: Slam) -> Self:
-        """The result of a state: the last one that `vggtgeo.run` gave, or what `vggtgeo.finish` made of it."""
+    def of(cls, slam: Slam, evidence: Evidence = ()) -> Self:
+        """The result of a state: the last one that `vggtgeo.run` gave, or what `vggtgeo.finish` made of it.
+
+        evidence: what an `EvidenceRecorder` noted of all frames; without it the verdict rests on the run's own record.
+        """
         from vggtgeo.slam.dense import map_points
         from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
+        from vggtgeo.slam.trust.judge import judge
 
         fx, fy, cx, cy = (float(value) for value in slam.intrinsics)
         cloud = map_points(slam.keyframes, slam.intrinsics)
-        return cls(frame_trajectory(slam), keyframe_trajectory(slam), cloud, (fx, fy, cx, cy), slam.metric)
+        verdict = judge(slam, evidence)
+        poses = frame_trajectory(slam), keyframe_trajectory(slam)
+        return cls(*poses, cloud, (fx, fy, cx, cy), verdict.metric, verdict)
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Self:
@@ -65,6 +75,8 @@ class Result:
         try:
             summary = json.loads((place / "summary.json").read_text(encoding="utf-8"))
             fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
+            metric = summary["scale"] == "metric"
+            verdict = Verdict.from_dict(summary["verdict"], metric)
         except (OSError, json.JSONDecodeError, KeyError) as error:
             message = f"`{place}` has no usable `summary.json` ({error}); give a folder that `vggtgeo run` wrote"
             raise InputError(message) from None
@@ -73,7 +85,8 @@ class Result:
             Trajectory.load_tum(place / "keyframes.txt"),
             PointCloud.load_ply(place / "map.ply"),
             (fx, fy, cx, cy),
-            summary["scale"] == "metric",
+            metric,
+            verdict,
             summary,
         )
 
@@ -84,6 +97,7 @@ class Result:
             "keyframes": len(self.keyframes),
             "map_points": len(self.cloud),
             "metric": self.metric,
+            "verdict": self.verdict.to_dict(),
             "path_length": self.trajectory.length,
             "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), self.intrinsics, strict=True)),
             "summary": dict(self.summary),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import jaxlie
@@ -296,7 +296,8 @@ def _as_arrays(observations: Observations) -> Observations:
     """The same observations, lists turned into arrays."""
     names = [field.name for field in fields(observations) if field.name != "alpha"]
     given = {name: getattr(observations, name) for name in names}
-    return replace(observations, **{name: as_numbers(name, v) for name, v in given.items() if v is not None})
+    arrays: dict[str, Any] = {name: as_numbers(name, v) for name, v in given.items() if v is not None}
+    return replace(observations, **arrays)
 
 
 def _with_segments(problem: Problem, depths: Array, present: Array, size: PaddedSize) -> tuple[Problem, Array]:

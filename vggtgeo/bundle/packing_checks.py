@@ -68,7 +68,7 @@ def check_values(observations: Observations) -> None:
     if not (np.isfinite(observations.alpha) and observations.alpha >= 0):
         raise InputError(f"`alpha` is {observations.alpha}; it must be finite and not negative")
     used = lambda weight: np.asarray(weight) > 0
-    finite = lambda values: np.isfinite(np.asarray(values, float)).reshape(len(values), -1).all(1)
+    finite = lambda values: np.isfinite(np.asarray(values, float)).all(1)
     for name, weight in (("point_target", observations.point_weight), ("line_coefficients", observations.line_weight)):
         values = getattr(observations, name)
         _refuse(name, values, used(weight) & ~finite(values), "finite where its weight is positive")

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.objective import (
+    EdgeData,
+    Motions,
     camera_of,
     edge_data,
     hosts_of,
@@ -119,7 +121,7 @@ def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[
     if not alone.edge_terms:
         return jnp.zeros((1, *term.weight.shape), state.inverse_depth.dtype)
 
-    def edge(host: Array, motion: tuple, data: tuple) -> Array:
+    def edge(host: Array, motion: Motions, data: EdgeData) -> Array:
         ((one, view),) = of_edge(alone, view_of(camera, hosts, host, motion), data)
         assert isinstance(one, EdgeTerm)
         return one.residuals(view)

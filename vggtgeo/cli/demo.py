@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, QuietOption, RerunOption
+from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.cli.view import serve_until_interrupted
 
@@ -54,3 +54,5 @@ def demo(
         serve_until_interrupted(finished.url, quiet)
     if finished.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
+    if finished.verdict.level == "failed":
+        raise typer.Exit(EXIT_FAILED)

@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from vggtgeo.cli.jax_flags import set_jax_flags
-from vggtgeo.cli.options import EXIT_INTERRUPTED
+from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.io.errors import InputError, InputWarning
 
 EXIT_INPUT = 2
@@ -100,7 +100,8 @@ START = (
     "vggtgeo COMMAND --help  # examples of each command",
 )
 EXIT_CODES = (
-    f"0 done; {EXIT_INPUT} something given is wrong (one line says what, and what to do); {EXIT_INTERRUPTED} "
+    f"0 done; {EXIT_INPUT} something given is wrong (one line says what, and what to do); {EXIT_FAILED} the verdict "
+    f"of a run is failed (its outputs are kept); {EXIT_INTERRUPTED} "
     f"interrupted (a run writes what it has first); {EXIT_INTERNAL} a fault of the program (`vggtgeo --debug ...` "
     "shows where)."
 )

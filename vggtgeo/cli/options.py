@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
+EXIT_FAILED = 3
+"""The run ended with the verdict "failed"; its outputs are there, to look at."""
 EXIT_INTERRUPTED = 130
 """After Ctrl-C."""
 QuietOption = Annotated[bool, typer.Option("--quiet/--no-quiet", help="Say nothing: no progress bar, no report.")]

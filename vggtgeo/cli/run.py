@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, QuietOption, RerunOption
+from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.io.errors import InputError, InputWarning
@@ -87,14 +87,15 @@ def run(
     import cv2
 
     from vggtgeo.cli.network_errors import as_input_errors
-    from vggtgeo.cli.run_sequence import run_and_write
+    from vggtgeo.cli.run_sequence import collected_warnings, run_and_write
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
     from vggtgeo.slam.settings import SlamSettings
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
     cv2.setRNGSeed(seed)
-    sequence = open_sequence(path, kind)
+    with collected_warnings() as warned:
+        sequence = open_sequence(path, kind)
     if intrinsics is not None:
         sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
     if rgb_only:
@@ -122,6 +123,7 @@ def run(
             rerun=rerun,
             quiet=quiet or as_json,
             facts=perceived.facts,
+            warned=warned,
         )
     if as_json:
         typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
@@ -129,6 +131,8 @@ def run(
         serve_until_interrupted(finished.url, quiet or as_json)
     if finished.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
+    if finished.verdict.level == "failed":
+        raise typer.Exit(EXIT_FAILED)
 
 
 def make_perception(

@@ -26,15 +26,20 @@ from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.run import finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.evidence import EvidenceRecorder
+from vggtgeo.slam.trust.finding import Verdict
+from vggtgeo.slam.trust.input import check_input
+from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.watching import Watcher, WindowRecorder
 from vggtgeo.slam.window import warm_up
 
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """The last state of a run, whether Ctrl-C ended it, and the address of a served view."""
+    """The last state of a run, how far it can be trusted, whether Ctrl-C ended it, and the address of a served view."""
 
     slam: Slam
+    verdict: Verdict
     interrupted: bool
     url: str | None = None
 
@@ -52,12 +57,13 @@ def run_and_write(
     label: str = "",
     facts: Callable[[], Mapping[str, Any]] = dict,
     rerun: str | None = None,
+    warned: Iterable[Warning | str] = (),
 ) -> Finished:
     """Run a sequence with a progress bar, write every output into `folder`, and print the report.
 
     flags: the effective settings, by the names of the flags; `settings.toml` and `summary.json` hold them.
     facts: what else the summary shall say, asked for at the end. rerun: where to log the run, see
-    `vggtgeo/viewing/target.py`.
+    `vggtgeo/viewing/target.py`. warned: what was said of the input when it was opened.
     """
     console = Console(stderr=False, quiet=quiet)
     watchers: tuple[Watcher, ...] = ()
@@ -66,15 +72,15 @@ def run_and_write(
         watcher, url = _rerun_watcher(rerun, label or sequence.name, folder)
         watchers, settings = (watcher,), replace(settings, record_iterations=True)
     clock, began = Clock(), time.perf_counter()
-    recorder = WindowRecorder()
+    recorder, witness = WindowRecorder(), EvidenceRecorder(sequence.camera)
     with clock.measure("compile"):
-        compiled = warm_up(settings)
+        compiled = warm_up(settings, roles.metric)
         for watcher in (recorder, *watchers):
             watcher.warm_up(*compiled)
     with collected_warnings() as said:
         estimated, truth = _set_apart(sequence)
         folder.mkdir(parents=True, exist_ok=True)
-        fold = _fold(estimated, roles, settings, selection, clock, console, (recorder, *watchers))
+        fold = _fold(estimated, roles, settings, selection, clock, console, (recorder, witness, *watchers))
     slam = fold.slam
     write_settings(folder / "settings.toml", flags)
     outputs.write_trajectories(folder, slam)
@@ -95,6 +101,9 @@ def run_and_write(
     with clock.measure("record and draw"):
         for watcher in watchers:
             watcher.finish(slam, cloud)
+    with clock.measure("verdict"):
+        warned = [*warned, *said]
+        verdict = judge(slam, witness.frames, check_input(warned, len(slam.frames)))
     report = outputs.compare(slam, truth)
     told = facts()
     summary = outputs.write_summary(
@@ -103,6 +112,7 @@ def run_and_write(
         {name.replace("-", "_"): value for name, value in flags.items()},
         {**clock.seconds, "all": time.perf_counter() - began},
         report,
+        verdict,
         **told,
         map_points=len(cloud),
         frames_per_second=round(fold.frames_per_second, 2),
@@ -116,10 +126,11 @@ def run_and_write(
         cloud=cloud,
         records=recorder.records,
         summary={**summary, "settings": flags},
-        warnings=[*([told["meaningless"]] if "meaningless" in told else []), *said],
+        verdict=verdict,
+        warnings=[*([told["meaningless"]] if "meaningless" in told else []), *map(str, warned)],
     )
-    _print_report(console, slam, report, folder, fold.frames_per_second, len(cloud))
-    return Finished(slam, interrupted, url)
+    _print_report(console, slam, report, folder, fold.frames_per_second, len(cloud), verdict)
+    return Finished(slam, verdict, interrupted, url)
 
 
 def _rerun_watcher(target: str, name: str, folder: Path) -> tuple[Watcher, str | None]:
@@ -204,14 +215,14 @@ def _show(progress: Progress, task: TaskID, slam: Slam, seconds: float) -> None:
 
 
 @contextmanager
-def collected_warnings() -> Iterator[list[str]]:
-    """The texts of the warnings about the input, in order, gathered while they are shown as before."""
-    said: list[str] = []
+def collected_warnings() -> Iterator[list[Warning | str]]:
+    """The warnings about the input, in order, gathered while they are shown as before."""
+    said: list[Warning | str] = []
     show_as_before = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
         if issubclass(category, InputWarning):
-            said.append(str(message))
+            said.append(message)
         show_as_before(message, category, *rest, **more)
 
     warnings.showwarning = show
@@ -228,7 +239,13 @@ def _state(slam: Slam) -> str:
 
 
 def _print_report(
-    console: Console, slam: Slam, report: TrajectoryReport | None, folder: Path, rate: float, points: int
+    console: Console,
+    slam: Slam,
+    report: TrajectoryReport | None,
+    folder: Path,
+    rate: float,
+    points: int,
+    verdict: Verdict,
 ) -> None:
     fx, fy, cx, cy = slam.intrinsics
     tracked = sum(record.tracked for record in slam.frames)
@@ -238,9 +255,13 @@ def _print_report(
     ]
     if not slam.metric:
         lines.append("scale: free, there is no metric depth; lengths have no unit")
+    elif not verdict.metric:
+        lines.append("scale: doubtful, lengths may be no metres")
     if report is not None:
         se3, sim3 = report.se3.statistics.rmse, report.sim3.statistics.rmse
         lines.append(f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment")
     lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply ({points} points) report.html")
+    lines += [f"- {reason}" for reason in verdict.reasons]
+    lines.append(f"verdict: {verdict.level}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

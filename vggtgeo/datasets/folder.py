@@ -12,7 +12,7 @@ from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, DepthFormat, read_depth, read_image
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 _SAMPLES = 3
 _NAMED_EMPTY_DEPTHS = 3
@@ -74,13 +74,14 @@ class FolderSequence:
         try:
             image = read_image(file.image)
         except InputError as error:
-            _warn(f"{error}; the frame is skipped")
+            _warn(f"{error}; the frame is skipped", LeftOutWarning)
             return None
         height, width = image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             _warn(
                 f"`{file.image}` is {width} x {height} pixels; the sequence's images are "
-                f"{self.camera.width} x {self.camera.height}: the frame is skipped"
+                f"{self.camera.width} x {self.camera.height}: the frame is skipped",
+                LeftOutWarning,
             )
             return None
         return image
@@ -155,5 +156,5 @@ def _other_size(path: Path, depth: np.ndarray, width: int, height: int) -> str:
     return f"`{path}` is {depth.shape[1]} x {depth.shape[0]} pixels; the colour images are {width} x {height}"
 
 
-def _warn(message: str) -> None:
-    warnings.warn(message, InputWarning, stacklevel=4)
+def _warn(message: str, category: type[InputWarning] = InputWarning) -> None:
+    warnings.warn(message, category, stacklevel=4)

@@ -18,7 +18,7 @@ from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, dept
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
 from vggtgeo.datasets.intrinsics import camera_from_folder, freiburg_camera, guess_with_warning
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 MAX_DEPTH_DELAY = 0.02
 """Seconds between an image and its depth."""
@@ -39,7 +39,7 @@ class TumRgbd(FolderSequence):
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
-        images = _read_list(folder / "rgb.txt")
+        images = _read_list(folder / "rgb.txt", frames=True)
         depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
         partners = _partners(images, depths)
         files = tuple(
@@ -63,7 +63,8 @@ class TumRgbd(FolderSequence):
         return Trajectory.load_tum(file) if file.is_file() else None
 
 
-def _read_list(file: Path) -> list[_Entry]:
+def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
+    """The entries by time; `frames` where each of them is a frame, which counts when it is left out."""
     if not file.is_file():
         raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
     entries = []
@@ -73,7 +74,7 @@ def _read_list(file: Path) -> list[_Entry]:
             entries.append(_parse_entry(file, number, text))
     if not entries:
         raise InputError(f"`{file}` lists nothing; expected lines `timestamp file`")
-    return _in_order(file, entries)
+    return _in_order(file, entries, frames)
 
 
 def _parse_entry(file: Path, number: int, text: str) -> _Entry:
@@ -87,13 +88,14 @@ def _parse_entry(file: Path, number: int, text: str) -> _Entry:
     return seconds, file.parent / name.strip()
 
 
-def _in_order(file: Path, entries: list[_Entry]) -> list[_Entry]:
+def _in_order(file: Path, entries: list[_Entry], frames: bool) -> list[_Entry]:
     ordered = sorted(entries, key=lambda entry: entry[0])
     if ordered != entries:
         _warn(f"`{file}`: timestamps are out of order; the list was sorted by time")
     unique = [entry for row, entry in enumerate(ordered) if row == 0 or entry[0] > ordered[row - 1][0]]
     if len(unique) < len(ordered):
-        _warn(f"`{file}`: {len(ordered) - len(unique)} lines repeat the time of another; the first was kept")
+        text = f"`{file}`: {len(ordered) - len(unique)} lines repeat the time of another; the first was kept"
+        _warn(LeftOutWarning(text, len(ordered) - len(unique)) if frames else text)
     return unique
 
 
@@ -113,5 +115,5 @@ def _partners(images: list[_Entry], depths: list[_Entry]) -> list[int | None]:
     return partners
 
 
-def _warn(message: str) -> None:
+def _warn(message: str | InputWarning) -> None:
     warnings.warn(message, InputWarning, stacklevel=4)

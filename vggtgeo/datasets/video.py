@@ -14,7 +14,7 @@ from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 _FALLBACK_RATE = 30.0
 
@@ -78,7 +78,7 @@ class VideoFile:
                             f"{self.name}, frame {index}",
                         )
                     else:
-                        _warn(f"`{self.name}`: frame {index} cannot be decoded; it is skipped")
+                        _warn(f"`{self.name}`: frame {index} cannot be decoded; it is skipped", LeftOutWarning)
                 index += 1
         wanted = self.count if end is None else min(end, self.count)
         if index < wanted:
@@ -103,5 +103,5 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         capture.release()
 
 
-def _warn(message: str) -> None:
-    warnings.warn(message, InputWarning, stacklevel=3)
+def _warn(message: str, category: type[InputWarning] = InputWarning) -> None:
+    warnings.warn(message, category, stacklevel=3)

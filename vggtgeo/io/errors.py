@@ -16,3 +16,11 @@ class InputError(ValueError):
 
 class InputWarning(UserWarning):
     """Something the user gave was left out or assumed, and the work goes on; the message names it."""
+
+
+class LeftOutWarning(InputWarning):
+    """Frames of the input were left out; `frames` counts them."""
+
+    def __init__(self, message: str, frames: int = 1) -> None:
+        super().__init__(message)
+        self.frames = frames

@@ -19,10 +19,16 @@ from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.keyframe_depth import optimised_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.watching import WindowRecord
 
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""
+VERDICT_LINES = {
+    "good": "Good: nothing that was checked contradicts this result.",
+    "degraded": "Degraded: something contradicts this result, or is missing from it.",
+    "failed": "Failed: this result is not to be used.",
+}
 _SAMPLE_WIDTH = 300
 """Pixels."""
 
@@ -63,6 +69,7 @@ def write_page(
     cloud: PointCloud,
     records: Sequence[WindowRecord],
     summary: Mapping[str, Any],
+    verdict: Verdict,
     warnings: Sequence[str] = (),
 ) -> None:
     """Writes the page of a run, one HTML file that needs nothing else, atomically.
@@ -75,6 +82,7 @@ def write_page(
         cloud: the map.
         records: one an adjustment of the window, in order.
         summary: what `summary.json` holds.
+        verdict: how far the result can be trusted; the first thing on the page.
         warnings: what was said about the input; the state's own notes come after them.
 
     """
@@ -86,6 +94,9 @@ def write_page(
         simulated=bool(summary.get("simulated")),
         interrupted=bool(summary.get("interrupted")),
         scale_is_free=not slam.metric,
+        verdict=verdict,
+        verdict_line=VERDICT_LINES[verdict.level],
+        timeline=_timeline(verdict),
         warnings=[*warnings, *slam.notes],
         trajectory=figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric),
         has_truth=truth is not None,
@@ -116,7 +127,7 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
         Fact(f"{summary['keyframes']}", "keyframes"),
         Fact(f"{summary['frames_per_second']:.1f}", "frames a second"),
     ]
-    if slam.metric:
+    if summary["scale"] == "metric":
         facts.append(Fact(f"{trajectory.length:.2f} m", "length of the path"))
     if "truth" in summary:
         aligned, name = ("ate_se3_m", "SE(3)") if slam.metric else ("ate_sim3_m", "Sim(3)")
@@ -124,6 +135,22 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
     facts.append(Fact(f"{len(cloud):,}".replace(",", "\u202f"), "points in the map"))
     facts.append(Fact(f"{summary['peak_memory_gb']:.2f} GB", "peak memory"))
     return facts
+
+
+def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
+    """Level, share of the run in percent, and a text of each segment; empty where the whole run is of one kind."""
+    frames = sum(part.end - part.start + 1 for part in verdict.segments)
+    if len(verdict.segments) < 2:
+        return []
+    return [
+        (
+            part.level,
+            100 * (part.end - part.start + 1) / frames,
+            f"frames {part.start} to {part.end}, {part.start_time:.2f} to {part.end_time:.2f} s: "
+            + (", ".join(part.checks) or "nothing to say"),
+        )
+        for part in verdict.segments
+    ]
 
 
 def _truth_table(truth: Mapping[str, Any] | None) -> list[tuple[str, list[str]]]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.bundle.terms.baseline import BaselinePrior
@@ -15,10 +16,6 @@ from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.solvers.kernels import Cauchy
-
-RELATIVE_POSE_SCALE = 3.5
-"""Standard deviations, of all six together, at which a measured relative pose counts half: the 95 % level of chi with 6
-degrees of freedom. What everything else contradicts (a false loop) gives way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +59,10 @@ class MeasuredRelativePose:
         return self.first, self.second
 
 
+TIE_WIDTH = 12.6**0.5
+"""Mahalanobis distance at which a measured motion counts half, so that one that all else contradicts (a false loop)
+gives way: the 95 % level of 6 degrees of freedom."""
+
 Factor = MeasuredRotation | MeasuredBaseline | MeasuredRelativePose
 
 
@@ -72,7 +73,11 @@ def factor_terms(
 
     places: row of each keyframe in the problem, by its number. Of more factors than there is room for, the last stay.
     """
-    makers = {MeasuredRotation: _rotations, MeasuredBaseline: _baselines, MeasuredRelativePose: _relative_poses}
+    makers: dict[type, Callable[..., AbstractTerm]] = {
+        MeasuredRotation: _rotations,
+        MeasuredBaseline: _baselines,
+        MeasuredRelativePose: _relative_poses,
+    }
     inside = [factor for factor in factors if all(number in places for number in factor.keyframes)]
     terms = []
     for kind, room in capacity.items():
@@ -91,7 +96,13 @@ def surface_term(
     measured, root = quadratic(at, jnp.asarray(hessians), jnp.asarray(gradients))
     first, second = np.asarray(pairs, int).reshape(-1, 2).T
     aligned = np.any(hessians != 0, (1, 2)).astype(np.float64)
-    return SurfaceAlignment(first=first, second=second, measured=measured, root=root, weight=aligned)
+    return SurfaceAlignment(
+        first=jnp.asarray(first, jnp.int32),
+        second=jnp.asarray(second, jnp.int32),
+        measured=measured,
+        root=root,
+        weight=jnp.asarray(aligned),
+    )
 
 
 def _rotations(own: Sequence[MeasuredRotation], places: Mapping[int, int], room: int) -> RotationPrior:
@@ -127,19 +138,19 @@ def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, in
         measured=jnp.asarray(rigid.to_quaternion(poses)),
         root=_roots([factor.information for factor in own], 6, room),
         weight=_present(own, room),
-        kernel=Cauchy(jnp.asarray(RELATIVE_POSE_SCALE)),
+        kernel=Cauchy(jnp.asarray(TIE_WIDTH)),
     )
 
 
-def _padded(rows: list[int], room: int) -> np.ndarray:
-    return np.array([*rows, *[0] * (room - len(rows))], int)
+def _padded(rows: list[int], room: int) -> Array:
+    return jnp.asarray([*rows, *[0] * (room - len(rows))], jnp.int32)
 
 
-def _present(own: Sequence[Factor], room: int) -> jnp.ndarray:
+def _present(own: Sequence[Factor], room: int) -> Array:
     return jnp.asarray((np.arange(room) < len(own)).astype(np.float64))
 
 
-def _roots(information: Sequence[np.ndarray], size: int, room: int) -> jnp.ndarray:
+def _roots(information: Sequence[np.ndarray], size: int, room: int) -> Array:
     """Square roots `R' R` of information matrices, which may be singular."""
     whole = np.zeros((room, size, size))
     if len(information):

@@ -22,6 +22,7 @@ from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.finding import Verdict
 
 DEPTH_UNIT = 5000.0
 """Counts a metre in the 16-bit depth images, as in the TUM RGB-D format."""
@@ -80,14 +81,16 @@ def write_summary(
     settings: Mapping[str, Any],
     seconds: Mapping[str, float],
     report: TrajectoryReport | None,
+    verdict: Verdict,
     **counts: Any,
 ) -> dict[str, Any]:
-    """`summary.json`: settings, versions, counts, time by stage, final intrinsics, and the ATE where truth is known.
+    """`summary.json`: verdict, settings, versions, counts, time by stage, final intrinsics, ATE where truth is known.
 
     Returns what it wrote.
     """
     tracked = sum(record.tracked for record in slam.frames)
     values = {
+        "verdict": verdict.to_dict(),
         "settings": dict(settings),
         "versions": versions(),
         "frames": len(slam.frames),
@@ -96,7 +99,7 @@ def write_summary(
         "pairs": len(slam.pairs),
         "origins": len(slam.origins),
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
-        "scale": "metric" if slam.metric else "free (no metric depth): lengths have no unit",
+        "scale": scale_name(slam, verdict),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
         "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
         "notes": list(slam.notes),
@@ -106,6 +109,13 @@ def write_summary(
         values["truth"] = report.as_dict()
     write_json(folder / "summary.json", values)
     return values
+
+
+def scale_name(slam: Slam, verdict: Verdict) -> str:
+    """What lengths are: "metric" only where nothing speaks against it."""
+    if not slam.metric:
+        return "free (no metric depth): lengths have no unit"
+    return "metric" if verdict.metric else "doubtful (see the verdict): lengths may be no metres"
 
 
 def versions() -> dict[str, str]:

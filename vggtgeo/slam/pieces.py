@@ -8,11 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.relocalisation import relocalise
-from vggtgeo.slam.settings import Roles
+from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking import Sight, Track
 from vggtgeo.slam.window_prior import WindowPrior
@@ -21,7 +20,7 @@ TRIED = 2
 """Keyframes of the other pieces that are verified for each new keyframe."""
 
 
-def join_pieces(slam: Slam, sight: Sight, roles: Roles) -> Slam:
+def join_pieces(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Slam:
     """Where the newest keyframe, seen as `sight`, shows a place of an earlier piece, move its piece there.
 
     Only where lengths are metres: two pieces of free scale would need a similarity, which no one keyframe pair tells
@@ -46,20 +45,20 @@ def _joined(slam: Slam, place: Track) -> Slam:
         f"{newest.frame}"
     )
     tie = MeasuredRelativePose(place.keyframe.number, newest.number, place.relative, place.information)
-    prior = slam.prior
     return replace(
         slam,
         keyframes=keyframes,
         origins=slam.origins[:-1],
-        held=(slam.window[0],),
         factors=(*slam.factors, tie),
-        prior=None if prior is None else WindowPrior(prior.keyframes, _carried_prior(prior.prior, carried)),
+        held=slam.window[:1],
+        prior=None if slam.prior is None else _carried_prior(slam.prior, carried),
         solved=None,
         notes=(*slam.notes, note),
     )
 
 
-def _carried_prior(prior: MarginalPrior, carried: np.ndarray) -> MarginalPrior:
+def _carried_prior(known: WindowPrior, carried: np.ndarray) -> WindowPrior:
     """The window's prior after a rigid motion of the world: left tangents do not see it, linearisation points do."""
-    poses = rigid.to_matrix(np.asarray(prior.poses.wxyz_xyz, np.float64)) @ carried
-    return eqx.tree_at(lambda p: p.poses.wxyz_xyz, prior, jnp.asarray(rigid.to_quaternion(poses)))
+    poses = rigid.to_matrix(np.asarray(known.prior.poses.wxyz_xyz, np.float64)) @ carried
+    moved = eqx.tree_at(lambda p: p.poses.wxyz_xyz, known.prior, jnp.asarray(rigid.to_quaternion(poses)))
+    return WindowPrior(known.keyframes, moved)

@@ -70,9 +70,9 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
         keyframes=(*slam.keyframes, keyframe),
         window=(number,),
         prior=None,
-        held=(),
         solved=None,
         origins=(*slam.origins, number),
+        held=(),
         axes=(),
         frames=(*slam.frames, record),
         velocity=np.eye(4),
@@ -145,7 +145,7 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     with clock.measure("adjust window"):
         slam = adjust(slam, settings)
     with clock.measure("relocalise"):
-        slam = join_pieces(slam, sight, roles)
+        slam = join_pieces(slam, sight, roles, settings)
     arrival = (found.keyframe.number, found.relative)
     evidence = found.evidence
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)
@@ -169,7 +169,7 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     """A window of the keyframes around an old one, held where it is: the camera has come back to it."""
     low = max(max((origin for origin in slam.origins if origin <= number), default=0), number - NEIGHBOURS)
     window = tuple(range(low, min(number + NEIGHBOURS + 1, len(slam.keyframes))))[-(settings.window - 1) :]
-    return replace(slam, window=window, held=(number,), prior=None, solved=None)
+    return replace(slam, window=window, prior=None, solved=None, held=(number,))
 
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:
@@ -218,8 +218,7 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
     if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
         return slam, found
-    numbers = {found.keyframe.number, near.number}
-    if any(set(factor.keyframes) == numbers for factor in slam.factors):
+    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
         return slam, again
     return replace(slam, factors=(*slam.factors, tie_between(found, again))), again
 
@@ -232,9 +231,10 @@ def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | Non
             continue
         distance = np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(found.pose)) / settings.keyframe_distance
         if distance < least:
-            away = max(distance, rigid.angle_between(keyframe.pose, found.pose) / settings.keyframe_angle)
+            turned = rigid.angle_between(keyframe.pose, found.pose) / settings.keyframe_angle
+            away = max(float(distance), float(turned))
             if away < least:
-                best, least = keyframe, float(away)
+                best, least = keyframe, away
     return best
 
 

@@ -11,7 +11,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.adjustment import Adjustment
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.evidence import Evidence
-from vggtgeo.slam.factors import Factor
+from vggtgeo.slam.factors import Factor, MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.rgbd_alignment import RgbdView
 from vggtgeo.slam.window_prior import WindowPrior
@@ -58,14 +58,14 @@ class Slam:
     intrinsics: current fx, fy, cx, cy. given_intrinsics, intrinsics_sigma: mean and standard deviation of their prior,
     pixels. keyframes: all, by number. pairs: all matches between them. window: numbers of
     the keyframes that are adjusted, oldest first. prior: what the keyframes that left the window said about it.
-    factors: what is known about poses beyond matches; the tracked motion of each keyframe from the one it was tracked
-    against is there, and holds the map together.
+    factors: what is known about poses beyond matches: the tracked motion of each keyframe, which holds the map
+    together, measured rotations, the unit of a map without metric depth.
     solved: the last window problem and its solution. energies: `1/2 sum rho` of that window before its first and after
     each iteration; iterations: what else each did, where the settings ask for it. frames: every frame's pose.
     velocity: last motion from frame to frame, camera -> camera. waiting: frames without a pose so far.
-    reference: number of the keyframe that frames are tracked against, and its view for the alignment. lost: frames
-    since tracking was lost. origins: the first keyframe of each piece of the map; pieces are tied to nothing else.
-    held: a keyframe that the window may not move, since those that held it have been left behind.
+    reference: number of the keyframe that frames are tracked against, and its view for the alignment. held: keyframes
+    that a window keeps where they are, besides origins. lost: frames since tracking
+    was lost. origins: the first keyframe of each piece of the map; pieces are tied to nothing else.
     metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
     world), as the first keyframes saw them. notes: what the user should know.
     """
@@ -96,6 +96,11 @@ class Slam:
         frames, keyframes = len(self.frames), len(self.keyframes)
         doing = "lost" if self.lost else "waiting for parallax" if self.waiting else "tracking"
         return f"Slam({frames} frame{'s' * (frames != 1)}, {keyframes} keyframe{'s' * (keyframes != 1)}, {doing})"
+
+    @property
+    def ties(self) -> tuple[MeasuredRelativePose, ...]:
+        """The tracked motions between keyframes."""
+        return tuple(factor for factor in self.factors if isinstance(factor, MeasuredRelativePose))
 
     def pose(self, record: FramePose) -> np.ndarray:
         """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""

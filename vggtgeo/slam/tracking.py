@@ -104,8 +104,9 @@ def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
     # Both errors are tangents at the frame; carried to the second keyframe by the adjoint of its motion.
     carry = rigid.adjoint(rigid.invert(second.relative))
     noise = np.linalg.inv(first.information) + np.linalg.inv(second.information)
-    information = np.linalg.inv(carry @ noise @ carry.T)
-    return MeasuredRelativePose(first.keyframe.number, second.keyframe.number, motion, information)
+    return MeasuredRelativePose(
+        first.keyframe.number, second.keyframe.number, motion, np.linalg.inv(carry @ noise @ carry.T)
+    )
 
 
 def _by_points(

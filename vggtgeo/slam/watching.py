@@ -71,12 +71,15 @@ class WindowRecorder:
         self._last = slam.solved
         adjustment, state = slam.solved
         sizes = _sizes_jit(adjustment.problem, state)
+        points, lines, depth = (float(sizes.rms.get(name, np.nan)) for name in _SHOWN)
         energies = slam.energies if slam.energies is not None else np.full(2, np.nan)
         self.records.append(
             WindowRecord(
                 frame.index,
                 frame.timestamp,
-                *(float(sizes.rms.get(name, np.nan)) for name in _SHOWN),
+                points,
+                lines,
+                depth,
                 tuple(int(sizes.count.get(name, 0)) for name in _SHOWN),
                 len(energies) - 1,
                 (float(energies[0]), float(energies[-1])),

@@ -133,16 +133,23 @@ def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) 
         size=window_size(settings),
         given_intrinsics=slam.given_intrinsics,
         intrinsics_sigma=slam.intrinsics_sigma,
-        fixed_pose=np.isin(numbers, (*slam.origins, *slam.held)),
+        fixed_pose=_gauge(numbers, slam),
         terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric))),
     )
+
+
+def _gauge(numbers: tuple[int, ...], slam: Slam) -> np.ndarray:
+    """Which members are held: origins of the map, and what the window hangs on; never nothing at all."""
+    fixed = np.isin(numbers, (*slam.origins, *slam.held))
+    if slam.prior is None and not fixed.any():
+        fixed[0] = True
+    return fixed
 
 
 def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
     """How many factors of each kind a window holds: one static shape for all windows of a run."""
     room: dict[type, int] = {MeasuredRelativePose: 2 * settings.window}
-    if not metric:
-        room[MeasuredBaseline] = 1
+    room |= {} if metric else {MeasuredBaseline: 1}
     return room | ({MeasuredRotation: settings.window} if settings.manhattan else {})
 
 

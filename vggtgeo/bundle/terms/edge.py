@@ -217,10 +217,11 @@ class ImageTerm(EdgeTerm):
 
 def times_depth_column(columns: Float[Array, "c mp"], slots: int) -> Float[Array, "c p"]:
     """Each column times the depth column, the rows of an observation added; gradient and curvature come last."""
-    depth, total = columns[-1], 0.0
-    for start in range(0, columns.shape[1], slots):
-        total = total + columns[:, start : start + slots] * depth[start : start + slots]
-    return total
+    depth = columns[-1]
+    parts = [
+        columns[:, start : start + slots] * depth[start : start + slots] for start in range(0, columns.shape[1], slots)
+    ]
+    return sum(parts[1:], parts[0])
 
 
 def uses_projection(camera: type[AbstractCamera]) -> bool:

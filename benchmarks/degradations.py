@@ -1,0 +1,187 @@
+"""What happens to people's recordings, done to simulated ones: functions from a list of frames to another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.simulation import simulate
+
+DEPTH_UNIT = 5000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Frames with their camera and the truth."""
+
+    frames: list[Frame]
+    camera: Camera
+    truth: Trajectory
+
+
+Degradation = Callable[[Recording, np.random.Generator], Recording]
+
+
+def record(scene: str, count: int, seed: int) -> Recording:
+    """A simulated walk at 10 frames a second."""
+    sequence = simulate(scene, count, seed, rate=10.0)
+    return Recording(list(sequence.frames()), sequence.camera, sequence.ground_truth())
+
+
+def as_it_is(recording: Recording, rng: np.random.Generator) -> Recording:
+    """The recording undisturbed."""
+    del rng
+    return recording
+
+
+def dirty_lens(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Twelve dark, sharp specks that stay in their place in the image."""
+    height, width = recording.frames[0].image.shape[:2]
+    mask = np.zeros((height, width), np.uint8)
+    for x, y, size in zip(
+        rng.integers(0, width, 12), rng.integers(0, height, 12), rng.integers(12, 36, 12), strict=True
+    ):
+        cv2.ellipse(mask, (int(x), int(y)), (int(size), int(size) // 2), float(rng.uniform(0, 180)), 0, 360, 255, -1)
+    return _images(recording, lambda image, row: np.where(mask[..., None] > 0, image // 5, image))
+
+
+def person(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A patterned figure 1.2 m away walks through the picture, to and fro; depth sees it, too."""
+    height, width = recording.frames[0].image.shape[:2]
+    pattern = cv2.resize(rng.integers(0, 255, (30, 16, 3)).astype(np.uint8), (width // 4, height))
+
+    def place(row: int) -> slice:
+        left = int((0.5 + 0.5 * np.sin(0.15 * row)) * (width - pattern.shape[1]))
+        return slice(left, left + pattern.shape[1])
+
+    def paint(image: np.ndarray, row: int) -> np.ndarray:
+        image = image.copy()
+        image[height // 5 :, place(row)] = pattern[height // 5 :]
+        return image
+
+    def near(depth: np.ndarray, row: int) -> np.ndarray:
+        depth = depth.copy()
+        depth[height // 5 :, place(row)] = 1.2
+        return depth
+
+    return _depths(_images(recording, paint), near)
+
+
+def dark(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A twelfth of the light, with the noise of a camera in it."""
+    change = lambda image, row: np.clip(image / 12.0 + rng.normal(0, 2.0, image.shape), 0, 255).astype(np.uint8)
+    return _images(recording, change)
+
+
+def centimetres(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Depth read in a unit ten times too small."""
+    del rng
+    return _depths(recording, lambda depth, row: 0.1 * depth)
+
+
+def growing_depth(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A depth camera that warms up: its scale grows by 40 % over the recording."""
+    del rng
+    count = len(recording.frames)
+    return _depths(recording, lambda depth, row: depth * (1 + 0.4 * row / count))
+
+
+def other_depth(recording: Recording, rng: np.random.Generator) -> Recording:
+    """The depth images in reverse order."""
+    del rng
+    frames = recording.frames
+    return replace(recording, frames=[replace(a, depth=b.depth) for a, b in zip(frames, frames[::-1], strict=True)])
+
+
+def shuffled(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Frames out of order (sorted by file name, say): 1, 10, 11, ..., 2, 20, ..."""
+    del rng
+    frames, poses, times = recording.frames, recording.truth.poses, recording.truth.timestamps
+    order = sorted(range(len(frames)), key=str)
+    moved = [replace(frames[source], index=row, timestamp=times[row]) for row, source in enumerate(order)]
+    return replace(recording, frames=moved, truth=Trajectory(times, poses[order]))
+
+
+def barrel(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A wide lens, k1 = -0.3, that nobody told of."""
+    del rng
+    camera = recording.camera
+    y, x = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+    grid = np.stack([x, y], -1).reshape(-1, 1, 2)
+    source = cv2.undistortPoints(grid, camera.matrix, np.array([-0.3, 0, 0, 0.0]), P=camera.matrix)
+    u, v = np.asarray(source, np.float32).reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
+    bent = _images(recording, lambda image, row: cv2.remap(image, u, v, cv2.INTER_LINEAR))
+    nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
+    return _depths(bent, lambda depth, row: cv2.remap(depth, u, v, cv2.INTER_NEAREST, **nothing))
+
+
+def zoomed(recording: Recording, rng: np.random.Generator) -> Recording:
+    """The calibration of a lens with 15 % more focal length."""
+    del rng
+    fx, fy, cx, cy = recording.camera.intrinsics
+    return replace(recording, camera=replace(recording.camera, intrinsics=(1.15 * fx, 1.15 * fy, cx, cy)))
+
+
+def covered(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A hand on the lens for a second in the middle."""
+    middle = len(recording.frames) // 2
+    noise = lambda image: rng.normal(12, 2.0, image.shape).clip(0, 255).astype(np.uint8)
+    inside = lambda row: middle <= row < middle + 10
+    blind = _images(recording, lambda image, row: noise(image) if inside(row) else image)
+    return _depths(blind, lambda depth, row: np.full_like(depth, np.nan) if inside(row) else depth)
+
+
+def without_depth(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Colour alone."""
+    del rng
+    return replace(recording, frames=[replace(frame, depth=None) for frame in recording.frames])
+
+
+DEGRADATIONS: dict[str, Degradation] = {
+    "base": as_it_is,
+    **{
+        change.__name__: change
+        for change in (dirty_lens, person, dark, centimetres, growing_depth, other_depth, shuffled, barrel)
+    },
+    **{change.__name__: change for change in (zoomed, covered, without_depth)},
+}
+
+
+def write(recording: Recording, folder: Path, truth: Path) -> None:
+    """A TUM folder without its truth, which goes into the file `truth`."""
+    for part in ("rgb", "depth"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    lines: dict[str, list[str]] = {"rgb": [], "depth": []}
+    for row, frame in enumerate(recording.frames):
+        name = f"{row:06d}.png"
+        cv2.imwrite(str(folder / "rgb" / name), frame.image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        lines["rgb"].append(f"{frame.timestamp:.6f} rgb/{name}\n")
+        if frame.depth is not None:
+            code = np.nan_to_num(frame.depth * DEPTH_UNIT, nan=0.0).clip(0, 65534).round().astype(np.uint16)
+            cv2.imwrite(str(folder / "depth" / name), code, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            lines["depth"].append(f"{frame.timestamp:.6f} depth/{name}\n")
+    (folder / "calibration.txt").write_text(" ".join(f"{value:.9g}" for value in recording.camera.intrinsics) + "\n")
+    for part, entries in lines.items():
+        if entries:
+            (folder / f"{part}.txt").write_text("".join(entries))
+    recording.truth.save_tum(truth)
+
+
+def _images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
+    frames = [replace(frame, image=change(frame.image, row)) for row, frame in enumerate(recording.frames)]
+    return replace(recording, frames=frames)
+
+
+def _depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
+    frames = [
+        frame if frame.depth is None else replace(frame, depth=change(frame.depth, row).astype(np.float32))
+        for row, frame in enumerate(recording.frames)
+    ]
+    return replace(recording, frames=frames)

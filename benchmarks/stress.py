@@ -1,0 +1,256 @@
+"""Degraded clips with the default settings: how many come out right, how many say that they do not, how many lie.
+
+    .venv/bin/python benchmarks/stress.py [--clips corridor-office building-walk] [--scenes office] [--frames 60]
+        [--groups a b] [--variants overlay30 ...] [--jobs 1] [--timeout 240] [--out runs/stress] [--page docs/stress.md]
+
+Clips are degraded by `../shared/stress/make_variants.py` and are skipped where that is not there; simulated scenes by
+`benchmarks/degradations.py`. Each run is one `vggtgeo run` in a process of its own, which cannot see the truth. What is
+done already lies in `--out` and is not run again; `--fresh` runs all.
+
+- good: ATE at most twice that of the clip undisturbed, or 4 cm; 90 % of the frames tracked; called good.
+- alarm: the same, but called degraded or failed.
+- told: not so, and called degraded or failed. error: refused with a message.
+- mild: between good and wrong, and called good. SILENT: wrong (three times, or 8 cm), and called good.
+- crash, hang: as they say.
+
+The ATE is after SE(3) where lengths are called metric, or doubtful; after Sim(3) where the scale is free.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from degradations import DEGRADATIONS, record, write
+
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared"
+ORDER = ("good", "alarm", "mild", "told", "SILENT", "error", "crash", "hang")
+MOST_TURN = 2.5
+"""Degrees, RMS from frame to frame, beyond which poses are wrong whatever the ATE is."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A degraded recording: `make` writes it into a folder and gives that and the file of its truth."""
+
+    source: str
+    name: str
+    make: Callable[[Path], tuple[Path, Path]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a run. ATE in metres; given, written, tracked: frames."""
+
+    source: str
+    name: str
+    code: int | None
+    level: str = ""
+    scale: str = ""
+    ate_se3: float = float("nan")
+    ate_sim3: float = float("nan")
+    turn: float = float("nan")
+    given: int = 0
+    written: int = 0
+    tracked: int = 0
+    seconds: float = 0.0
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def ate(self) -> float:
+        """The one that counts."""
+        return self.ate_sim3 if self.scale.startswith("free") else self.ate_se3
+
+
+def main() -> None:
+    """Run the cases, and write the table."""
+    options = _options()
+    cases = [*_clip_cases(options), *_scene_cases(options)]
+    if not cases:
+        raise SystemExit("nothing to run: there is no `../shared/stress`, and `--scenes` names no scene")
+    options.out.mkdir(parents=True, exist_ok=True)
+    done: list[Outcome] = []
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for outcome in pool.map(lambda case: _run(case, options), cases):
+            done.append(outcome)
+            print(_row(outcome, judge(outcome, _base(done, outcome.source))), flush=True)
+    text = _page(done, options)
+    (options.out / "stress.md").write_text(text)
+    if options.page:
+        options.page.write_text(text)
+
+
+def judge(outcome: Outcome, base: float) -> str:
+    """The word for an outcome; base: ATE of the recording undisturbed, metres."""
+    if outcome.code is None:
+        return "hang"
+    if outcome.code not in (0, 3):
+        return "error" if outcome.code == 2 else "crash"
+    told = outcome.level != "good"
+    complete = outcome.written >= 0.98 * outcome.given and outcome.tracked >= 0.9 * outcome.written
+    complete = complete and not outcome.turn > MOST_TURN
+    if outcome.ate <= max(2 * base, 0.04) and complete:
+        return "alarm" if told else "good"
+    if told:
+        return "told"
+    return "mild" if complete and outcome.ate <= max(3 * base, 0.08) else "SILENT"
+
+
+def _run(case: Case, options: argparse.Namespace) -> Outcome:
+    kept = options.out / f"{case.source}.{case.name}.json"
+    if kept.is_file() and not options.fresh:
+        return Outcome(**json.loads(kept.read_text()))
+    work = options.out / f"{case.source}.{case.name}"
+    shutil.rmtree(work, ignore_errors=True)
+    folder, truth = case.make(work)
+    began = time.perf_counter()
+    try:
+        ended = subprocess.run(
+            [options.program, "run", str(folder), "-o", str(work / "run"), "--quiet"],
+            capture_output=True,
+            text=True,
+            timeout=options.timeout,
+            check=False,
+        )
+        code: int | None = ended.returncode
+        (work / "log.txt").write_text(ended.stdout + ended.stderr)
+    except subprocess.TimeoutExpired:
+        code = None
+    outcome = _measured(case, folder, truth, work / "run", code, time.perf_counter() - began)
+    kept.write_text(json.dumps(asdict(outcome)))
+    if not options.keep:
+        shutil.rmtree(work)
+    return outcome
+
+
+def _measured(case: Case, folder: Path, truth: Path, run: Path, code: int | None, seconds: float) -> Outcome:
+    given = sum(1 for line in (folder / "rgb.txt").read_text().splitlines() if line.strip() and line[0] != "#")
+    facts: dict[str, Any] = {"given": given, "seconds": seconds}
+    if code in (0, 3) and (run / "summary.json").is_file():
+        summary = json.loads((run / "summary.json").read_text())
+        estimate, true = Trajectory.load_tum(run / "trajectory.txt"), Trajectory.load_tum(truth)
+        report = evaluate_trajectory(estimate, true)
+        facts |= {
+            "level": summary["verdict"]["level"],
+            "reasons": tuple(summary["verdict"]["reasons"]),
+            "scale": summary["scale"],
+            "written": summary["frames"],
+            "tracked": summary["frames_tracked"],
+            "ate_se3": report.se3.statistics.rmse,
+            "ate_sim3": report.sim3.statistics.rmse,
+            "turn": float(np.degrees(report.relative.rotation_statistics.rmse)),
+        }
+    return Outcome(case.source, case.name, code, **facts)
+
+
+def _clip_cases(options: argparse.Namespace) -> Iterator[Case]:
+    script = SHARED / "stress" / "make_variants.py"
+    if not script.is_file():
+        print("clips are skipped: `../shared/stress/make_variants.py` is not there")
+        return
+    spec = importlib.util.spec_from_file_location("make_variants", script)
+    assert spec is not None
+    assert spec.loader is not None
+    variants = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = variants
+    spec.loader.exec_module(variants)
+    for clip in options.clips:
+        for name, (group, _, _) in variants.VARIANTS.items():
+            chosen = name in options.variants if options.variants else not options.groups or group in options.groups
+            if name == "base" or chosen:
+                source = SHARED / "data" / clip
+                make = lambda work, name=name, source=source: variants.make(
+                    source, work, name, options.frames, options.start, options.seed
+                )
+                yield Case(clip, name, make)
+
+
+def _scene_cases(options: argparse.Namespace) -> Iterator[Case]:
+    for scene in options.scenes:
+        for name, change in DEGRADATIONS.items():
+            if options.variants and name != "base" and name not in options.variants:
+                continue
+
+            def make(work: Path, scene: str = scene, change: Any = change) -> tuple[Path, Path]:
+                changed = change(record(scene, options.frames, options.seed), np.random.default_rng(options.seed))
+                write(changed, work / "frames", work / "truth.txt")
+                return work / "frames", work / "truth.txt"
+
+            yield Case(f"simulated {scene}", name, make)
+
+
+def _base(outcomes: list[Outcome], source: str) -> float:
+    """ATE of the recording undisturbed; 1 cm where that itself went wrong, so that it excuses nothing."""
+    found = [o.ate for o in outcomes if o.source == source and o.name == "base" and o.level == "good"]
+    return found[0] if found and found[0] < 0.1 else 0.01
+
+
+def _row(outcome: Outcome, word: str) -> str:
+    reasons = "; ".join(outcome.reasons)
+    reasons = reasons if len(reasons) < 160 else reasons[:157] + "..."
+    name = f"**{word}**" if word in ("SILENT", "crash", "hang") else word
+    return (
+        f"| {outcome.source} | {outcome.name} | {name} | {outcome.level or '-'} | {100 * outcome.ate_se3:.1f} | "
+        f"{100 * outcome.ate_sim3:.1f} | {outcome.tracked}/{outcome.given} | {reasons.replace('|', '/')} |"
+    )
+
+
+def _page(outcomes: list[Outcome], options: argparse.Namespace) -> str:
+    words = [judge(outcome, _base(outcomes, outcome.source)) for outcome in outcomes]
+    lines = [
+        "# Degraded clips",
+        "",
+        "Written by `" + " ".join(["benchmarks/stress.py", *sys.argv[1:]]) + "`; the words are explained there.",
+        "",
+        "| source | cases | " + " | ".join(ORDER) + " |",
+        "|---" * (len(ORDER) + 2) + "|",
+    ]
+    for source in [*dict.fromkeys(outcome.source for outcome in outcomes), "all"]:
+        count = Counter(w for o, w in zip(outcomes, words, strict=True) if source in (o.source, "all"))
+        lines.append(f"| {source} | {sum(count.values())} | " + " | ".join(str(count[w]) for w in ORDER) + " |")
+    lines += [
+        "",
+        "| source | variant | outcome | verdict | SE(3) cm | Sim(3) cm | tracked | reasons |",
+        "|---" * 8 + "|",
+    ]
+    lines += [_row(outcome, word) for outcome, word in zip(outcomes, words, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clips", nargs="*", default=["corridor-office", "building-walk"])
+    parser.add_argument("--scenes", nargs="*", default=["office"])
+    parser.add_argument("--variants", nargs="*", default=[])
+    parser.add_argument("--groups", nargs="*", default=[])
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--start", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--timeout", type=float, default=240.0, help="seconds a run may take")
+    parser.add_argument("--program", default=str(Path(sys.executable).parent / "vggtgeo"))
+    parser.add_argument("--out", type=Path, default=Path("runs/stress"))
+    parser.add_argument("--page", type=Path, help="file that gets the table, too")
+    parser.add_argument("--keep", action="store_true", help="keep recordings and runs")
+    parser.add_argument("--fresh", action="store_true", help="run again what is done")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""The depth images alone: frozen while the picture moves, or of a size that no room has.
+
+- Every sensor has noise, and a camera that moves sees other depths: a depth image that is to the last digit the one
+  before, while the corners moved by more than `MOVED` pixels, is the same file again.
+- Frames of indoor RGB-D clips have median depths between 0.6 and 4 m (redkitchen 1.7, corridor-office 2.4,
+  building-walk 2.3, TUM's desks 1 to 1.5); sensors for rooms begin at 0.2 to 0.5 m and end at 8 to 10. A clip whose
+  median is outside `PLAUSIBLE` was most likely read in a wrong unit. A constant factor between those limits cannot be
+  seen: the world of the run is then as much larger or smaller, and agrees with itself.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.evidence import Evidence, FrameEvidence, common
+from vggtgeo.slam.trust.finding import Finding, spans
+
+MOVED = 2.0
+LEAST_CHANGED = 0.02
+"""Share of pixels of a depth image that a moving camera changes at least, quantisation to 5 cm included (0.7)."""
+LEAST_FRAMES = 3
+PLAUSIBLE = (0.5, 6.5)
+"""Metres, of the median over all frames of their median depth."""
+
+
+def check_frozen(evidence: Evidence, harmless: bool) -> list[Finding]:
+    """Depth images that are repeated while the picture moves.
+
+    harmless: whether depth and motion agree all the same, as they do where the camera hardly moves: then it marks the
+    segment only.
+    """
+    moved = np.array([0.0, *(_flow(a, b) for a, b in pairwise(evidence))])
+    with np.errstate(invalid="ignore"):
+        frozen = (np.array([frame.depth_changed for frame in evidence]) < LEAST_CHANGED) & (moved > MOVED)
+    if np.count_nonzero(frozen) < LEAST_FRAMES:
+        return []
+    found = []
+    for first, last in spans(frozen, join=3):
+        start, end = evidence[max(first - 1, 0)].frame, evidence[last].frame
+        text = f"frames {start} to {end}: the depth image stays the same while the picture moves"
+        found.append(Finding("frozen depth", "degraded", text, start, end, scale=not harmless, local=harmless))
+    return found
+
+
+def check_range(estimate: Estimate, evidence: Evidence) -> list[Finding]:
+    """A depth that no room has: most likely a wrong unit."""
+    medians = np.array([frame.depth_median for frame in evidence])
+    medians = medians[np.isfinite(medians)]
+    if not estimate.metric or not len(medians):
+        return []
+    middle = float(np.median(medians))
+    if PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
+        return []
+    text = (
+        f"the median depth is {middle:.3g} m; indoors it is {PLAUSIBLE[0]} to {PLAUSIBLE[1]} m: is the unit of the "
+        "depth images right?"
+    )
+    return [Finding("depth range", "degraded", text, scale=True)]
+
+
+def _flow(first: FrameEvidence, second: FrameEvidence) -> float:
+    rows, others = common(first, second)
+    if len(rows) < 8:
+        return 0.0
+    return float(np.median(np.linalg.norm(second.pixels[others] - first.pixels[rows], axis=1)))

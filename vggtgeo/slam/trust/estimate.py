@@ -1,0 +1,72 @@
+"""What is judged: the poses and the camera that a run claims, in plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.run import frame_trajectory
+from vggtgeo.slam.state import Slam
+
+GUESSED = 0.1
+"""A prior on the focal length that is wider than this share of it stands for a guess."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The claim of a run.
+
+    frames: int [n]; times: float64 [n], s; poses: float64 [n, 4, 4], world -> camera; tracked: bool [n].
+    intrinsics: fx, fy, cx, cy at the end; given: before the run; sigma: of their prior, pixels. metric: lengths are
+    metres. inliers: int [n], matches that agreed with the pose; is_keyframe: bool [n]. origins: how many parts the map
+    has. started: whether there ever was a map.
+    """
+
+    frames: np.ndarray
+    times: np.ndarray
+    poses: np.ndarray
+    tracked: np.ndarray
+    intrinsics: np.ndarray
+    given: np.ndarray
+    sigma: np.ndarray
+    metric: bool
+    inliers: np.ndarray
+    is_keyframe: np.ndarray
+    origins: int = 1
+    started: bool = True
+
+    @classmethod
+    def of(cls, slam: Slam) -> Self:
+        """The claim of a state."""
+        trajectory = frame_trajectory(slam)
+        known = any(np.isfinite(keyframe.points.inverse_depth).any() for keyframe in slam.keyframes)
+        return cls(
+            np.array([record.frame for record in slam.frames], int),
+            trajectory.timestamps,
+            rigid.invert(trajectory.poses),
+            np.array([record.tracked for record in slam.frames], bool),
+            np.asarray(slam.intrinsics, np.float64),
+            np.asarray(slam.given_intrinsics, np.float64),
+            np.asarray(slam.intrinsics_sigma, np.float64),
+            slam.metric,
+            np.array([record.inliers for record in slam.frames], int),
+            np.isin([record.frame for record in slam.frames], [keyframe.frame for keyframe in slam.keyframes]),
+            len(slam.origins),
+            known,
+        )
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def centres(self) -> np.ndarray:
+        """Camera centres, float64 [n, 3]."""
+        return rigid.invert(self.poses)[:, :3, 3]
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the intrinsics were given, not guessed."""
+        return bool(self.sigma[0] < GUESSED * self.given[0])

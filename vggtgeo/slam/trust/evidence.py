@@ -1,0 +1,184 @@
+"""What a run notes of every frame for its verdict: corners followed from image to image, and the sensor's depth there.
+
+The tracks (Lucas & Kanade, 1981, on images of 320 pixels) know nothing of the map, its features or its poses. So they
+are a witness that the estimate has not heard yet: poses that are right explain how these corners move, and depth that
+is right says how far away they are. About 4 ms a frame (640 x 480), 4 kB a frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.slam.state import Slam
+
+WIDTH = 320
+"""Pixels of the longer side of the images that corners are followed in."""
+CELL = 20
+"""Pixels of these images a side of a cell. A cell holds one track: a poster does not outvote the walls around it."""
+LEAST_CORNER = 2e-5
+"""Smallest eigenvalue of the structure tensor (OpenCV's unit). White noise of 3 grey levels gives 1e-5."""
+CONTRAST = 50.0
+"""Grey levels, standard deviation."""
+ROUND_TRIP = 0.5
+"""Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
+_FLOW = {
+    "winSize": (15, 15),
+    "maxLevel": 4,
+    "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FrameEvidence:
+    """One frame's corners.
+
+    ids: int32 [m], a track's number, the same in each frame that saw it. pixels: float32 [m, 2], of the ideal pinhole
+    image. depth: float32 [m], the sensor's, metres, NaN = none. depth_changed: share of the pixels with depth whose
+    depth is not exactly that of the frame before, NaN without depth. contrast: standard deviation of the grey levels.
+    """
+
+    frame: int
+    timestamp: float
+    ids: np.ndarray
+    pixels: np.ndarray
+    depth: np.ndarray
+    depth_median: float
+    depth_changed: float
+    contrast: float
+
+
+class EvidenceRecorder:
+    """Collects a `FrameEvidence` of each frame; a `Watcher`."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.frames: list[FrameEvidence] = []
+        self._camera = camera
+        self._image: np.ndarray | None = None
+        self._depth: np.ndarray | None = None
+        self._ids = np.zeros(0, np.int32)
+        self._pixels = np.zeros((0, 2), np.float32)
+        self._next = 0
+
+    def warm_up(self, problem: Problem, state: State) -> None:
+        """Nothing to compile."""
+
+    def see(self, slam: Slam, frame: Frame) -> None:
+        self.add(frame)
+
+    def add(self, frame: Frame) -> None:
+        """Follow the corners into this frame, and begin new ones where there are none."""
+        scale = max(frame.image.shape[:2]) / WIDTH
+        grey, contrast = _small_grey(frame.image, scale)
+        if self._image is not None and len(self._ids):
+            pixels, kept = follow(self._image, grey, self._pixels)
+            self._ids, self._pixels = one_a_cell(self._ids[kept], pixels[kept])
+        fresh = new_corners(grey, self._pixels)
+        numbers = np.arange(self._next, self._next + len(fresh), dtype=np.int32)
+        self._next += len(fresh)
+        self._ids = np.concatenate([self._ids, numbers])
+        self._pixels = np.concatenate([self._pixels, fresh])
+        self._image = grey
+        full = (self._pixels + 0.5) * scale - 0.5
+        changed, median = self._compare_depth(frame.depth)
+        depth = np.full(len(full), np.nan, np.float32) if frame.depth is None else _read(frame.depth, full)
+        ideal = _undistorted(full, self._camera).astype(np.float32)
+        self.frames.append(
+            FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth, median, changed, contrast)
+        )
+
+    def finish(self, slam: Slam, cloud: PointCloud) -> None:
+        """Nothing: the last adjustment is no frame."""
+
+    def _compare_depth(self, depth: np.ndarray | None) -> tuple[float, float]:
+        """The share of pixels that changed since the last frame, and the median; NaN where there is no depth."""
+        if depth is None:
+            self._depth = None
+            return float("nan"), float("nan")
+        small = depth[4::8, 4::8].copy()
+        before, self._depth = self._depth, small
+        known = np.isfinite(small)
+        median = float(np.median(small[known])) if np.any(known) else float("nan")
+        if before is None or np.count_nonzero(known) < 0.05 * known.size:
+            return float("nan"), median
+        return float(np.mean(before[known] != small[known])), median
+
+
+def follow(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where corners of one grey image are in the next, float32 [m, 2], and which of them came back when asked."""
+    start = pixels.reshape(-1, 1, 2)
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None, **_FLOW)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **_FLOW)
+    off = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
+    moved = there.reshape(-1, 2)
+    height, width = after.shape
+    inside = (moved > 4).all(1) & (moved < (width - 5, height - 5)).all(1)
+    return moved, (ok.ravel() == 1) & (again.ravel() == 1) & (off < ROUND_TRIP) & inside
+
+
+def one_a_cell(ids: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The oldest track of each cell; ids grow with time, and rows are in their order."""
+    cells = (pixels // CELL).astype(int)
+    _, first = np.unique(cells[:, 0] + 10_000 * cells[:, 1], return_index=True)
+    kept = np.sort(first)
+    return ids[kept], pixels[kept]
+
+
+def new_corners(grey: np.ndarray, taken: np.ndarray) -> np.ndarray:
+    """The strongest corner of each cell that holds none of `taken`, float32 [m, 2]."""
+    strength = cv2.cornerMinEigenVal(grey, 5)
+    rows, columns = grey.shape[0] // CELL, grey.shape[1] // CELL
+    cells = strength[: rows * CELL, : columns * CELL].reshape(rows, CELL, columns, CELL)
+    cells = cells.transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+    best = cells.argmax(2)
+    free = cells.max(2) > LEAST_CORNER
+    x, y = np.clip(taken // CELL, 0, (columns - 1, rows - 1)).astype(int).T
+    free[y, x] = False
+    row, column = np.nonzero(free)
+    inner = best[row, column]
+    return np.column_stack([column * CELL + inner % CELL, row * CELL + inner // CELL]).astype(np.float32)
+
+
+def _small_grey(image: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
+    """The image that corners are followed in, uint8, and the standard deviation of its grey levels before."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    height, width = (max(round(side / scale), 2 * CELL) for side in grey.shape)
+    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+    mean, deviation = float(small.mean()), float(small.std())
+    # One mean and contrast for all, since a camera changes its exposure and LK compares grey levels.
+    gain = min(CONTRAST / max(deviation, 1e-3), 4.0)
+    levels = np.arange(256, dtype=np.float32)
+    table = np.clip(gain * (levels - mean) + 128.0, 0, 255).astype(np.uint8)
+    return cv2.LUT(small, table), deviation
+
+
+def _read(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    columns, rows = np.rint(pixels).astype(int).T
+    height, width = depth.shape
+    return depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float32)
+
+
+def _undistorted(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    if not any(camera.distortion) or not len(pixels):
+        return pixels
+    matrix = camera.matrix
+    flat = cv2.undistortPoints(
+        pixels.reshape(-1, 1, 2).astype(np.float64), matrix, np.array(camera.distortion), P=matrix
+    )
+    return np.asarray(flat).reshape(-1, 2)
+
+
+def common(first: FrameEvidence, second: FrameEvidence) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the tracks that both frames saw."""
+    _, rows, others = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+    return rows, others
+
+
+Evidence = Sequence[FrameEvidence]

@@ -1,0 +1,54 @@
+"""The verdict of a run: every check on what it claims and on what was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.blind import check_blind
+from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
+from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
+from vggtgeo.slam.trust.depth_images import check_frozen, check_range
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.evidence import Evidence
+from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
+from vggtgeo.slam.trust.record import check_record
+from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
+from vggtgeo.slam.trust.speed import check_speed
+from vggtgeo.slam.trust.steps import breaks, check_steps, steps
+from vggtgeo.slam.trust.still_points import check_parts, divide
+
+
+def judge(slam: Slam, evidence: Evidence = (), said: tuple[Finding, ...] = ()) -> Verdict:
+    """How far the state after the last adjustment can be trusted.
+
+    evidence: of all frames, from an `EvidenceRecorder`; without it only the run's own record speaks. said: what is
+    known of the input already.
+    """
+    estimate = Estimate.of(slam)
+    by_frame = {noted.frame: noted for noted in evidence}
+    aligned = [by_frame[frame] for frame in estimate.frames if frame in by_frame]
+    found = [*said, *check_record(estimate), *check_speed(estimate)]
+    if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
+        height, width = slam.keyframes[0].image.shape[:2]
+        found += _images(estimate, aligned, (width, height))
+    return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)
+
+
+def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> Iterator[Finding]:
+    taken = steps(estimate, evidence)
+    wrong = breaks(estimate, evidence, taken)
+    yield from check_steps(estimate, taken, wrong)
+    yield from check_blind(estimate, evidence, taken)
+    yield from check_parts(estimate, [divide(step) for step in taken])
+    ratios = depth_ratios(estimate, evidence)
+    yield from check_depth(estimate, ratios)
+    yield from check_frozen(evidence, harmless=agree(ratios))
+    yield from check_range(estimate, evidence)
+    sound = np.ones(len(estimate), bool)
+    for part in wrong:
+        sound[part.first : part.last + 2] = False
+    yield from check_scale(estimate, hand_overs(estimate, evidence, sound))
+    yield from check_camera(estimate, camera_opinion(estimate, evidence), size)

@@ -1,0 +1,56 @@
+"""What the tracker itself says of its run: whether it ever began, how many frames it lost, how many parts the map has.
+
+A lost stretch of `T` seconds is bridged by assuming a smooth motion. A hand-held camera's acceleration has a standard
+deviation of about `ACCELERATION` (the clips: 0.5 to 1.5 m/s^2), so the middle of a bridge is off by `a T^2 / 8`, the
+end of a run that is never found again by `a T^2 / 2`. The RMS over all frames says what this does to the ATE.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.finding import Finding, spans
+
+ACCELERATION = 1.0
+"""m/s^2."""
+MOST_BRIDGED = 0.04
+"""Metres, RMS over all frames, that bridges may cost."""
+MOST_LOST = 0.10
+LEAST_TRACKED = 0.5
+"""Share of frames below which the run is not to be used."""
+
+
+def check_record(estimate: Estimate) -> list[Finding]:
+    """Lost frames, new origins, and a map that never was."""
+    if not len(estimate):
+        return []
+    share = float(np.mean(estimate.tracked))
+    if not estimate.started or (len(estimate) > 2 and np.count_nonzero(estimate.tracked) <= 1):
+        text = "no map was ever started: there was not enough parallax, or nothing to see; the poses mean nothing"
+        return [Finding("start", "failed", text)]
+    found = []
+    stretches = spans(~estimate.tracked)
+    serious = 1 - share > MOST_LOST or bridging_error(estimate) > MOST_BRIDGED
+    for first, last in stretches:
+        start, end = int(estimate.frames[first]), int(estimate.frames[last])
+        text = f"frames {start} to {end} were lost; their poses are only predicted"
+        found.append(Finding("lost", "degraded", text, start, end, local=not serious))
+    if share < LEAST_TRACKED:
+        found.append(Finding("lost", "failed", f"only {100 * share:.0f} % of the frames were tracked"))
+    if estimate.origins > 1:
+        text = f"the map is in {estimate.origins} parts; how they lie to each other is only predicted"
+        found.append(Finding("parts", "degraded", text))
+    return found
+
+
+def bridging_error(estimate: Estimate) -> float:
+    """Metres, RMS over all frames, that the lost ones may be off."""
+    squares = 0.0
+    for first, last in spans(~estimate.tracked):
+        before, after = max(first - 1, 0), min(last + 1, len(estimate) - 1)
+        seconds = float(estimate.times[after] - estimate.times[before])
+        open_end = first == 0 or last == len(estimate) - 1
+        error = ACCELERATION * seconds**2 / (2 if open_end else 8)
+        squares += (last - first + 1) * error**2 / 2
+    return float(np.sqrt(squares / max(len(estimate), 1)))

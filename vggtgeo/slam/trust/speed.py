@@ -1,0 +1,44 @@
+"""Speeds that nobody who carries a camera through a building has.
+
+Walking is 1.5 m/s, running 3 to 4; the clips have medians of 0.2 (redkitchen), 0.6 to 0.9 (HoloLens), at most 2.4 over
+`SPAN` seconds. A single wrong pose is a matter of the images (`steps`), so speeds are taken over `SPAN`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.finding import Finding, spans
+
+SPAN = 0.4
+"""Seconds."""
+MOST_SPEED = 5.0
+MOST_TYPICAL_SPEED = 3.0
+"""m/s: over `SPAN`, and the median over the run."""
+
+
+def check_speed(estimate: Estimate) -> list[Finding]:
+    """Stretches that are too fast, and a run that is."""
+    if not estimate.metric or len(estimate) < 3:
+        return []
+    speed = speeds(estimate)
+    typical = float(np.median(speed))
+    if typical > MOST_TYPICAL_SPEED:
+        text = f"the camera moves at {typical:.1f} m/s: nobody carries one so fast; is the unit of the depth right?"
+        return [Finding("speed", "degraded", text, scale=True)]
+    found = []
+    for first, last in spans(speed > MOST_SPEED, join=3):
+        start, end = int(estimate.frames[first]), int(estimate.frames[min(last + 1, len(estimate) - 1)])
+        text = f"frames {start} to {end}: the camera moves at {speed[first : last + 1].max():.0f} m/s"
+        found.append(Finding("speed", "degraded", text, start, end))
+    return found
+
+
+def speeds(estimate: Estimate) -> np.ndarray:
+    """From each frame to the first one at least `SPAN` later (or the last), m/s, float64 [n - 1]."""
+    rows = np.arange(len(estimate) - 1)
+    later = np.minimum(np.searchsorted(estimate.times, estimate.times[:-1] + SPAN - 1e-9), len(estimate) - 1)
+    later = np.maximum(later, rows + 1)
+    distance = np.linalg.norm(estimate.centres[later] - estimate.centres[rows], axis=1)
+    return np.asarray(distance / np.maximum(estimate.times[later] - estimate.times[rows], min(SPAN, 0.03)))
