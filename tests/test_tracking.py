@@ -18,7 +18,8 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.evidence import Evidence
-from vggtgeo.slam.rgbd_alignment import RgbdAlignment, RgbdView
+from vggtgeo.slam.rgbd_alignment import RgbdAlignment
+from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
