@@ -159,7 +159,8 @@ def make_roles(sequence: Sequence, init: str, features: str) -> Roles:
 
     roles = Roles(points={"sift": SiftMatcher, "orb": OrbMatcher}[features]())
     if init == "constant-velocity":
-        roles = replace(roles, geometry=ConstantVelocity())
+        # The ablation is a start by motion alone: nothing else may mend the pose before the window does.
+        roles = replace(roles, geometry=ConstantVelocity(), alignment=None)
     if not sequence.has_depth:
         roles = replace(roles, depth=NoDepth())
     return roles

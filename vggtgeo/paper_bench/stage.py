@@ -64,4 +64,5 @@ class Stage:
             depth=replace(moge, error=factor * moge.error, wobble=factor * moge.wobble),
             confidence=SimulatedDino(oracle, seed),
             geometry=variant.start(SimulatedVggt(oracle, seed)),
+            alignment=None,  # the paper has none, and the ablation of its start would be none beside one
         )

@@ -12,7 +12,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import place_vector
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.rgbd_alignment import RgbdView
+from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles
 from vggtgeo.slam.state import FramePose, Slam, Waiting
 from vggtgeo.slam.tracking import Expectation, Sight, Track, track

@@ -114,7 +114,8 @@ class SlamSettings:
     """What scales the depth prior of a pixel. "own": the confidence of the depth itself; "saliency": the Omega that
     weights the matches, as in the paper's formula; "complement": 1 - Omega, as the paper's text describes it."""
     known_intrinsics_sigma: float = 1e-4
-    """Standard deviation of the prior on known intrinsics, relative to the focal length."""
+    """Standard deviation of the prior on known intrinsics, relative to the focal length: so small that they are held.
+    With 1 % they took up every error of the poses, 495.6 became 424 on building-walk."""
     guessed_intrinsics_sigma: float = 0.3
     """The same for guessed ones."""
     window_iterations: int = 12

@@ -13,7 +13,7 @@ from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.factors import Factor, MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.rgbd_alignment import RgbdView
+from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 

@@ -16,7 +16,8 @@ from vggtgeo.models.roles import Features, GeometryResult, PointMatches, PoseGue
 from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, tangent, worst_sigma
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.rgbd_alignment import Aligned, RgbdView
+from vggtgeo.slam.rgbd_alignment import Aligned
+from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles
 
 PIXEL_SIGMA = 2.0

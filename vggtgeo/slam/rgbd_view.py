@@ -1,0 +1,163 @@
+"""What the direct alignment of two RGB-D images needs of each: a pyramid of brightness, surface points, edge points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vggtgeo.geometry import rigid
+
+WIDTH = 300
+"""Images are shrunk by a whole factor to about so many pixels for the brightness."""
+LEVELS = 3
+BACKGROUND = 6.0
+"""Standard deviation of the local mean that is taken off, pixels of each level: exposure and shading change it."""
+BLOCK = 2
+"""Cells of the depth, in shrunk pixels a side: their mean is less noisy than one pixel."""
+EDGE_CELL = 4
+"""One brightness sample, the one with the strongest gradient, is taken of each such cell, shrunk pixels a side."""
+FAINT = 1.5
+"""Grey levels a pixel; a weaker gradient is noise of the image."""
+MOST_POINTS = 2400
+"""Surface points of the source that take part; more cost time and change nothing, for they share their errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gray:
+    """One level: brightness without its local mean and its derivatives, float32 [h, w]; intrinsics of the level."""
+
+    value: np.ndarray
+    dx: np.ndarray
+    dy: np.ndarray
+    intrinsics: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RgbdView:
+    """What an alignment needs of one image.
+
+    levels: finest first. surface: float32 [h, w, 3] points in the camera frame, metres, and normals: the same of unit
+    normals towards the camera, NaN = none; surface_intrinsics of that grid. samples: points and normals float32 [n, 3]
+    of cells spread over the image. edges: float64 [m, 3] points in the camera
+    frame with a strong gradient, and edge_values: one float32 [m] of brightness for each level.
+    """
+
+    levels: tuple[Gray, ...]
+    surface: np.ndarray
+    normals: np.ndarray
+    surface_intrinsics: np.ndarray
+    samples: tuple[np.ndarray, np.ndarray]
+    edges: np.ndarray
+    edge_values: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, image: np.ndarray, depth: np.ndarray | None, intrinsics: np.ndarray) -> RgbdView:
+        """From an image uint8 [H, W, 3] and its depth float [H, W], metres, NaN = none."""
+        factor = max(round(image.shape[1] / WIDTH), 1)
+        gray = _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), factor)
+        own = _scaled(intrinsics, factor)
+        levels = _pyramid(gray, own)
+        if depth is None or not np.isfinite(depth).any():
+            nothing = np.full((1, 1, 3), np.nan, np.float32)
+            none, empty = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+            return cls(levels, nothing, nothing, own, (none, none), none, (empty,) * LEVELS)
+        cells = _cell_means(depth, factor * BLOCK)
+        coarse = _scaled(intrinsics, factor * BLOCK)
+        surface = _unproject_grid(cells, coarse)
+        normals = _normals(surface)
+        edges, values = _edge_samples(levels, cells)
+        return cls(levels, surface, normals, coarse, _spread(surface, normals), edges, values)
+
+
+def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
+    if factor == 1:
+        return image
+    return cv2.resize(image, (image.shape[1] // factor, image.shape[0] // factor), interpolation=cv2.INTER_AREA)
+
+
+def _scaled(intrinsics: np.ndarray, factor: int) -> np.ndarray:
+    """Of an image of blocks of `factor` pixels; integers are pixel centres."""
+    return np.array([*intrinsics[:2], *(np.asarray(intrinsics[2:]) + 0.5 - factor / 2)]) / factor
+
+
+def _pyramid(gray: np.ndarray, intrinsics: np.ndarray) -> tuple[Gray, ...]:
+    levels = []
+    for level in range(LEVELS):
+        image = _shrink(gray, 2**level)
+        value = image - cv2.GaussianBlur(image, (0, 0), BACKGROUND)
+        dx = cv2.Scharr(value, cv2.CV_32F, 1, 0, scale=1 / 32)
+        dy = cv2.Scharr(value, cv2.CV_32F, 0, 1, scale=1 / 32)
+        levels.append(Gray(value, dx, dy, _scaled(intrinsics, 2**level)))
+    return tuple(levels)
+
+
+def _cell_means(depth: np.ndarray, factor: int) -> np.ndarray:
+    """Mean inverse depth's depth of blocks, float32 [h, w]; NaN where half a block is unknown, or across a jump."""
+    height, width = depth.shape[0] // factor * factor, depth.shape[1] // factor * factor
+    known = np.isfinite(depth[:height, :width])
+    inverse = np.where(known, 1.0 / np.where(known, depth[:height, :width], 1.0), 0.0).astype(np.float32)
+    size = (width // factor, height // factor)
+    share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    mean, square = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (inverse, inverse * inverse))
+    safe = np.maximum(share, 1e-6)
+    mean, square = mean / safe, square / safe
+    spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
+    good = (share >= 0.5) & (spread < 0.05 * mean)
+    return np.where(good, 1.0 / np.maximum(mean, 1e-6), np.nan).astype(np.float32)
+
+
+def _unproject_grid(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]].astype(np.float32)
+    rays = np.stack([(u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], np.ones_like(u)], -1)
+    return (rays * depth[..., None]).astype(np.float32)
+
+
+def _normals(points: np.ndarray) -> np.ndarray:
+    """Unit normals towards the camera from central differences, NaN at borders, holes and jumps of the depth."""
+    normals = np.full_like(points, np.nan)
+    if min(points.shape[:2]) < 3:
+        return normals
+    right = points[1:-1, 2:] - points[1:-1, :-2]
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    normal = np.cross(down, right)
+    z = points[1:-1, 1:-1, 2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        smooth = (np.abs(right[..., 2]) < 0.1 * z) & (np.abs(down[..., 2]) < 0.1 * z)
+        normal = normal / np.linalg.norm(normal, axis=2, keepdims=True)
+    normals[1:-1, 1:-1] = np.where(smooth[..., None], normal, np.nan)
+    return normals
+
+
+def _spread(surface: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals of at most about `MOST_POINTS` cells, evenly spread."""
+    known = np.nonzero(np.isfinite(normals[..., 0]).ravel())[0]
+    # A fixed shuffle: a regular stride would take whole columns of the grid.
+    order = np.random.default_rng(0).permutation(len(known))[:MOST_POINTS]
+    chosen = np.sort(known[order])
+    return surface.reshape(-1, 3)[chosen], normals.reshape(-1, 3)[chosen]
+
+
+def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """The strongest gradient of each cell whose depth is known: points float64 [m, 3], brightness of each level."""
+    finest = levels[0]
+    strength = np.hypot(finest.dx, finest.dy)
+    height, width = (side // EDGE_CELL * EDGE_CELL for side in strength.shape)
+    blocks = strength[:height, :width].reshape(height // EDGE_CELL, EDGE_CELL, width // EDGE_CELL, EDGE_CELL)
+    flat = blocks.transpose(0, 2, 1, 3).reshape(height // EDGE_CELL, width // EDGE_CELL, -1)
+    place = flat.argmax(2)
+    row = np.arange(height // EDGE_CELL)[:, None] * EDGE_CELL + place // EDGE_CELL
+    column = np.arange(width // EDGE_CELL)[None, :] * EDGE_CELL + place % EDGE_CELL
+    row, column = row.ravel(), column.ravel()
+    z = cells[np.minimum(row // BLOCK, cells.shape[0] - 1), np.minimum(column // BLOCK, cells.shape[1] - 1)]
+    inner = (row > 2) & (column > 2) & (row < strength.shape[0] - 3) & (column < strength.shape[1] - 3)
+    good = np.isfinite(z) & (strength[row, column] > FAINT) & inner
+    row, column, z = row[good], column[good], z[good]
+    pixels = np.column_stack([column, row]).astype(np.float64)
+    points = rigid.rays(pixels, finest.intrinsics) * z[:, None]
+    values = []
+    for number, level in enumerate(levels):
+        x, y = ((pixels + 0.5) / 2**number - 0.5).astype(np.float32).T
+        values.append(cv2.remap(level.value, x[None], y[None], cv2.INTER_LINEAR)[0] if len(x) else x)
+    return points, tuple(values)
