@@ -19,7 +19,16 @@ Values = Float[Array, "*n"]
 
 
 class AbstractKernel(eqx.Module):
-    """A robust kernel; `s` is the squared norm, any shape, `s >= 0`."""
+    """A robust kernel; `s` is the squared norm, any shape, `s >= 0`.
+
+    Example: a kernel of one's own, for small residuals the square.
+        >>> class Welsch(vg.AbstractKernel):
+        ...     def rho(self, s):
+        ...         return 1 - jax.numpy.exp(-s)
+        >>> float(Welsch().weight(jax.numpy.asarray(0.0)))
+        1.0
+
+    """
 
     @abc.abstractmethod
     def rho(self, s: Values) -> Values:

@@ -26,7 +26,13 @@ _NEWTON_STEPS = 8
 
 
 class AbstractCamera(eqx.Module):
-    """A camera model: `fx, fy, cx, cy` first, then what the model adds."""
+    """A camera model: `fx, fy, cx, cy` first, then what the model adds.
+
+    Example:
+        >>> vg.KannalaBrandt.names[:4]
+        ('fx', 'fy', 'cx', 'cy')
+
+    """
 
     parameters: Float[Array, " q"]
 

@@ -11,7 +11,14 @@ from vggtgeo.geometry import lie
 
 
 class BaselinePrior(PairTerm):
-    """`r = log(|t_ij| / length) / sigma`: the distance of two camera centres."""
+    """`r = log(|t_ij| / length) / sigma`: the distance of two camera centres.
+
+    Example: the first two cameras are 20 cm apart, to a per mille.
+        >>> one = jax.numpy.ones(1)
+        >>> vg.BaselinePrior(first=[0], second=[1], length=0.2 * one, sigma=1e-3 * one, weight=one).name
+        'baselines'
+
+    """
 
     length: Float[Array, " m"]
     """Metres, or the map's own unit."""

@@ -14,6 +14,11 @@ class DepthPrior(SlotTerm):
 
     The paper's raw difference (its equation 7) is `sigma = 1`; `sigma = sigma_rel * mean` makes it commensurable with
     pixels. Its weight is `alpha * weight`.
+
+    Example:
+        >>> problem.depth.mean.shape  # keyframes, slots
+        (4, 32)
+
     """
 
     mean: Float[Array, "n s"]

@@ -59,7 +59,18 @@ class LocalModel(NamedTuple):
 
 
 class EdgeTerm(AbstractTerm):
-    """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its host."""
+    """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its host.
+
+    Example: a landmark lies on a plane that is known in the target camera.
+        >>> class PointToPlane(vg.EdgeTerm):
+        ...     normal: jax.Array
+        ...     distance: jax.Array
+        ...     def residual(self, view):
+        ...         return self.normal @ view.point - self.distance
+        >>> PointToPlane.name
+        'point_to_plane'
+
+    """
 
     first_slot: int = eqx.field(static=True, kw_only=True, default=0)
     """Slot of the host that the first column is about."""
@@ -136,6 +147,15 @@ class ImageTerm(EdgeTerm):
 
     With the pinhole, its derivatives come from `fast/pinhole.py`, written by hand; with other cameras from automatic
     differentiation. The tests hold the two equal.
+
+    Example: only the column of a match is known.
+        >>> class Column(vg.ImageTerm):
+        ...     column: jax.Array
+        ...     def image_residual(self, u, v):
+        ...         return (u - self.column,)
+        >>> Column(column=jax.numpy.asarray(100.0)).image_residual(103.0, 7.0)[0].item()
+        3.0
+
     """
 
     @abc.abstractmethod

@@ -8,7 +8,13 @@ from vggtgeo.bundle.terms.node import CameraTerm
 
 
 class IntrinsicsPrior(CameraTerm):
-    """`r = k - mean` for each parameter, weight `1 / sigma^2`; without a robust kernel."""
+    """`r = k - mean` for each parameter, weight `1 / sigma^2`; without a robust kernel.
+
+    Example:
+        >>> problem.intrinsics_prior.mean.shape
+        (4,)
+
+    """
 
     index: Int[Array, " q"]
     """Which parameter each observation is about, from 0."""

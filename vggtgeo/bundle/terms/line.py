@@ -8,7 +8,13 @@ from vggtgeo.bundle.terms.edge import ImageTerm
 
 
 class LineTerm(ImageTerm):
-    """`r = a u' + b v' + c`, pixels, of the sample's projection (equation 6 of the paper)."""
+    """`r = a u' + b v' + c`, pixels, of the sample's projection (equation 6 of the paper).
+
+    Example:
+        >>> problem.lines.coefficients.shape  # edges, samples, (a, b, c)
+        (12, 12, 3)
+
+    """
 
     coefficients: Float[Array, "e l 3"]
     """`(a, b, c)` with `a^2 + b^2 = 1`, of the line in keyframe j."""

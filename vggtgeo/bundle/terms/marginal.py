@@ -16,6 +16,11 @@ class MarginalPrior(DenseTerm):
     """`r = root (x boxminus linearisation) + offset` over poses and camera parameters.
 
     Coordinates: six a keyframe (left tangent `log(T T_lin^-1)`, translation first), then the camera's.
+
+    Example:
+        >>> vg.no_prior(3).root.shape
+        (22, 22)
+
     """
 
     root: Float[Array, "c c"]

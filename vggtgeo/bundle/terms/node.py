@@ -20,7 +20,18 @@ _indices: Callable[[object], Array] = lambda given: jnp.asarray(given, jnp.int32
 
 
 class PoseTerm(AbstractTerm):
-    """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`."""
+    """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`.
+
+    Example: a position fix.
+        >>> class PositionFix(vg.PoseTerm):
+        ...     position: jax.Array
+        ...     def residual(self, pose, camera):
+        ...         return pose.inverse().translation() - self.position
+        >>> fix = PositionFix(keyframe=[1], position=jax.numpy.zeros((1, 3)), weight=jax.numpy.ones(1))
+        >>> [term.name for term in problem.with_term(fix).terms][-1]
+        'position_fix'
+
+    """
 
     keyframe: _Index = eqx.field(converter=_indices, kw_only=True)
     """Which pose each observation is about."""
@@ -50,7 +61,18 @@ class PoseTerm(AbstractTerm):
 
 
 class PairTerm(AbstractTerm):
-    """Observations of two poses: `weight` and data have the axis `[m]`."""
+    """Observations of two poses: `weight` and data have the axis `[m]`.
+
+    Example: what the wheels say of a motion.
+        >>> class Wheels(vg.PairTerm):
+        ...     step: jax.Array
+        ...     def residual(self, first, second):
+        ...         return (second @ first.inverse()).translation() - self.step
+        >>> wheels = Wheels(first=[0], second=[1], step=jax.numpy.zeros((1, 3)), weight=jax.numpy.ones(1))
+        >>> wheels.name, wheels.present().tolist()
+        ('wheels', [True])
+
+    """
 
     first: _Index = eqx.field(converter=_indices, kw_only=True)
     """Keyframe i of each observation."""
@@ -86,7 +108,17 @@ NodeTerm = PoseTerm | PairTerm
 
 
 class CameraTerm(AbstractTerm):
-    """Observations of the camera's parameters: `weight` and data have the axis `[m]`."""
+    """Observations of the camera's parameters: `weight` and data have the axis `[m]`.
+
+    Example: pixels are square.
+        >>> class SquarePixels(vg.CameraTerm):
+        ...     def residual(self, parameters):
+        ...         return parameters[0] - parameters[1]
+        >>> square = SquarePixels(weight=jax.numpy.ones(1))
+        >>> float(square.residual(jax.numpy.array([500.0, 498.0, 320.0, 240.0])))
+        2.0
+
+    """
 
     @abc.abstractmethod
     def residual(self, parameters: Float[Array, " q"]) -> Float[Array, "*m"]:
@@ -111,7 +143,13 @@ class CameraTerm(AbstractTerm):
 
 
 class DenseTerm(AbstractTerm):
-    """One observation of all poses and the camera together; it fills the matrix. `weight` is a scalar."""
+    """One observation of all poses and the camera together; it fills the matrix. `weight` is a scalar.
+
+    Example: the one of the package is the prior of marginalisation.
+        >>> isinstance(vg.no_prior(3), vg.DenseTerm)
+        True
+
+    """
 
     @abc.abstractmethod
     def residual(self, poses: jaxlie.SE3, parameters: Float[Array, " q"]) -> Float[Array, " m"]:

@@ -8,7 +8,13 @@ from vggtgeo.bundle.terms.edge import ImageTerm
 
 
 class PointTerm(ImageTerm):
-    """`r = pi(T_j T_i^-1 pi^-1(u_i, d_i)) - u_j`, pixels (equation 5 of the paper)."""
+    """`r = pi(T_j T_i^-1 pi^-1(u_i, d_i)) - u_j`, pixels (equation 5 of the paper).
+
+    Example:
+        >>> problem.points.target.shape  # edges, slots, (u, v)
+        (12, 20, 2)
+
+    """
 
     target: Float[Array, "e p 2"]
     """Matched pixel in keyframe j."""

@@ -15,6 +15,14 @@ class RelativePose(PairTerm):
 
     A quadratic `1/2 eta' H eta + g' eta` about a linearisation point `L` (normal equations of an alignment of surfaces)
     is the same term with `M = exp(-H^+ g) L`, see `quadratic`.
+
+    Example: camera 1 stands where camera 0 does, to 1 cm and 0.01 rad.
+        >>> import jax.numpy as jnp
+        >>> root = 100.0 * jnp.eye(6)[None]
+        >>> same = jnp.array([[1.0, 0, 0, 0, 0, 0, 0]])
+        >>> vg.RelativePose(first=[0], second=[1], measured=same, root=root, weight=jnp.ones(1)).name
+        'relative_poses'
+
     """
 
     measured: Float[Array, "m 7"]

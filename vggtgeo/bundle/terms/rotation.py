@@ -11,7 +11,15 @@ from vggtgeo.geometry.cameras import AbstractCamera
 
 
 class RotationPrior(PoseTerm):
-    """`r = root Log(R M^T)` with `root^T root` the information of the measured rotation `M`."""
+    """`r = root Log(R M^T)` with `root^T root` the information of the measured rotation `M`.
+
+    Example: the first camera stands upright, to a degree.
+        >>> import jax.numpy as jnp
+        >>> upright, root = jnp.array([[1.0, 0, 0, 0]]), 57.3 * jnp.eye(3)[None]
+        >>> vg.RotationPrior(keyframe=[0], measured=upright, root=root, weight=jnp.ones(1)).name
+        'rotations'
+
+    """
 
     measured: Float[Array, "m 4"]
     """`M`: world -> camera, unit quaternion `(w, x, y, z)`."""

@@ -14,7 +14,16 @@ Derivatives = tuple[Float[Array, "n s"], Float[Array, "n s"]]
 
 
 class SlotTerm(AbstractTerm):
-    """Observations of inverse depths: `weight` and data have the axes `[n, s]`, keyframe and slot."""
+    """Observations of inverse depths: `weight` and data have the axes `[n, s]`, keyframe and slot.
+
+    Example: no landmark is nearer than it should be.
+        >>> class NotNear(vg.SlotTerm):
+        ...     def residual(self, inverse_depth):
+        ...         return jax.numpy.maximum(inverse_depth - 2.0, 0.0)
+        >>> float(NotNear().residual(2.5))
+        0.5
+
+    """
 
     @abc.abstractmethod
     def residual(self, inverse_depth: Float[Array, ""]) -> Float[Array, "*m"]:

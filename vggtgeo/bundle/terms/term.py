@@ -24,7 +24,17 @@ Local = Callable[[Array], Array]
 
 
 def shared_field(**options: Any) -> Any:
-    """A field of a term that all its observations share (a scale, a calibration), not data with an axis of its own."""
+    """A field of a term that all its observations share (a scale, a calibration), not data with an axis of its own.
+
+    Example:
+        >>> class Height(vg.PoseTerm):
+        ...     floor: float = vg.shared_field(default=0.0)
+        ...     def residual(self, pose, camera):
+        ...         return pose.inverse().translation()[1] - self.floor
+        >>> Height(keyframe=[0]).data()
+        {}
+
+    """
     return eqx.field(metadata={"shared": True}, **options)
 
 
@@ -33,6 +43,12 @@ class AbstractTerm(eqx.Module):
 
     The fields that a subclass adds are data: every array in them has the axes of `weight` first. What all observations
     share is declared with `vggtgeo.shared_field()`.
+
+    Example: a term of a problem, without its first edge.
+        >>> term = problem.points
+        >>> term.reweighted(term.weight.at[0].set(0.0)).present()[0].any().item()
+        False
+
     """
 
     weight: Float[Array, "*observations"] = eqx.field(converter=jnp.asarray, kw_only=True, default=1.0)

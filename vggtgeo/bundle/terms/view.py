@@ -13,6 +13,13 @@ class View(eqx.Module):
     """A landmark of host camera i in target camera j.
 
     The landmark is carried scaled by its inverse depth, `R ray + d t`, which stays finite for points at infinity.
+
+    Example: a landmark seen by two cameras at one place.
+        >>> import jax.numpy as jnp, jaxlie
+        >>> camera = vg.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0]))
+        >>> vg.View(jaxlie.SE3.identity(), camera, jnp.array([100.0, 50.0]), jnp.asarray(0.5)).projected.tolist()
+        [100.0, 50.0]
+
     """
 
     relative: jaxlie.SE3
