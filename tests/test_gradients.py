@@ -46,6 +46,7 @@ LEAVES: dict[str, tuple[Callable[[Both], Any], float]] = {
     "measured pose": (lambda both: both[0].relative_poses.measured, 1e-6),
     "measured root": (lambda both: both[0].relative_poses.root, 1e-4),
     "measured weight": (lambda both: both[0].relative_poses.weight, 1e-4),
+    "measured kernel": (lambda both: both[0].relative_poses.kernel.delta, 1e-3),
     "held pose": (lambda both: both[1].poses.wxyz_xyz, 1e-6),
     "held intrinsics": (lambda both: both[1].intrinsics, 1e-3),
 }
@@ -119,8 +120,9 @@ def check_gradients(both: Both, value_and_gradient: Callable) -> None:
         along = jnp.asarray(direction(name, both))
         difference = finite_difference(lambda both: value_and_gradient(both)[0], name, both, along)
         found = float(jnp.sum(where(gradient) * along))
-        assert abs(difference) > 1e-7, name
-        assert abs(found - difference) < 1e-5 * abs(difference), (name, found, difference)
+        assert abs(difference) > 1e-9, name
+        # The loss is known to about 1e-14, so its differences over these steps to about 1e-10.
+        assert abs(found - difference) < 1e-5 * abs(difference) + 1e-10, (name, found, difference)
 
 
 @pytest.mark.parametrize("seed", [None, *range(RANDOM_PROBLEMS)])

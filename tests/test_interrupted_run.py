@@ -34,7 +34,7 @@ def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr("vggtgeo.cli.run_sequence.warm_up", lambda settings: ())
+    monkeypatch.setattr("vggtgeo.cli.run_sequence.warm_up", lambda settings, metric: ())
     monkeypatch.setattr("vggtgeo.slam.watching.WindowRecorder.warm_up", lambda self: None)
     monkeypatch.setattr("vggtgeo.cli.run_sequence.run_frames", interrupted)
     (tmp_path / "trajectory.txt").write_text("of an earlier run")

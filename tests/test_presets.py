@@ -28,6 +28,7 @@ from vggtgeo.simulation.sequence import SyntheticSequence, simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.run import frame_trajectory, run
 from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.trust.finding import Verdict
 
 RUN_AND_WRITE = "vggtgeo.cli.run_sequence"
 """The module from which the command takes `run_and_write`."""
@@ -137,7 +138,7 @@ def called(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
         sequence: object, roles: Roles, *_: object, facts: Callable[[], dict], **__: object
     ) -> SimpleNamespace:
         given.update(roles=roles, facts=facts())
-        return SimpleNamespace(interrupted=False)
+        return SimpleNamespace(interrupted=False, verdict=Verdict("good"))
 
     module = importlib.import_module(RUN_AND_WRITE)
     monkeypatch.setattr(module, "run_and_write", stand_in)
