@@ -145,7 +145,10 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
         return _gradient(shifted, shifted.hold(point), system)
 
     _, right_hand_side = jax.jvp(lambda moving: stationarity(moving, at), (moving,), (moved,))
-    flat, unflatten = ravel_pytree(right_hand_side)  # one leaf: JAX wants all to depend on what is differentiated
+    trusted = _trusted(left, options)
+    flat, unflatten = ravel_pytree(
+        _times(right_hand_side, trusted)
+    )  # one leaf: JAX wants all to depend on what is differentiated
 
     def operator(vector: Array) -> Array:
         along = _expanded(system, _free(unflatten(vector), system))
@@ -163,23 +166,30 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
 
     zero = jax.tree.map(jnp.zeros_like, solved)
     value, tangent = jax.jvp(found, (moving, zero), (moved, solved))
-    tangent = _judged(tangent, left, options)
-    return (value, told), (tangent, jax.tree.map(jnp.zeros_like, eqx.filter(told, eqx.is_inexact_array)))
-
-
-def _judged(tangent: Any, left: Float[Array, ""], options: ArrowAdjoint) -> Any:
-    """The derivative, or what `not_stationary` asks for where the point is not at rest."""
-    if options.not_stationary == "keep":
-        return tangent
-    rest = left <= STATIONARY
     if options.not_stationary == "error":
-        message = (
-            "The point is no optimum, so it has no derivative as one: the solve did not converge, and the polish did "
-            "not bring it to rest. Raise `max_iterations`, or differentiate the iterations with "
-            "`adjoint=optimistix.RecursiveCheckpointAdjoint()`."
-        )
-        return eqx.error_if(tangent, ~rest, message)
-    return jax.tree.map(lambda leaf: leaf * jnp.where(rest, 1.0, jnp.nan).astype(leaf.dtype), tangent)
+        value = eqx.error_if(value, left > STATIONARY, _NOT_STATIONARY)
+    return (value, told), (
+        _times(tangent, trusted),
+        jax.tree.map(jnp.zeros_like, eqx.filter(told, eqx.is_inexact_array)),
+    )
+
+
+_NOT_STATIONARY = (
+    "The point is no optimum, so it has no derivative as one: the solve did not converge, and the polish did not bring "
+    "it to rest. Raise `max_iterations`, or differentiate the iterations with "
+    "`adjoint=optimistix.RecursiveCheckpointAdjoint()`."
+)
+
+
+def _trusted(left: Float[Array, ""], options: ArrowAdjoint) -> Float[Array, ""]:
+    """1, or NaN where the point is not at rest and derivatives are to be NaN there."""
+    doubtful = (left > STATIONARY) & (options.not_stationary == "nan")
+    return jnp.where(doubtful, jnp.nan, 1.0)
+
+
+def _times(tree: Any, factor: Float[Array, ""]) -> Any:
+    """Before and after the linear solve, which lets no NaN through: so it reaches the result in both modes."""
+    return jax.tree.map(lambda leaf: leaf * factor.astype(leaf.dtype), tree)
 
 
 def _detached(tree: Any) -> Any:

@@ -74,8 +74,11 @@ def test_nothing_at_all(observed: Observe) -> None:
 
 
 def test_no_parallax(observed: Observe) -> None:
-    # Proves that under pure rotation every inverse depth is undetermined, and none in the well-posed problem.
-    turning = undetermined_landmarks(observed(*packed(pure_rotation(), at_truth=True)))
+    # Proves that under pure rotation every inverse depth is undetermined, which its short form says, and none in the
+    # well-posed problem.
+    found = observed(*packed(pure_rotation(), at_truth=True))
+    turning = undetermined_landmarks(found)
+    assert f"{turning[0]} of {turning[1]} inverse depths undetermined" in repr(found)
     assert turning == (KEYFRAMES * POINTS, KEYFRAMES * POINTS)
     lost, used = undetermined_landmarks(observed(*packed(WELL, at_truth=True)))
     assert (lost, used) == (0, WELL.observations.host.size)

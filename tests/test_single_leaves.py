@@ -122,7 +122,8 @@ def test_a_landmark_at_its_bound_is_held() -> None:
     moved = lambda e: run(eqx.tree_at(get, problem, get(problem) + e * along))[1]
     difference = float(moved(1e-4) - moved(-1e-4)) / 2e-4
     gradient = jax.jit(jax.grad(lambda target: run(eqx.tree_at(get, problem, target))[1]))(get(problem))
-    assert float(jnp.sum(gradient * along)) == pytest.approx(difference, rel=1e-5)
+    # The differences are of solves that no polish has followed: they know five digits.
+    assert float(jnp.sum(gradient * along)) == pytest.approx(difference, rel=1e-4)
 
 
 def test_the_solution_says_that_it_was_polished() -> None:

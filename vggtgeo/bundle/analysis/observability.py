@@ -118,7 +118,9 @@ class Observability(eqx.Module):
         except TypeError:  # inside `jit`, or of a batch
             return eqx.Module.__repr__(self)
         weak = "; ".join(known["weak"][:3]) + f" and {len(known['weak']) - 3} more" * (len(known["weak"]) > 3)
-        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak or 'none'})"
+        lost, used = known["inverse_depths_undetermined"], known["inverse_depths"]
+        depths = f", {lost} of {used} inverse depths undetermined" if lost else ""
+        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak or 'none'}{depths})"
 
 
 def observability(problem: Problem, state: State) -> Observability:
