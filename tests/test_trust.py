@@ -11,6 +11,7 @@ from recorded_run import recorded_run
 from scipy.spatial.transform import Rotation
 from witness import SIZE, K, Walk, walk, with_depth
 
+import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import LeftOutWarning
@@ -378,3 +379,15 @@ def test_spans_are_joined_across_short_gaps() -> None:
     assert spans(marked) == [(1, 2), (4, 4), (8, 8)]
     assert spans(marked, join=2) == [(1, 4), (8, 8)]
     assert spans(np.zeros(3, bool)) == []
+
+
+def test_a_lost_frame_keeps_its_place_in_the_claim() -> None:
+    # Proves that frames without a pose, which the trajectory leaves out, do not shift the others against their evidence,
+    # and that they are told. Oracle: the frames' numbers.
+    *_, slam = vg.run(vg.simulate("room", 3, size=(160, 120)))
+    middle = replace(slam.frames[1], tracked=False)
+    slam = replace(slam, frames=(slam.frames[0], middle, slam.frames[2]))
+    claim = Estimate.of(slam)
+    assert len(claim.times) == len(claim.poses) == len(claim.frames) == 3
+    assert len(vg.frame_trajectory(slam)) == 2
+    assert "lost" in str(vg.Result.of(slam).verdict)

@@ -114,15 +114,24 @@ def finish(
 def frame_trajectory(slam: Slam) -> Trajectory:
     """Camera -> world of every frame that has a pose.
 
-    A frame without one (lost, or before a start) is left out. A frame hangs on the keyframe it was tracked against.
-    What the adjustment then changed between that keyframe and the next is shared out over the frames in between, in
-    proportion to time, so that the path has no steps.
+    A frame without one (lost, or before a start) is left out.
 
     Example:
         >>> import vggtgeo as vg
         >>> vg.frame_trajectory(next(vg.run(vg.simulate("room", 3, size=(160, 120)))))
         Trajectory(1 pose, 0.00 s, path 0.00 m)
 
+    """
+    times, poses = frame_poses(slam)
+    tracked = np.array([record.tracked for record in slam.frames], bool)
+    return Trajectory(times[tracked], rigid.invert(poses[tracked]))
+
+
+def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
+    """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known.
+
+    A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and the
+    next is shared out over the frames in between, in proportion to time, so that the path has no steps.
     """
     poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
     times = np.array([record.timestamp for record in slam.frames])
@@ -137,8 +146,7 @@ def frame_trajectory(slam: Slam) -> Trajectory:
         for k in between:
             poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
         last = row
-    tracked = np.array([record.tracked for record in slam.frames], bool)
-    return Trajectory(times[tracked], rigid.invert(poses[tracked]))
+    return times, poses
 
 
 def keyframe_trajectory(slam: Slam) -> Trajectory:

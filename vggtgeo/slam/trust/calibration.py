@@ -47,8 +47,9 @@ CAMERA_STEPS = (1e-5, 1e-2, 1e-2, 1e-5)
 """Of the numerical derivatives."""
 SIGMAS = 5.0
 """How sure a deviation must be to be told."""
-MOST_MOVED = 5.0
-"""Standard deviations of its prior that a run may move the camera (healthy ones: at most 3.8) to count as settled."""
+MOST_MOVED = 0.05
+"""Of the focal length: how far a run may move the camera to count as settled. Healthy ones moved it by at most 3.8 %
+with a loose prior, and by less than 1 % with the one that holds it."""
 MOST_FOCAL = 0.08
 """Relative."""
 MOST_SHIFT = 0.05
@@ -99,7 +100,7 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
         return []
     found = []
     focal, x, y, radial = (float(value) for value in opinion.value)
-    moved = bool(np.any(np.abs(estimate.intrinsics - estimate.given) > MOST_MOVED * estimate.sigma))
+    moved = bool(np.any(np.abs(estimate.intrinsics - estimate.given) > MOST_MOVED * estimate.given[0]))
     sure = np.abs(opinion.value) > (0.8 if moved else 1.0) * SIGMAS * opinion.sigma
     much = 0.5 if moved else 1.0
     if sure[0] and abs(focal) > much * MOST_FOCAL:

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.run import frame_trajectory
+from vggtgeo.slam.run import frame_poses
 from vggtgeo.slam.state import Slam
 
 GUESSED = 0.1
@@ -41,12 +41,12 @@ class Estimate:
     @classmethod
     def of(cls, slam: Slam) -> Self:
         """The claim of a state."""
-        trajectory = frame_trajectory(slam)
+        times, poses = frame_poses(slam)
         known = any(np.isfinite(keyframe.points.inverse_depth).any() for keyframe in slam.keyframes)
         return cls(
             np.array([record.frame for record in slam.frames], int),
-            trajectory.timestamps,
-            rigid.invert(trajectory.poses),
+            times,
+            poses,
             np.array([record.tracked for record in slam.frames], bool),
             np.asarray(slam.intrinsics, np.float64),
             np.asarray(slam.given_intrinsics, np.float64),
