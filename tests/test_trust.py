@@ -382,7 +382,7 @@ def test_spans_are_joined_across_short_gaps() -> None:
 
 
 def test_a_lost_frame_keeps_its_place_in_the_claim() -> None:
-    # Proves that frames without a pose, which the trajectory leaves out, do not shift the others against their evidence,
+    # Proves that frames without a pose, which the trajectory leaves out, do not shift the others in the verdict,
     # and that they are told. Oracle: the frames' numbers.
     *_, slam = vg.run(vg.simulate("room", 3, size=(160, 120)))
     middle = replace(slam.frames[1], tracked=False)
