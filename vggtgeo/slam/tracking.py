@@ -23,8 +23,8 @@ from vggtgeo.slam.settings import Roles
 PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
 SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
-"""What no number of samples removes (calibration, rolling shutter, clocks): metres, radians, share of the motion. Chosen,
-because the information of the samples alone is about 30 times too large on pairs of real frames; to be calibrated."""
+"""What no number of samples removes (calibration, rolling shutter, clocks): metres, radians, share of the motion.
+Chosen, because the information of the samples alone is about 30 times too large on pairs of real frames."""
 AGREEMENT_GATE = float(chi_square.ppf(0.9999, 6))
 """Of the squared Mahalanobis distance between the poses by points and by the picture, below which they are averaged."""
 LARGEST_DISAGREEMENT = 0.15
