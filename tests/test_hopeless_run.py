@@ -19,7 +19,7 @@ def test_a_run_that_never_begins_says_so(tmp_path: Path, monkeypatch: pytest.Mon
     """Pictures without parallax give identity poses, which nobody may take for a result: code 3, last line, summary and
     page; oracle: no motion can be had from such pictures.
     """
-    monkeypatch.setattr("vggtgeo.cli.run_sequence.warm_up", lambda settings: ())
+    monkeypatch.setattr("vggtgeo.cli.run_sequence.warm_up", lambda settings, metric: ())
     monkeypatch.setattr("vggtgeo.slam.watching.WindowRecorder.warm_up", lambda self: None)
     rng = np.random.default_rng(0)
     for row in range(6):
@@ -37,5 +37,6 @@ def test_a_run_that_never_begins_says_so(tmp_path: Path, monkeypatch: pytest.Mon
     assert summary["verdict"]["level"] == "failed"
     assert "no map was ever started" in summary["verdict"]["reasons"][0]
     assert "Failed: this result is not to be used." in (out / "report.html").read_text()
-    assert len((out / "trajectory.txt").read_text().splitlines()) == 7
+    # A frame without a pose is left out: the first alone is where the world begins.
+    assert len((out / "trajectory.txt").read_text().splitlines()) == 2
     assert Result.load(out).verdict.level == "failed"
