@@ -29,7 +29,7 @@ from vggtgeo.solvers.arrow import (
     to_relative,
 )
 from vggtgeo.solvers.band_cholesky import Bands, factorise_bands, prepare_bands
-from vggtgeo.solvers.block_band import from_band, solve_band, to_band
+from vggtgeo.solvers.block_band import band_layout, solve_band
 from vggtgeo.solvers.block_jacobi import JacobiBlocks, apply_blocks, invert_blocks, prepare_blocks
 from vggtgeo.solvers.flat_directions import flat_stiffness, free_gauge
 from vggtgeo.solvers.reduced import MIN_DIAGONAL, AbstractReducedSolver, predicted_decrease
@@ -100,13 +100,14 @@ class BandPreconditioner(AbstractPreconditioner[Bands]):
     reach: int = eqx.field(static=True)
 
     def prepare(self, system: ArrowSystem) -> Bands:
-        return prepare_bands(system, self.reach)
+        return prepare_bands(system, band_layout(system, self.reach, None))
 
     def inverse(self, system: ArrowSystem, prepared: Bands, damping: Float[Array, ""]) -> Apply:
-        factor = factorise_bands(system, prepared, damping)
+        factor, layout = factorise_bands(system, prepared, damping), prepared.layout
 
         def apply(residual: Array) -> Array:
-            return from_band(solve_band(factor, to_band(prepared.hessian, residual[:, None])), len(residual))[:, 0]
+            columns = layout.columns(residual[:, None], len(prepared.hessian.corner))
+            return layout.flat(solve_band(factor, columns))[:, 0]
 
         return apply
 

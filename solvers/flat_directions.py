@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -37,3 +39,31 @@ def pins(system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Arr
     at = jnp.argmax(jnp.abs(free_gauge(system)), axis=0)
     pinned = jnp.zeros_like(system.gauge).at[at, jnp.arange(len(at))].set(1.0)
     return pinned * jnp.where(stiffness > 0, diagonal[at], 0.0)
+
+
+def pinned_update(
+    system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Array, " c"]
+) -> tuple[Float[Array, "c 2g"], Float[Array, " 2g"]]:
+    """`U, D` with `B + U D U'` the matrix that the gauge's own stiffness holds, where `B` is the pinned one:
+    `U = [G, P]` and `D = diag(K, -stiffness of pins)`.
+    """
+    pinned = pins(system, stiffness, diagonal)
+    updates = jnp.concatenate([free_gauge(system), (pinned != 0).astype(pinned.dtype)], 1)
+    return updates, jnp.concatenate([stiffness, -pinned.sum(0)])
+
+
+def solve_pinned(
+    system: ArrowSystem,
+    stiffness: Float[Array, " g"],
+    diagonal: Float[Array, " c"],
+    inverse: Callable[[Array], Array],
+    rhs: Float[Array, " c"],
+) -> Float[Array, " c"]:
+    """Solve with the flat directions held as `DenseCholesky` holds them, given `inverse` of the pinned matrix, which
+    takes columns `[c, m]` (the identity of Woodbury).
+    """
+    updates, weights = pinned_update(system, stiffness, diagonal)
+    solved = inverse(jnp.concatenate([rhs[:, None], updates], 1))
+    first, others = solved[:, 0], solved[:, 1:]
+    small = jnp.eye(len(weights), dtype=rhs.dtype) + weights[:, None] * (updates.T @ others)
+    return first - others @ jnp.linalg.solve(small, weights * (updates.T @ first))
