@@ -2,72 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
-from vggtgeo.solvers.arrow import (
-    ArrowSystem,
-    ArrowVector,
-    back_substitute,
-    carry_to_nodes,
-    dense_gradient,
-    inverse_landmark_hessian,
-)
-from vggtgeo.solvers.block_band import (
-    BandFactor,
-    BandLayout,
-    BandMatrix,
-    add_to_diagonal,
-    assemble_bands,
-    band_layout,
-    factorise,
-    solve_band,
-)
-from vggtgeo.solvers.flat_directions import flat_stiffness, pins, solve_pinned
-from vggtgeo.solvers.reduced import MIN_DIAGONAL, AbstractReducedSolver, predicted_decrease
-
-
-class Bands(eqx.Module):
-    """What the band solvers prepare once a linearisation."""
-
-    layout: BandLayout
-    hessian: BandMatrix
-    schur: BandMatrix
-    gradient: Float[Array, " c"]
-    schur_gradient: Float[Array, " c"]
-    diagonal: Float[Array, " c"]
-    stiffness: Float[Array, " g"]
-
-
-def prepare_bands(system: ArrowSystem, layout: BandLayout) -> Bands:
-    """Both matrices as far as the edges go that the layout holds, and the right-hand side."""
-    hessian, schur = assemble_bands(system, layout)
-    gradient, diagonal = dense_gradient(system)
-    schur_gradient = carry_to_nodes(system, inverse_landmark_hessian(system) * system.landmark_gradient)
-    diagonal = jnp.maximum(diagonal, MIN_DIAGONAL)
-    return Bands(layout, hessian, schur, gradient, schur_gradient, diagonal, flat_stiffness(system))
-
-
-def damped_band(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandMatrix:
-    """The damped Schur complement, flat directions pinned."""
-    shrink, shared = 1 / (1 + damping), len(bands.hessian.corner)
-    matrix: BandMatrix = jax.tree.map(lambda whole, taken: whole - shrink * taken, bands.hessian, bands.schur)
-    added = damping * bands.diagonal + pins(system, bands.stiffness, bands.diagonal).sum(1)
-    return add_to_diagonal(matrix, bands.layout.columns(added[:, None], shared))
-
-
-def factorise_bands(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandFactor:
-    """Factor of `damped_band` over the free coordinates."""
-    moves = bands.layout.columns(system.free[:, None], len(bands.hessian.corner))
-    return factorise(damped_band(system, bands, damping), moves)
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, back_substitute
+from vggtgeo.solvers.band_inverse import BandElimination, band_elimination, band_inverse
+from vggtgeo.solvers.bands import Bands, factorise_bands, prepare_bands
+from vggtgeo.solvers.block_band import band_layout, solve_band
+from vggtgeo.solvers.flat_directions import pinned_update, solve_pinned
+from vggtgeo.solvers.local_inverse import LocalInverse
+from vggtgeo.solvers.reduced import AbstractReducedSolver, predicted_decrease
 
 
 class BandCholesky(AbstractReducedSolver[Bands]):
     """Exact where every edge joins nodes at most `reach` places apart; cost linear in their number.
 
-    Longer edges enter as if their far end were held: the step is then a descent direction, not the
-    exact one. Use `ConjugateGradients(BandPreconditioner(reach))` for them.
+    Longer edges enter as if their far end were held: the step is then a descent direction, not the exact one. Use
+    `ConjugateGradients(BandPreconditioner(reach))` for them.
     """
 
     reach: int = eqx.field(static=True)
@@ -94,6 +47,12 @@ class BandCholesky(AbstractReducedSolver[Bands]):
         rhs = jnp.where(system.free, shrink * prepared.schur_gradient - prepared.gradient, 0.0)
         factor, shared = factorise_bands(system, prepared, damping), len(prepared.hessian.corner)
         inverse = lambda columns: prepared.layout.flat(solve_band(factor, prepared.layout.columns(columns, shared)))
-        dense = solve_pinned(system, prepared.stiffness, prepared.diagonal, inverse, rhs)
+        dense = solve_pinned(*pinned_update(system, prepared.stiffness, prepared.diagonal), inverse, rhs)
         step = ArrowVector(dense, shrink * back_substitute(system, dense))
         return step, predicted_decrease(system, prepared.gradient, prepared.diagonal, step, damping)
+
+    def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> BandElimination:
+        return band_elimination(system, self.prepare(system))
+
+    def inverse(self, system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
+        return band_inverse(system, self.prepare(system), hosts)

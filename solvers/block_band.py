@@ -3,8 +3,8 @@
 Nodes in the order of a sequence see their near neighbours only: an edge of reach `r = |i - j|` and the elimination of
 the landmarks couple nodes at most `2 r` apart. A closed loop is a sequence too, once it is folded: in the order
 `0, n - 1, 1, n - 2, ...` no edge reaches more than twice as far. Groups of `2 r` nodes (`w` coordinates) make the
-
 matrix block tridiagonal, with the few shared coordinates as a border:
+
     M = [ T   F ]     T_kk = L_k L_k' + Y_{k-1} Y_{k-1}',     Y_k = T_{k+1,k} L_k^-T,
         [ F'  K ]     Z_k = L_k^-1 (F_k - Y_{k-1} Z_{k-1}),   K - Z' Z = C C'.
 
@@ -69,12 +69,29 @@ class BandLayout(AbstractLayout):
         nodes = jnp.pad(nodes, ((0, groups * self.group - self.nodes), (0, 0), (0, 0)))
         return nodes.reshape(groups, -1, nodes.shape[-1])
 
+    def gather(
+        self, stored: Float[Array, "k 2 w w"], row: Int[Array, "*t"], column: Int[Array, "*t"]
+    ) -> Float[Array, "*t b b"]:
+        """Blocks of a symmetric matrix whose lower half is stored as `add` stores it; zero outside the band."""
+        row, column = self._placed(row), self._placed(column)
+        below = row // self.group - column // self.group
+        above = below < 0
+        first, second = jnp.where(above, column, row), jnp.where(above, row, column)
+        blocks = stored.reshape(*stored.shape[:2], *(self.group, stored.shape[-1] // self.group) * 2)
+        at = second // self.group, jnp.minimum(jnp.abs(below), 1)
+        found = blocks[*at, first % self.group, :, second % self.group, :]
+        found = jnp.where(above[..., None, None], jnp.swapaxes(found, -1, -2), found)
+        return jnp.where((jnp.abs(below) <= 1)[..., None, None], found, 0.0)
+
     def flat(self, vector: BandVector) -> Float[Array, "c o"]:
         """The inverse of `columns`."""
-        width = vector.nodes.shape[1] // self.group
-        nodes = vector.nodes.reshape(-1, width, vector.nodes.shape[-1])
-        nodes = nodes[: self.nodes] if self.place is None else nodes[self.place]
-        return jnp.concatenate([nodes.reshape(self.nodes * width, -1), vector.shared])
+        nodes = self.nodes_of(vector.nodes)
+        return jnp.concatenate([nodes.reshape(-1, nodes.shape[-1]), vector.shared])
+
+    def nodes_of(self, rows: Shaped[Array, "k w o"]) -> Shaped[Array, "n b o"]:
+        """The inverse of `rows`."""
+        nodes = rows.reshape(-1, rows.shape[1] // self.group, rows.shape[-1])
+        return nodes[: self.nodes] if self.place is None else nodes[self.place]
 
     def near(self, system: ArrowSystem, reach: int) -> Bool[Array, " e"]:
         """Edges whose ends are at most so many places apart."""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.bundle.packing import Observations
 from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment, quadratic
-from vggtgeo.simulation.small_window import INTRINSICS, SIZE, SimulatedWindow, project_between
+from vggtgeo.simulation.small_window import SIZE, SimulatedWindow, project_between
 
 _SPACING = 0.15
 """Metres between keyframes."""
