@@ -32,11 +32,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
+from vggtgeo.solvers.reduced import AbstractReducedSolver
 
 import vggtgeo as vg
 from vggtgeo.simulation.loop import simulate_loop
-from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
-from vggtgeo.solvers.reduced import AbstractReducedSolver
 
 SOLVERS: dict[str, Callable[[vg.Problem], AbstractReducedSolver]] = {
     "chosen": vg.choose_reduced_solver,

@@ -147,10 +147,10 @@ def covariances(
         True
 
     """
-    ready = prepared(problem)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
     asked = jnp.arange(problem.num_keyframes) if keyframes is None else jnp.asarray(keyframes)
     _check_size(solver, problem.num_keyframes, len(asked))
+    ready = prepared(problem)
     found = covariance(linearise(ready, state), solver, asked)
     return Covariances(
         poses=found.nodes,
