@@ -60,7 +60,7 @@ def pins(system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Arr
 
 def pinned_update(
     system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Array, " c"]
-) -> tuple[Float[Array, "c 2g"], Float[Array, " 2g"]]:
+) -> tuple[Float[Array, "c u"], Float[Array, " u"]]:
     """`U, D` with `B + U D U'` the matrix that the gauge's own stiffness holds, where `B` is the pinned one:
     `U = [G, P]` and `D = diag(K, -stiffness of pins)`.
     """
