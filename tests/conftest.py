@@ -25,6 +25,24 @@ jax.config.update("jax_enable_x64", True)  # oracles need it; a test of float32 
 install_import_hook("vggtgeo", "typechecker.check")
 
 
+LONGEST = (
+    "test_pipeline",
+    "test_gradients",
+    "test_notebooks",
+    "test_tracking",
+    "test_user_terms",
+    "test_optimised",
+)
+"""Files of more than 30 s: they begin, so that no worker waits long for another's last file (`make test` keeps this
+order by `--no-loadscope-reorder`; pytest-xdist would begin with the files of most tests)."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first."""
+    rank = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
+
+
 _MOST_MAPPINGS = 30_000
 """Half of what Linux allows a process by default (`vm.max_map_count`). Each compiled function holds some, and XLA ends
 with a segmentation fault where there are no more."""
