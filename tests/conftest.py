@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -24,7 +25,6 @@ jax.config.update("jax_enable_x64", True)  # oracles need it; a test of float32 
 # From here on every annotated function of the package checks its arguments and results; see typechecker.py.
 install_import_hook("vggtgeo", "typechecker.check")
 
-
 LONGEST = (
     "test_pipeline",
     "test_gradients",
@@ -46,6 +46,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 _MOST_MAPPINGS = 30_000
 """Half of what Linux allows a process by default (`vm.max_map_count`). Each compiled function holds some, and XLA ends
 with a segmentation fault where there are no more."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _worlds_are_built_once() -> None:
+    """Keep each synthetic world of a seed: one takes some seconds to build, and nothing ever changes it."""
+    from vggtgeo.simulation import WORLDS  # after the hook above
+
+    WORLDS.update({name: (cache(build), walk) for name, (build, walk) in WORLDS.items()})
 
 
 @pytest.fixture(scope="module", autouse=True)
