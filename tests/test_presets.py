@@ -5,10 +5,8 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,13 +20,12 @@ from vggtgeo.models.roles import PoseQuery
 from vggtgeo.models.window_locator import WindowLocator
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.cli.presets import NEEDED, perception
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.simulation.sequence import SyntheticSequence, simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.slam.presets import NEEDED, Perception, perception
 from vggtgeo.slam.run import frame_trajectory, run
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.trust.finding import Verdict
 
 RUN_AND_WRITE = "vggtgeo.cli.run_sequence"
 """The module from which the command takes `run_and_write`."""
@@ -134,11 +131,8 @@ def called(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     """What `vggtgeo run` would do: the run itself is left out."""
     given: dict[str, object] = {}
 
-    def stand_in(
-        sequence: object, roles: Roles, *_: object, facts: Callable[[], dict], **__: object
-    ) -> SimpleNamespace:
-        given.update(roles=roles, facts=facts())
-        return SimpleNamespace(interrupted=False, verdict=Verdict("good"))
+    def stand_in(sequence: object, perceived: Perception, *_: object, **__: object) -> None:
+        given.update(roles=perceived.roles, facts=perceived.facts())
 
     module = importlib.import_module(RUN_AND_WRITE)
     monkeypatch.setattr(module, "run_and_write", stand_in)
@@ -209,7 +203,7 @@ def test_missing_and_wrong_files_end_the_run_before_any_frame(
         (folder / f"{name}.onnx").rename(tmp_path / f"{name}.onnx")
     result = _run(tmp_path, "--preset", "paper", "--models", folder)
     assert result.exit_code == 2
-    assert "`--preset paper` needs vggt.onnx, moge2.onnx in" in result.output
+    assert "`preset` 'paper' needs vggt.onnx, moge2.onnx in" in result.output
     for name in ("vggt", "moge2"):
         (tmp_path / f"{name}.onnx").rename(folder / f"{name}.onnx")
     result = _run(tmp_path, "--preset", "paper", "--models", folder)
@@ -233,7 +227,7 @@ def test_missing_and_wrong_files_end_the_run_before_any_frame(
 
 def test_an_unknown_preset_is_refused() -> None:
     # Proves that the name is checked where it is used.
-    with pytest.raises(InputError, match="`--preset` is 'large'; it must be one of classical, light, paper"):
+    with pytest.raises(InputError, match="`preset` is 'large'; it must be one of classical, light, paper"):
         perception("large", Roles())
 
 

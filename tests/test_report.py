@@ -19,7 +19,7 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.report import map_view, write_page
-from vggtgeo.slam.outputs import write_summary
+from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
@@ -56,7 +56,7 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
     verdict = options.setdefault("verdict", Verdict("good"))
     settings, seconds = {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}
-    summary = write_summary(folder, slam, settings, seconds, report, verdict, **facts)
+    summary = summarise(slam, verdict, settings=settings, seconds=seconds, report=report, **facts)
     given = {"title": "a <room>", "truth": truth, "cloud": run.cloud, "records": run.recorder.records}
     write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
     return (folder / "report.html").read_text()

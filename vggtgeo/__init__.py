@@ -70,9 +70,12 @@ if TYPE_CHECKING:
     from vggtgeo.results import Result as Result
     from vggtgeo.results import evaluate as evaluate
     from vggtgeo.results import read as read
+    from vggtgeo.results.reconstruction import reconstruct as reconstruct
     from vggtgeo.simulation import SimulatedWindow as SimulatedWindow
     from vggtgeo.simulation import simulate as simulate
     from vggtgeo.simulation import simulate_window as simulate_window
+    from vggtgeo.slam.callback import Callback as Callback
+    from vggtgeo.slam.presets import perception as perception
     from vggtgeo.slam.run import finish as finish
     from vggtgeo.slam.run import frame_trajectory as frame_trajectory
     from vggtgeo.slam.run import run as run
@@ -119,7 +122,10 @@ _HOME = {
     "bundle.problem_file": ("load_problem",),
     "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),
     "results": ("Result", "evaluate", "read"),
+    "results.reconstruction": ("reconstruct",),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
+    "slam.callback": ("Callback",),
+    "slam.presets": ("perception",),
     "slam.run": ("finish", "frame_trajectory", "run"),
     "slam.settings": ("Roles", "SlamSettings"),
     "slam.trust.evidence": ("EvidenceRecorder",),

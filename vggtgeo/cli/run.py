@@ -5,7 +5,6 @@ What is heavy is imported when a run begins, so that `vggtgeo run --help` answer
 
 from __future__ import annotations
 
-import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -13,14 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, JsonOption, QuietOption, RerunOption
+from vggtgeo.cli.options import JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
-from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.io.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
-    from vggtgeo.cli.presets import Perception
     from vggtgeo.datasets import Sequence
+    from vggtgeo.slam.presets import Perception
     from vggtgeo.slam.settings import Roles
 
 Init = Literal["pnp", "constant-velocity"]
@@ -84,55 +82,45 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
-    import cv2
-
-    from vggtgeo.cli.network_errors import as_input_errors
-    from vggtgeo.cli.run_sequence import collected_warnings, run_and_write
-    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
+    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.io.warned import collected_warnings
     from vggtgeo.slam.settings import SlamSettings
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
-    cv2.setRNGSeed(seed)
+    if preset == "paper" and features != "sift":
+        raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
+    if memory_limit_gb is not None and not memory_limit_gb > 0:
+        raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be positive")
     with collected_warnings() as warned:
-        sequence = open_sequence(path, kind)
-    if intrinsics is not None:
-        sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
-    if rgb_only:
-        sequence = without_depth(sequence)
+        sequence = open_input(path, kind, intrinsics, rgb_only)
     slam_settings = SlamSettings(
         use_lines=lines,
         use_confidence=confidence,
         depth_weight=SlamSettings.depth_weight if depth_prior else 0.0,
         global_adjustment=global_adjustment,
     )
-    if preset == "paper" and features != "sift":
-        raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
-    if memory_limit_gb is not None and not memory_limit_gb > 0:
-        raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be positive")
     perceived = make_perception(preset, make_roles(sequence, init, features), models, cache, provider, memory_limit_gb)
-    with as_input_errors():
-        finished = run_and_write(
-            sequence,
-            perceived.roles,
-            slam_settings,
-            output,
-            settings.values() if settings else {},
-            (start, end, stride),
-            save_depth=save_depth,
-            rerun=rerun,
-            quiet=quiet or as_json,
-            facts=perceived.facts,
-            warned=warned,
-        )
-    if as_json:
-        typer.echo(json.dumps(json.loads((output / "summary.json").read_text())))
-    if rerun == "serve":
-        serve_until_interrupted(finished.url, quiet or as_json)
-    if finished.interrupted:
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if finished.verdict.level == "failed":
-        raise typer.Exit(EXIT_FAILED)
+    flags = settings.values() if settings else {}
+    run_and_write(
+        sequence,
+        perceived,
+        slam_settings,
+        Output(output, flags, rerun, save_depth, quiet, as_json),
+        (start, end, stride),
+        seed=seed,
+        warned=warned,
+    )
+
+
+def open_input(path: Path, kind: str | None, intrinsics: str | None, rgb_only: bool) -> Sequence:
+    """The sequence at `path`, with what the flags say otherwise."""
+    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
+
+    sequence = open_sequence(path, kind)
+    if intrinsics is not None:
+        sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
+    return without_depth(sequence) if rgb_only else sequence
 
 
 def make_perception(
@@ -144,7 +132,7 @@ def make_perception(
     memory_limit_gb: float | None,
 ) -> Perception:
     """The roles of a preset; warns of networks whose weights are random."""
-    from vggtgeo.cli.presets import perception
+    from vggtgeo.slam.presets import perception
 
     perceived = perception(preset, classical, models, cache, provider, memory_limit_gb)
     if perceived.random:

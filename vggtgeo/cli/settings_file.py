@@ -61,15 +61,6 @@ SettingsOption = Annotated[
 that is no flag of the command, and for a value of a wrong type."""
 
 
-def write_settings(path: Path, values: dict[str, Any]) -> None:
-    """Writes a settings file that gives `values` again, atomically; what is None is left out, as TOML has no null."""
-    import tomli_w
-
-    from vggtgeo.io.files import write_text
-
-    write_text(path, tomli_w.dumps({key: value for key, value in values.items() if value is not None}))
-
-
 def _read(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))

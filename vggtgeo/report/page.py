@@ -20,7 +20,7 @@ from vggtgeo.slam.keyframe_depth import optimised_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
-from vggtgeo.slam.watching import WindowRecord
+from vggtgeo.slam.window_recorder import WindowRecord
 
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""
@@ -125,8 +125,9 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
     facts = [
         Fact(f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
         Fact(f"{summary['keyframes']}", "keyframes"),
-        Fact(f"{summary['frames_per_second']:.1f}", "frames a second"),
     ]
+    if "frames_per_second" in summary:
+        facts.append(Fact(f"{summary['frames_per_second']:.1f}", "frames a second"))
     if summary["scale"] == "metric":
         facts.append(Fact(f"{trajectory.length:.2f} m", "length of the path"))
     if "truth" in summary:
