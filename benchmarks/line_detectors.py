@@ -29,7 +29,7 @@ from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.results.reconstruction import reconstruct
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings import LineSettings, Roles, SlamSettings
 
 DRAWN = 4
 """Frames of which a picture is made, spread over the sequence."""
@@ -56,7 +56,7 @@ def main() -> None:
 def line(name: str, detector: LineDetector | None, data: Path, folder: Path, end: int | None) -> str:
     """One run, as a line of the table."""
     roles = Roles() if detector is None else replace(Roles(), lines=detector)
-    settings = SlamSettings(use_lines=detector is not None)
+    settings = SlamSettings(lines=LineSettings(use_lines=detector is not None))
     result = reconstruct(data, roles, settings, end=end)
     result.save(folder, settings={"lines": name})
     slam, truth = result.record.slam, result.summary["truth"]

@@ -13,13 +13,16 @@ from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings import RefinementSettings, Roles, SlamSettings, WindowSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
 
 FRAMES = 9
 # The shape of tests/test_pipeline.py, so that a process that runs both compiles the solver once.
-SETTINGS = SlamSettings(window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False)
+SETTINGS = SlamSettings(
+    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    refinement=RefinementSettings(global_adjustment=False),
+)
 ROLES = Roles(points=SiftMatcher(count=500))
 
 

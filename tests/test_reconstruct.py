@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded_run import SETTINGS
 from typer.testing import CliRunner
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
 from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.slam.settings_table import changed
 
-FRAMES = 3
+FRAMES = 5
+TABLES = changed(SETTINGS)
 DATA = ("keyframes.txt", "map.ply", "trajectory.txt")
 
 
@@ -58,25 +62,35 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated TUM folder."""
     place = tmp_path_factory.mktemp("data") / "room"
-    for _ in write_tum_folder(vg.simulate("room", FRAMES, 0, (160, 120)), place):
+    for _ in write_tum_folder(vg.simulate("room", FRAMES, 0, (160, 120), rate=10.0), place):
         pass
     return place
 
 
 def test_the_notebook_and_the_command_line_write_the_same_folder(folder: Path, tmp_path: Path) -> None:
     """The same names, the same bytes of the data files, the same summary but for times and flags; oracle: the folder of
-    `vggtgeo run` on the same frames.
+    `vggtgeo run` on the same frames with the same settings.
     """
     program, notebook = tmp_path / "program", tmp_path / "notebook"
-    done = CliRunner().invoke(make_app(), ["run", str(folder), "-o", str(program), "--save-depth", "--quiet"])
+    assignments = [
+        f"--set={group}.{name}={json.dumps(value)}"
+        for group, values in TABLES.items()
+        for name, value in values.items()
+    ]
+    arguments = ["run", str(folder), "-o", str(program), "--save-depth", "--quiet", *assignments]
+    done = CliRunner().invoke(make_app(), arguments)
     assert done.exit_code == 0, done.output
-    result = vg.reconstruct(folder)
+    result = vg.reconstruct(folder, settings=SETTINGS)
+    assert len(result.keyframes) > 1
     result.save(notebook, depth=True)
     names = [sorted(str(file.relative_to(place)) for file in place.rglob("*")) for place in (program, notebook)]
     assert names[0] == names[1]
     assert {"report.html", "settings.toml", "summary.json", "trajectory.png", *DATA} < set(names[0])
     for name in (*DATA, *(name for name in names[0] if name.endswith(".png") and name.startswith("depth/"))):
         assert (program / name).read_bytes() == (notebook / name).read_bytes(), name
+    for place in (program, notebook):
+        written = tomllib.loads((place / "settings.toml").read_text())
+        assert {group: written[group] for group in TABLES} == TABLES
     first, second = (json.loads((place / "summary.json").read_text()) for place in (program, notebook))
     assert first.keys() == second.keys()
     for changing in ("settings", "seconds_by_stage", "frames_per_second", "peak_memory_gb"):

@@ -75,7 +75,7 @@ def test_every_adjustment_is_recorded_once(run: RecordedRun) -> None:
         assert 0 < record.points < 3.0
         assert record.counts[0] > 50
         assert record.energy[1] <= record.energy[0]
-        assert 1 <= record.iterations <= SETTINGS.window_iterations
+        assert 1 <= record.iterations <= SETTINGS.window.window_iterations
 
 
 class _Checker(HTMLParser):

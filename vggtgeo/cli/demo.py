@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.options import JsonOption, QuietOption, RerunOption
+from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 
 
@@ -17,14 +17,16 @@ def demo(
     scene: Annotated[str, typer.Option(help="Synthetic scene: office, hall, corridor, staircase, room.")] = "office",
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of the scene and its noise.")] = 0,
+    assignments: AssignmentsOption = None,
     rerun: RerunOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run in a synthetic office with exact truth, rendered on the spot."""
+    from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.simulation import simulate
-    from vggtgeo.slam.settings import Roles, SlamSettings
+    from vggtgeo.slam.settings import Roles
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
@@ -34,7 +36,7 @@ def demo(
     run_and_write(
         sequence,
         Roles(),
-        SlamSettings(),
+        pipeline_settings(settings, assignments or (), {}),
         Output(output, settings.values() if settings else {}, rerun, quiet=quiet, as_json=as_json),
         title=f"simulated {scene}",
         facts={"simulated": True},

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.options import JsonOption, QuietOption, RerunOption
+from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -76,15 +76,17 @@ def run(
     save_depth: Annotated[
         bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
     ] = False,
+    assignments: AssignmentsOption = None,
     rerun: RerunOption = None,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
+    from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
-    from vggtgeo.slam.settings import SlamSettings
+    from vggtgeo.slam.settings import DepthSettings
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
@@ -94,12 +96,13 @@ def run(
         raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be positive")
     with collected_warnings() as warned:
         sequence = open_input(path, kind, intrinsics, rgb_only)
-    slam_settings = SlamSettings(
-        use_lines=lines,
-        use_confidence=confidence,
-        depth_weight=SlamSettings.depth_weight if depth_prior else 0.0,
-        global_adjustment=global_adjustment,
-    )
+    switches = {
+        "lines": {"lines": {"use_lines": lines}},
+        "confidence": {"confidence": {"use_confidence": confidence}},
+        "depth_prior": {"depth": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},
+        "global_adjustment": {"refinement": {"global_adjustment": global_adjustment}},
+    }
+    slam_settings = pipeline_settings(settings, assignments or (), switches)
     perceived = make_perception(preset, make_roles(sequence, init, features), models, cache, provider, memory_limit_gb)
     flags = settings.values() if settings else {}
     run_and_write(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
 from vggtgeo.viewing.target import STAND_IN, open_target
@@ -65,7 +66,7 @@ def run_and_write(
     console = Console(stderr=False, quiet=silent)
     callbacks, url = _rerun_callbacks(output, title or sequence.name)
     if callbacks:
-        settings = replace(settings, record_iterations=True)
+        settings = updated(settings, {"window": {"record_iterations": True}})
     start, end, stride = selection
     with as_input_errors(), ProgressBar(console) as bar:
         result = reconstruct(

@@ -5,20 +5,15 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
-
-import equinox as eqx
-import jax
-import numpy as np
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 from vggtgeo.paper_bench.measure import Errors
 from vggtgeo.paper_bench.plan import Job
 from vggtgeo.paper_bench.variants import VARIANTS
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings_table import tables_of
 
 
 @dataclass(frozen=True)
@@ -72,18 +67,10 @@ class Store:
 def fingerprint(job: Job) -> str:
     """Changes with the course, the settings of the system, the stubs' errors, and the version of the package."""
     variant = VARIANTS[job.variant]
-    settings = variant.settings(job.course)
-    chosen = [field for field in fields(SlamSettings) if field.name != "record_iterations"]  # it changes no result
     parts = {
         "course": asdict(job.course),
-        "settings": {field.name: _plain(getattr(settings, field.name)) for field in chosen},
+        "settings": tables_of(variant.settings(job.course)),
         "depth_errors": variant.depth_errors,
         "version": importlib.metadata.version("vggtgeo"),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, eqx.Module):
-        return [type(value).__name__, *(np.asarray(leaf).tolist() for leaf in jax.tree.leaves(value))]
-    return value

@@ -107,7 +107,7 @@ def write_page(
         depth_range=(low, high) if np.isfinite(low) else None,
         stages=_stages(summary["seconds_by_stage"]),
         total=summary["seconds_by_stage"].get("all"),
-        settings={name: _plain(value) for name, value in summary["settings"].items()},
+        settings=_flat(summary["settings"]),
         versions=summary["versions"],
         intrinsics=summary["intrinsics"],
         truth_table=_truth_table(summary.get("truth")),
@@ -200,6 +200,17 @@ def _sample(keyframe: Keyframe, low: float, high: float) -> Sample:
 
 def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | None:
     return figures.picture(view(cloud, trajectory), 900) if len(cloud) > 100 else None
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Each setting as text; those of a table by the names of table and field."""
+    rows: dict[str, str] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            rows |= {f"{name}.{field}": _plain(own) for field, own in value.items()}
+        else:
+            rows[name] = _plain(value)
+    return rows
 
 
 def _plain(value: Any) -> str:

@@ -27,6 +27,7 @@ from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import default_roles, finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings_table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.input import check_input
@@ -105,7 +106,7 @@ def reconstruct(
     summary = summarise(
         slam,
         verdict,
-        settings={},
+        settings=changed(settings),
         seconds={**clock.seconds, "all": time.perf_counter() - began},
         report=compare(slam, source.truth),
         **known,

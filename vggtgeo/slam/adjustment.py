@@ -78,9 +78,9 @@ def build(
         **line_rows,
         depth_mean=np.where(has_prior, prior, 1.0),
         depth_sigma=np.where(has_prior, sigma, 1.0),
-        depth_weight=weight if settings.depth_weight > 0 else np.zeros_like(weight),
-        alpha=settings.depth_weight,
-        segment=_segments(keyframes, points, lines) if settings.two_ends_lines else None,
+        depth_weight=weight if settings.depth.depth_weight > 0 else np.zeros_like(weight),
+        alpha=settings.depth.depth_weight,
+        segment=_segments(keyframes, points, lines) if settings.lines.two_ends_lines else None,
     )
     problem, initial, index = pack(
         observations,
@@ -91,7 +91,7 @@ def build(
         intrinsics_mean=given_intrinsics,
         intrinsics_sigma=intrinsics_sigma,
         fixed_pose=fixed_pose,
-        kernel=settings.kernel,
+        kernel=settings.window.kernel,
         terms=terms,
     )
     return Adjustment(
@@ -155,7 +155,7 @@ class _Selection:
             counts[local[edge.host]][edge.slots] += 1 + 0.1 * edge.confidence
         chosen = []
         for count in counts:
-            order = np.argsort(-count, kind="stable")[: settings.point_slots]
+            order = np.argsort(-count, kind="stable")[: settings.window.point_slots]
             chosen.append(np.sort(order[count[order] > 0]))
         return cls.of(chosen, [len(c) for c in counts])
 
@@ -170,14 +170,14 @@ class _Selection:
         for keyframe, count in zip(keyframes, counts, strict=True):
             known = np.isfinite(keyframe.samples.prior)
             taken = np.ones(len(known), bool)
-            if settings.two_ends_lines:
-                taken = spread_samples(keyframe.sample_segment, settings.segment_samples)
+            if settings.lines.two_ends_lines:
+                taken = spread_samples(keyframe.sample_segment, settings.lines.segment_samples)
             length = np.bincount(keyframe.sample_segment[taken], minlength=len(count))
-            if settings.two_ends_lines:
-                length = np.full_like(length, settings.segment_samples)
+            if settings.lines.two_ends_lines:
+                length = np.full_like(length, settings.lines.segment_samples)
             order = np.argsort(-count, kind="stable")
             order = order[count[order] > 0]
-            order = order[np.cumsum(length[order]) <= settings.line_slots]
+            order = order[np.cumsum(length[order]) <= settings.window.line_slots]
             chosen.append(np.nonzero(np.isin(keyframe.sample_segment, order) & known & taken)[0])
         return cls.of(chosen, [len(keyframe.sample_segment) for keyframe in keyframes])
 
@@ -246,15 +246,15 @@ def _line_rows(
             samples.pixels[chosen], samples.inverse_depth[chosen], keyframes[host].pose, intrinsics
         )
         near = supported(
-            places, target.pose, own_ends, intrinsics, reach=settings.line_spacing, gate=settings.line_gate
+            places, target.pose, own_ends, intrinsics, reach=settings.lines.line_spacing, gate=settings.lines.line_gate
         )
         edge_ids.append(np.full(len(chosen), number))
         landmarks.append(offset + lines.table[host][chosen])
         coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
         weight = _weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen], settings)
-        if settings.two_ends_lines:
-            weight = weight * sample_shares(keyframes[host].sample_segment, settings.segment_samples)[chosen]
-        weights.append(np.where(near, weight * settings.line_weight, 0.0))
+        if settings.lines.two_ends_lines:
+            weight = weight * sample_shares(keyframes[host].sample_segment, settings.lines.segment_samples)[chosen]
+        weights.append(np.where(near, weight * settings.lines.line_weight, 0.0))
     return {
         "line_edge": np.concatenate(edge_ids),
         "line_landmark": np.concatenate(landmarks),
@@ -264,15 +264,15 @@ def _line_rows(
 
 
 def _prior_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
-    if not settings.use_confidence:
+    if not settings.confidence.use_confidence:
         return np.ones_like(own)
-    return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth_trust]
+    return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth.depth_trust]
 
 
 def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:
-    if not settings.use_confidence:
+    if not settings.confidence.use_confidence:
         return np.ones_like(confidence)
-    return settings.confidence_gain * confidence + settings.confidence_floor
+    return settings.confidence.confidence_gain * confidence + settings.confidence.confidence_floor
 
 
 def _initial_depths(
