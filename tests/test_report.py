@@ -16,9 +16,10 @@ from vggtgeo.solvers.kernels import Square
 
 from vggtgeo.bundle.residuals import residual_sizes
 from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.report import map_view, write_page
+from vggtgeo.report import write_page
 from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam

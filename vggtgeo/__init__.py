@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from vggtgeo.datasets import Frame as Frame
     from vggtgeo.datasets import open_sequence as open_sequence
     from vggtgeo.evaluation import evaluate_trajectory as evaluate_trajectory
+    from vggtgeo.figures.plot import plot as plot
     from vggtgeo.geometry.camera import Camera as Camera
     from vggtgeo.geometry.cameras import AbstractCamera as AbstractCamera
     from vggtgeo.geometry.cameras import KannalaBrandt as KannalaBrandt
@@ -103,6 +104,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "bundle.batches": ("pack_batch", "solve_batch"),
+    "figures.plot": ("plot",),
     "geometry.camera": ("Camera",),
     "datasets": ("Frame", "open_sequence"),
     "bundle.objective": ("energy", "energy_terms"),

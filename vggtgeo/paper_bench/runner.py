@@ -11,8 +11,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
+from vggtgeo.figures.plot import plot
+from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
 from vggtgeo.paper_bench import tables
@@ -53,15 +53,16 @@ class BenchReport:
         """Plan and every run as plain values, SI units and degrees."""
         return {"plan": self.plan.name, "simulated": True, "runs": [asdict(result) for result in self.results]}
 
-    def plot(self) -> Figure:
-        """The error of every run, by scene and variant."""
-        return ablation_figure(self.results, f"Simulated ablations, plan `{self.plan.name}`")
-
     def write(self, folder: Path) -> None:
         """`tables.md`, `runs.csv` and `ablations.png`, each atomically."""
         write_text(folder / "tables.md", self.markdown())
         write_text(folder / "runs.csv", self.csv())
         write_figure(folder / "ablations.png", self.results, f"Simulated ablations, plan `{self.plan.name}`")
+
+
+@plot.register(BenchReport)
+def _plot(value: BenchReport) -> NotebookFigure:
+    return ablation_figure(value.results, f"Simulated ablations, plan `{value.plan.name}`")
 
 
 def bench(

@@ -11,10 +11,11 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
-from vggtgeo.report import figures, map_view
+from vggtgeo.report import figures
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.keyframe_depth import optimised_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory

@@ -7,11 +7,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
-from vggtgeo.figures.plots import plot_trajectory
+from vggtgeo.figures.plot import plot
+from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
+from vggtgeo.figures.result_figure import result_figure
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -27,9 +29,6 @@ from vggtgeo.slam.trust.evidence import Evidence
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.window_recorder import WindowRecord
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,12 +195,6 @@ class Result:
             "summary": dict(self.summary),
         }
 
-    def plot(self, truth: Trajectory | None = None) -> Figure:
-        """Trajectory from above and from the side, and the map from behind and from above."""
-        from vggtgeo.figures.plots import result_figure
-
-        return result_figure(self, truth)
-
     def __repr__(self) -> str:
         frames, keyframes = len(self.trajectory), len(self.keyframes)
         unit = " m" if self.metric else " (no unit)"
@@ -209,3 +202,8 @@ class Result:
             f"Result({frames} frame{'s' * (frames != 1)}, {keyframes} keyframe{'s' * (keyframes != 1)}, "
             f"path {self.trajectory.length:.2f}{unit}, {len(self.cloud)} points)"
         )
+
+
+@plot.register(Result)
+def _plot(value: Result, truth: Trajectory | None = None) -> NotebookFigure:
+    return result_figure(value.trajectory, value.keyframes, value.cloud, value.metric, truth)
