@@ -10,7 +10,7 @@ from conftest import ROOT
 
 FILES = sorted(file for folder in ("vggtgeo", "solvers", "models") for file in (ROOT / folder).rglob("*.py"))
 ALLOWED = {
-    "solvers": {"vggtgeo.solvers", "equinox", "jax", "jaxtyping", "lineax", "numpy", "optimistix"},
+    "solvers": {"vggtgeo.solvers", "equinox", "jax", "jaxtyping", "numpy", "optimistix"},
     "models": {"vggtgeo.models", "cv2", "numpy", "onnxruntime", "scipy"},
 }
 STAIR = (
@@ -28,7 +28,7 @@ STAIR = (
 STEP = {package: step for step, packages in enumerate(STAIR) for package in packages}
 LATE = {"vggtgeo.cli"}
 """Packages whose functions import the project: a command's help must not load what the command needs."""
-NEVER_AT_MODULE_LEVEL = {"evo", "onnx", "onnxscript", "rerun", "submitit", "torch"}
+NEVER_AT_MODULE_LEVEL = {"evo", "onnx", "onnxscript", "rerun", "torch"}
 
 
 def _statements(body: ast.AST, in_functions: bool, for_types: bool = True) -> Iterator[ast.AST]:
