@@ -30,13 +30,14 @@ def demo(
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
+    slam_settings = pipeline_settings(settings, assignments or (), {})
     sequence = simulate(scene, frames, seed, rate=10.0)
     if not (quiet or as_json):
         typer.echo(f"simulated scene `{scene}`: all numbers below are of a simulation")
     run_and_write(
         sequence,
         Roles(),
-        pipeline_settings(settings, assignments or (), {}),
+        slam_settings,
         Output(output, settings.values() if settings else {}, rerun, quiet=quiet, as_json=as_json),
         title=f"simulated {scene}",
         facts={"simulated": True},

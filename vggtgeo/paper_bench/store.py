@@ -17,7 +17,7 @@ from vggtgeo.slam.settings_table import tables_of
 
 
 @dataclass(frozen=True)
-class Result:
+class BenchRun:
     """What one run gave."""
 
     scene: str
@@ -36,7 +36,7 @@ class Store:
         """The file of a job."""
         return self.folder / "runs" / f"{job.name}.json"
 
-    def load(self, job: Job) -> Result | None:
+    def load(self, job: Job) -> BenchRun | None:
         """The stored result; None if there is none, or one of other settings. InputError for a spoilt file."""
         path = self.path(job)
         if not path.exists():
@@ -45,11 +45,11 @@ class Store:
             values = json.loads(path.read_text())
             if values["fingerprint"] != fingerprint(job):
                 return None
-            return Result(job.course.scene, job.variant, job.seed, Errors.from_dict(values["errors"]))
+            return BenchRun(job.course.scene, job.variant, job.seed, Errors.from_dict(values["errors"]))
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"`{path}` is no finished run ({error}); delete it and call again") from None
 
-    def save(self, job: Job, errors: Errors) -> Result:
+    def save(self, job: Job, errors: Errors) -> BenchRun:
         """Write a result; it is there as a whole or not at all."""
         values = {
             "simulated": True,
@@ -61,7 +61,7 @@ class Store:
             "errors": errors.as_dict(),
         }
         write_json(self.path(job), values)
-        return Result(job.course.scene, job.variant, job.seed, errors)
+        return BenchRun(job.course.scene, job.variant, job.seed, errors)
 
 
 def fingerprint(job: Job) -> str:

@@ -33,7 +33,7 @@ from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.input import check_input
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.window import warm_up
-from vggtgeo.slam.window_recorder import WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
 
 def reconstruct(
@@ -90,33 +90,58 @@ def reconstruct(
         source = _opened(frames, camera)
         perception = _perception(roles, source.has_depth)
         windows, witness = WindowRecorder(), EvidenceRecorder(source.camera)
-        told = _Callbacks((windows, witness, *callbacks), clock)
+        hooks = _Callbacks((windows, witness, *callbacks), clock)
         with clock.measure("compile"):
-            told.warm_up(settings, perception.roles)
-        tracked = _track(source, (start, end, stride), perception.roles, settings, told)
-    slam, interrupted = _adjust(tracked, perception.roles, settings, told)
+            hooks.warm_up(settings, perception.roles)
+        tracked = _track(source, (start, end, stride), perception.roles, settings, hooks)
+    slam, interrupted = _adjust(tracked, perception.roles, settings, hooks)
+    known = {
+        **perception.facts(),
+        **(facts or {}),
+        "frames_per_second": round(tracked.frames_per_second, 2),
+        "interrupted": interrupted,
+    }
+    ending = _Ending(slam, source.truth, (*warned, *collected), title or source.name, known, clock, began)
+    return _concluded(ending, settings, hooks, windows.records, witness)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ending:
+    """A run after its last adjustment: what it is judged and described by."""
+
+    slam: Slam
+    truth: Trajectory | None
+    warned: tuple[Warning | str, ...]
+    title: str
+    facts: Mapping[str, Any]
+    clock: Clock
+    began: float
+
+
+def _concluded(
+    run: _Ending, settings: SlamSettings, hooks: _Callbacks, windows: Iterable[WindowRecord], witness: EvidenceRecorder
+) -> Result:
+    """The map, the verdict, the summary."""
+    slam, clock = run.slam, run.clock
     with clock.measure("dense map"):
         depths = tuple(fused_depths(slam.keyframes, slam.intrinsics))
         cloud = map_points(slam.keyframes, slam.intrinsics, depths)
-    told.each("on_finish", slam, cloud)
-    shown = [*warned, *collected]
+    hooks.each("on_finish", slam, cloud)
     with clock.measure("verdict"):
-        verdict = judge(slam, witness.frames, check_input(shown, len(slam.frames)))
-    known = {**perception.facts(), **(facts or {})}
+        verdict = judge(slam, witness.frames, check_input(run.warned, len(slam.frames)))
     summary = summarise(
         slam,
         verdict,
         settings=changed(settings),
-        seconds={**clock.seconds, "all": time.perf_counter() - began},
-        report=compare(slam, source.truth),
-        **known,
+        seconds={**clock.seconds, "all": time.perf_counter() - run.began},
+        report=compare(slam, run.truth),
         map_points=len(cloud),
-        frames_per_second=round(tracked.frames_per_second, 2),
-        interrupted=interrupted,
+        **run.facts,
     )
-    notices = (*([known["meaningless"]] if "meaningless" in known else []), *map(str, shown))
-    record = RunRecord(slam, depths, tuple(windows.records), source.truth, notices, title or source.name)
-    return Result.assemble(record, cloud, verdict, summary)
+    notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
+    return Result.assemble(
+        RunRecord(slam, depths, tuple(windows), run.truth, notices, run.title), cloud, verdict, summary
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,18 +222,18 @@ class _Tracked:
 
 
 def _track(
-    source: _Source, selection: tuple[int, int | None, int], roles: Roles, settings: SlamSettings, told: _Callbacks
+    source: _Source, selection: tuple[int, int | None, int], roles: Roles, settings: SlamSettings, hooks: _Callbacks
 ) -> _Tracked:
     """The loop over frames; Ctrl-C ends it early, an input error of the sequence ends it without a result."""
     slam: Slam | None = None
     interrupted = False
     given: dict[int, Frame] = {}
-    told.each("on_begin", source.name, source.count(*selection))
+    hooks.each("on_begin", source.name, source.count(*selection))
     frames = _remembered(source.frames.frames(*selection), given)
     began = time.perf_counter()
     try:
-        for slam in run_frames(frames, source.camera, roles, settings, told.clock):
-            told.each("on_frame", slam, given.pop(slam.frames[-1].frame))
+        for slam in run_frames(frames, source.camera, roles, settings, hooks.clock):
+            hooks.each("on_frame", slam, given.pop(slam.frames[-1].frame))
     except KeyboardInterrupt:
         interrupted = True
     if slam is None or not slam.frames:
@@ -216,19 +241,19 @@ def _track(
             raise KeyboardInterrupt
         raise InputError(f"`{source.name}` gave no frame that could be used; nothing was written")
     if interrupted:
-        told.each("on_message", "interrupted: keeping what there is")
+        hooks.each("on_message", "interrupted: keeping what there is")
     return _Tracked(slam, interrupted, len(slam.frames) / (time.perf_counter() - began))
 
 
-def _adjust(tracked: _Tracked, roles: Roles, settings: SlamSettings, told: _Callbacks) -> tuple[Slam, bool]:
+def _adjust(tracked: _Tracked, roles: Roles, settings: SlamSettings, hooks: _Callbacks) -> tuple[Slam, bool]:
     """The state after the last adjustment, and whether Ctrl-C ended the run; after Ctrl-C there is none."""
-    told.each("on_adjust", tracked.slam)
+    hooks.each("on_adjust", tracked.slam)
     if tracked.interrupted:
         return tracked.slam, True
     try:
-        return finish(tracked.slam, roles, settings, told.clock), False
+        return finish(tracked.slam, roles, settings, hooks.clock), False
     except KeyboardInterrupt:
-        told.each("on_message", "interrupted: keeping what there is, without the last adjustment")
+        hooks.each("on_message", "interrupted: keeping what there is, without the last adjustment")
         return tracked.slam, True
 
 

@@ -212,7 +212,8 @@ class CameraSettings(CheckedSettings):
 _KERNEL = "a kernel of a width above 0, such as `cauchy 2.0` (`vggtgeo.Cauchy(2.0)`)"
 
 
-def _is_kernel(value: Any) -> bool:
+def is_kernel(value: Any) -> bool:
+    """Whether it is a robust kernel whose width, where it has one, is above 0."""
     return isinstance(value, AbstractKernel) and float(getattr(value, "delta", 1.0)) > 0
 
 
@@ -233,7 +234,7 @@ class WindowSettings(CheckedSettings):
     point_slots: int = whole(320, at_least=1)
     line_slots: int = whole(192, at_least=1)
     kernel: AbstractKernel = field(
-        default_factory=lambda: Cauchy(jnp.asarray(2.0)), metadata={"expected": Expected(_KERNEL, _is_kernel)}
+        default_factory=lambda: Cauchy(jnp.asarray(2.0)), metadata={"expected": Expected(_KERNEL, is_kernel)}
     )
     """Robust kernel of points and lines, in the last adjustment too; widths in pixels."""
     window_iterations: int = whole(12, at_least=1)

@@ -15,7 +15,7 @@ import numpy as np
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.setting_checks import CheckedSettings
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings import SlamSettings, is_kernel
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
 
 KERNELS: dict[str, type[AbstractKernel]] = {
@@ -107,10 +107,13 @@ def _value(name: str, value: Any) -> Any:
 def _kernel(name: str, text: str) -> AbstractKernel:
     kind, *numbers = text.split() or [""]
     try:
-        return KERNELS[kind.lower()](*map(float, numbers))
+        kernel = KERNELS[kind.lower()](*map(float, numbers))
     except (KeyError, TypeError, ValueError):
-        expected = f"one of {', '.join(KERNELS)} and its numbers, such as `cauchy 2.0`"
-        raise InputError(f"`{name}` is {text!r}; it must be {expected}") from None
+        kernel = None
+    if kernel is None or not is_kernel(kernel):
+        expected = f"one of {', '.join(KERNELS)} and its numbers, the width above 0, such as `cauchy 2.0`"
+        raise InputError(f"`{name}` is {text!r}; it must be {expected}")
+    return kernel
 
 
 def _kernel_text(kernel: AbstractKernel) -> str:
