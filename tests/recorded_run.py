@@ -13,7 +13,8 @@ from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.settings import RefinementSettings, Roles, SlamSettings, WindowSettings
+from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
 

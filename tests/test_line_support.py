@@ -8,7 +8,8 @@ import pytest
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.adjustment import _prior_trust
 from vggtgeo.slam.line_support import sample_shares, spread_samples, supported
-from vggtgeo.slam.settings import DepthSettings, SlamSettings
+from vggtgeo.slam.setting_groups import DepthSettings
+from vggtgeo.slam.settings import SlamSettings
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
 # Along the optical axis' right: pixels (160 + 30 k, 120) for points (0.1 k * 3, 0, 3).

@@ -22,7 +22,8 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_adjustment import adjust_all, close_loops
 from vggtgeo.slam.run import finish, frame_trajectory, keyframe_trajectory, run_frames
-from vggtgeo.slam.settings import RefinementSettings, Roles, SlamSettings, WindowSettings
+from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
 

@@ -25,7 +25,8 @@ from vggtgeo.simulation.sequence import SyntheticSequence, simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.presets import NEEDED, Perception, perception
 from vggtgeo.slam.run import frame_trajectory, run
-from vggtgeo.slam.settings import RefinementSettings, Roles, SlamSettings
+from vggtgeo.slam.setting_groups import RefinementSettings
+from vggtgeo.slam.settings import Roles, SlamSettings
 
 RUN_AND_WRITE = "vggtgeo.cli.run_sequence"
 """The module from which the command takes `run_and_write`."""

@@ -21,7 +21,8 @@ from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.settings import RefinementSettings, Roles, SlamSettings, WindowSettings
+from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
 

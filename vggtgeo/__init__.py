@@ -80,17 +80,17 @@ if TYPE_CHECKING:
     from vggtgeo.slam.run import finish as finish
     from vggtgeo.slam.run import frame_trajectory as frame_trajectory
     from vggtgeo.slam.run import run as run
-    from vggtgeo.slam.settings import CameraSettings as CameraSettings
-    from vggtgeo.slam.settings import ConfidenceSettings as ConfidenceSettings
-    from vggtgeo.slam.settings import DepthSettings as DepthSettings
-    from vggtgeo.slam.settings import KeyframeSettings as KeyframeSettings
-    from vggtgeo.slam.settings import LineSettings as LineSettings
-    from vggtgeo.slam.settings import MatchingSettings as MatchingSettings
-    from vggtgeo.slam.settings import RefinementSettings as RefinementSettings
+    from vggtgeo.slam.setting_groups import CameraSettings as CameraSettings
+    from vggtgeo.slam.setting_groups import ConfidenceSettings as ConfidenceSettings
+    from vggtgeo.slam.setting_groups import DepthSettings as DepthSettings
+    from vggtgeo.slam.setting_groups import KeyframeSettings as KeyframeSettings
+    from vggtgeo.slam.setting_groups import LineSettings as LineSettings
+    from vggtgeo.slam.setting_groups import MatchingSettings as MatchingSettings
+    from vggtgeo.slam.setting_groups import RefinementSettings as RefinementSettings
+    from vggtgeo.slam.setting_groups import TrackingSettings as TrackingSettings
+    from vggtgeo.slam.setting_groups import WindowSettings as WindowSettings
     from vggtgeo.slam.settings import Roles as Roles
     from vggtgeo.slam.settings import SlamSettings as SlamSettings
-    from vggtgeo.slam.settings import TrackingSettings as TrackingSettings
-    from vggtgeo.slam.settings import WindowSettings as WindowSettings
     from vggtgeo.slam.trust.evidence import EvidenceRecorder as EvidenceRecorder
     from vggtgeo.slam.trust.finding import Verdict as Verdict
     from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
@@ -138,7 +138,7 @@ _HOME = {
     "slam.callback": ("Callback",),
     "slam.presets": ("perception",),
     "slam.run": ("finish", "frame_trajectory", "run"),
-    "slam.settings": (
+    "slam.setting_groups": (
         "CameraSettings",
         "ConfidenceSettings",
         "DepthSettings",
@@ -146,11 +146,10 @@ _HOME = {
         "LineSettings",
         "MatchingSettings",
         "RefinementSettings",
-        "Roles",
-        "SlamSettings",
         "TrackingSettings",
         "WindowSettings",
     ),
+    "slam.settings": ("Roles", "SlamSettings"),
     "slam.trust.evidence": ("EvidenceRecorder",),
     "slam.trust.finding": ("Verdict",),
     "bundle.solution": ("Solution", "solve"),

@@ -53,7 +53,7 @@ def run(
     from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
-    from vggtgeo.slam.settings import DepthSettings
+    from vggtgeo.slam.setting_groups import DepthSettings
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None

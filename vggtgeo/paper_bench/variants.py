@@ -11,14 +11,14 @@ from vggtgeo.models.roles import InitialGeometry
 from vggtgeo.models.stubs import SimulatedVggt
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.paper_bench.courses import Course
-from vggtgeo.slam.settings import (
+from vggtgeo.slam.setting_groups import (
     ConfidenceSettings,
     DepthSettings,
     KeyframeSettings,
     LineSettings,
     RefinementSettings,
-    SlamSettings,
 )
+from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import Tables, updated
 
 _Start = Callable[[SimulatedVggt], InitialGeometry]

@@ -15,7 +15,8 @@ import numpy as np
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.setting_checks import CheckedSettings
-from vggtgeo.slam.settings import SlamSettings, is_kernel
+from vggtgeo.slam.setting_groups import is_kernel
+from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
 
 KERNELS: dict[str, type[AbstractKernel]] = {
