@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import jaxtyping
 import pytest
 import tomli_w
 from typer.testing import CliRunner
@@ -64,6 +66,14 @@ def _other(name: str) -> Any:
     group, field = name.split(".")
     default = tables_of(vg.SlamSettings())[group][field]
     return WORDS[name] if name in WORDS else OTHER[type(default)](default)
+
+
+@pytest.fixture(autouse=True)
+def as_a_user() -> Iterator[None]:
+    """Without the tests' own checks of types, which would refuse a wrong value before the settings see it."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def test_every_setting_is_tested() -> None:

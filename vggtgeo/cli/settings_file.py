@@ -99,15 +99,15 @@ def _checked(path: Path, given: dict[str, Any], names: dict[str, str], types: di
 
 def _affirmed(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
     """`no-lines = true` as `lines = false`: what a flag can say, a file can."""
-    said = dict(given)
+    values = dict(given)
     for key, name in _keys(context, negated=True).items():
-        if key in said:
+        if key in values:
             positive = next(k for k, n in _keys(context).items() if n == name)
-            if positive in said:
+            if positive in values:
                 raise InputError(f"`{path}`: `{positive}` and `{key}` are one setting; give one of them")
-            value = said.pop(key)
-            said[positive] = not value if isinstance(value, bool) else value
-    return said
+            value = values.pop(key)
+            values[positive] = not value if isinstance(value, bool) else value
+    return values
 
 
 def _keys(context: Any, negated: bool = False) -> dict[str, str]:

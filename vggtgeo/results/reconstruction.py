@@ -68,7 +68,7 @@ def reconstruct(
         stride: take every n-th frame.
         seed: of OpenCV's random choices, a global setting of that package.
         title: of the report; by default the name of the sequence.
-        callbacks: told of every frame.
+        callbacks: called with every frame.
         facts: what the summary shall say besides.
         warned: warnings about the input that came before, for the verdict and the report.
 
@@ -89,8 +89,8 @@ def reconstruct(
     with collected_warnings() as collected:
         source = _opened(frames, camera)
         perception = _perception(roles, source.has_depth)
-        windows, witness = WindowRecorder(), EvidenceRecorder(source.camera)
-        hooks = _Callbacks((windows, witness, *callbacks), clock)
+        windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
+        hooks = _Callbacks((windows, evidence, *callbacks), clock)
         with clock.measure("compile"):
             hooks.warm_up(settings, perception.roles)
         tracked = _track(source, (start, end, stride), perception.roles, settings, hooks)
@@ -102,7 +102,7 @@ def reconstruct(
         "interrupted": interrupted,
     }
     ending = _Ending(slam, source.truth, (*warned, *collected), title or source.name, known, clock, began)
-    return _concluded(ending, settings, hooks, windows.records, witness)
+    return _concluded(ending, settings, hooks, windows.records, evidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class _Ending:
 
 
 def _concluded(
-    run: _Ending, settings: SlamSettings, hooks: _Callbacks, windows: Iterable[WindowRecord], witness: EvidenceRecorder
+    run: _Ending, settings: SlamSettings, hooks: _Callbacks, windows: Iterable[WindowRecord], evidence: EvidenceRecorder
 ) -> Result:
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
@@ -128,7 +128,7 @@ def _concluded(
         cloud = map_points(slam.keyframes, slam.intrinsics, depths)
     hooks.each("on_finish", slam, cloud)
     with clock.measure("verdict"):
-        verdict = judge(slam, witness.frames, check_input(run.warned, len(slam.frames)))
+        verdict = judge(slam, evidence.frames, check_input(run.warned, len(slam.frames)))
     summary = summarise(
         slam,
         verdict,

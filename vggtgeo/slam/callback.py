@@ -1,4 +1,4 @@
-"""What is told of a run while it goes on: progress bars, viewers, recorders. None of them changes the result."""
+"""Callbacks of a run: progress bars, viewers, recorders. None of them changes the result."""
 
 from __future__ import annotations
 
