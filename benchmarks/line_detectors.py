@@ -57,7 +57,7 @@ def main() -> None:
 def line(name: str, detector: LineDetector | None, data: Path, folder: Path, end: int | None) -> str:
     """One run, as a line of the table."""
     roles = Roles() if detector is None else replace(Roles(), lines=detector)
-    settings = SlamSettings(lines=LineSettings(use_lines=detector is not None))
+    settings = SlamSettings(line=LineSettings(use_lines=detector is not None))
     result = reconstruct(data, roles, settings, end=end)
     result.save(folder, settings={"lines": name})
     slam, truth = result.record.slam, result.summary["truth"]

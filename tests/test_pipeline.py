@@ -72,7 +72,7 @@ def test_single_precision_of_the_caller_changes_nothing(room, tracked: Slam) -> 
 def test_two_ends_lines_recover_the_truth(room) -> None:
     """ATE below 1.5 cm where each segment has two unknowns; oracle: the renderer's poses."""
     frames, camera, truth = room
-    slam = _run(frames, camera, settings=updated(SETTINGS, {"lines": {"two_ends_lines": True}}))
+    slam = _run(frames, camera, settings=updated(SETTINGS, {"line": {"two_ends_lines": True}}))
     assert slam.solved is not None
     assert slam.solved[0].problem.fraction is not None
     assert evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse < 0.015

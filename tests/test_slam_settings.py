@@ -16,7 +16,7 @@ import tomli_w
 from typer.testing import CliRunner
 
 import vggtgeo as vg
-from vggtgeo.cli.main import make_app
+from vggtgeo.cli.main import COMMANDS, load_command, make_app
 from vggtgeo.cli.pipeline_settings import pipeline_settings
 from vggtgeo.slam.settings_table import GROUPS, changed, names, parsed, tables_of, updated
 
@@ -30,19 +30,19 @@ WRONG = {
     "matching.match_gate": (0.0,),
     "matching.epipolar_gate": (-4.0,),
     "matching.least_overlap": (-0.1, 1.1),
-    "lines.use_lines": (1, "yes"),
-    "lines.line_gate": (0,),
-    "lines.line_spacing": (0.0,),
-    "lines.line_weight": (-0.1,),
-    "lines.two_ends_lines": (None,),
-    "lines.segment_samples": (1,),
-    "lines.manhattan": (0,),
+    "line.use_lines": (1, "yes"),
+    "line.line_gate": (0,),
+    "line.line_spacing": (0.0,),
+    "line.line_weight": (-0.1,),
+    "line.two_ends_lines": (None,),
+    "line.segment_samples": (1,),
+    "line.manhattan": (0,),
     "depth.depth_weight": (-2.0,),
     "depth.depth_trust": ("omega", 1),
     "depth.surface_points": (-1.0,),
-    "confidence.use_confidence": ("on",),
-    "confidence.confidence_gain": (-1.0,),
-    "confidence.confidence_floor": (float("nan"),),
+    "weights.use_confidence": ("on",),
+    "weights.confidence_gain": (-1.0,),
+    "weights.confidence_floor": (float("nan"),),
     "camera.known_intrinsics_sigma": (0.0,),
     "camera.guessed_intrinsics_sigma": (-0.3,),
     "window.size": (2, 10.0),
@@ -102,10 +102,8 @@ def test_a_group_in_its_place(group: str) -> None:
 def test_settings_that_do_not_fit_each_other_are_refused() -> None:
     """Slots that are no multiple of a segment's samples are refused where segments have two unknowns only."""
     assert vg.SlamSettings(window=vg.WindowSettings(line_slots=100)).padded_samples is None
-    with pytest.raises(
-        vg.InputError, match=r"`window.line_slots` is 100; with `lines.two_ends_lines` it must be a mul"
-    ):
-        updated(vg.SlamSettings(), {"window": {"line_slots": 100}, "lines": {"two_ends_lines": True}})
+    with pytest.raises(vg.InputError, match=r"`window.line_slots` is 100; with `line.two_ends_lines` it must be a mul"):
+        updated(vg.SlamSettings(), {"window": {"line_slots": 100}, "line": {"two_ends_lines": True}})
 
 
 @pytest.mark.parametrize("name", names())
@@ -121,6 +119,14 @@ def test_a_file_and_a_flag_reach_every_setting(name: str) -> None:
         assert changed(updated(vg.SlamSettings(), changed(settings))) == changed(settings)
 
 
+def test_no_group_has_the_name_of_a_flag() -> None:
+    """A table of a settings file and a flag can stand side by side; oracle: the parameters of the commands."""
+    for entry in COMMANDS:
+        if entry.name in ("run", "demo"):
+            flags = {option.lstrip("-") for p in load_command(entry).params for option in (*p.opts, *p.secondary_opts)}
+            assert flags & set(GROUPS) == set()
+
+
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
@@ -129,7 +135,7 @@ def test_a_file_and_a_flag_reach_every_setting(name: str) -> None:
         ("window.window=4", "`window.window` is no setting; the nearest is `window.window_iterations`"),
         ("window.size", "`window.size` sets nothing; write `group.field=value`"),
         ("window.size=four", "`window.size` is 'four'; it must be a whole number, 3 or more"),
-        ("lines.use_lines=1", "`lines.use_lines` is 1; it must be true or false"),
+        ("line.use_lines=1", "`line.use_lines` is 1; it must be true or false"),
         ("window.kernel=tukey 3", "`window.kernel` is 'tukey 3'; it must be one of barron, cauchy"),
     ],
 )
@@ -154,16 +160,16 @@ def test_a_table_of_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
     ("table", "given", "assignments", "expected"),
     [
         ({}, False, (), False),  # a switch of the file or by default
-        ({"lines": {"use_lines": True}}, False, (), True),  # a table says more than a switch of the same file
-        ({"lines": {"use_lines": True}}, True, (), False),  # a switch that is given wins over the file
-        ({"lines": {"use_lines": True}}, True, ("lines.use_lines=true",), True),  # `--set` wins over all
-        ({}, False, ("lines.use_lines=false", "lines.use_lines=true"), True),  # the last wins
+        ({"line": {"use_lines": True}}, False, (), True),  # a table says more than a switch of the same file
+        ({"line": {"use_lines": True}}, True, (), False),  # a switch that is given wins over the file
+        ({"line": {"use_lines": True}}, True, ("line.use_lines=true",), True),  # `--set` wins over all
+        ({}, False, ("line.use_lines=false", "line.use_lines=true"), True),  # the last wins
     ],
 )
 def test_who_wins(table: dict, given: bool, assignments: tuple[str, ...], expected: bool) -> None:
     """The order: switch of a file, table of a file, switch of the command line, `--set`."""
     in_use = SimpleNamespace(tables=table, on_command_line=lambda name: given)
-    settings = pipeline_settings(in_use, assignments, {"lines": {"lines": {"use_lines": False}}})
+    settings = pipeline_settings(in_use, assignments, {"lines": {"line": {"use_lines": False}}})
     assert settings == dataclasses.replace(
-        vg.SlamSettings(), window=settings.window, lines=vg.LineSettings(use_lines=expected)
+        vg.SlamSettings(), window=settings.window, line=vg.LineSettings(use_lines=expected)
     )

@@ -81,13 +81,13 @@ if TYPE_CHECKING:
     from vggtgeo.slam.run import frame_trajectory as frame_trajectory
     from vggtgeo.slam.run import run as run
     from vggtgeo.slam.setting_groups import CameraSettings as CameraSettings
-    from vggtgeo.slam.setting_groups import ConfidenceSettings as ConfidenceSettings
     from vggtgeo.slam.setting_groups import DepthSettings as DepthSettings
     from vggtgeo.slam.setting_groups import KeyframeSettings as KeyframeSettings
     from vggtgeo.slam.setting_groups import LineSettings as LineSettings
     from vggtgeo.slam.setting_groups import MatchingSettings as MatchingSettings
     from vggtgeo.slam.setting_groups import RefinementSettings as RefinementSettings
     from vggtgeo.slam.setting_groups import TrackingSettings as TrackingSettings
+    from vggtgeo.slam.setting_groups import WeightSettings as WeightSettings
     from vggtgeo.slam.setting_groups import WindowSettings as WindowSettings
     from vggtgeo.slam.settings import Roles as Roles
     from vggtgeo.slam.settings import SlamSettings as SlamSettings
@@ -140,7 +140,7 @@ _HOME = {
     "slam.run": ("finish", "frame_trajectory", "run"),
     "slam.setting_groups": (
         "CameraSettings",
-        "ConfidenceSettings",
+        "WeightSettings",
         "DepthSettings",
         "KeyframeSettings",
         "LineSettings",

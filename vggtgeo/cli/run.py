@@ -59,8 +59,8 @@ def run(
     rerun = check_target(rerun) if rerun else None
     check_flags(preset, features, memory_limit_gb)
     switches = {
-        "lines": {"lines": {"use_lines": lines}},
-        "confidence": {"confidence": {"use_confidence": confidence}},
+        "lines": {"line": {"use_lines": lines}},
+        "confidence": {"weights": {"use_confidence": confidence}},
         "depth_prior": {"depth": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},
         "global_adjustment": {"refinement": {"global_adjustment": global_adjustment}},
     }

@@ -21,7 +21,7 @@ from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.settings_table import updated
+from vggtgeo.slam.settings_table import changed, updated
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
 from vggtgeo.viewing.target import STAND_IN, open_target
@@ -78,7 +78,7 @@ def run_and_write(
             stride=stride,
             seed=seed,
             title=title,
-            callbacks=(bar, _EarlyFiles(output), *callbacks),
+            callbacks=(bar, _EarlyFiles(output, settings), *callbacks),
             facts=facts,
             warned=warned,
         )
@@ -97,14 +97,15 @@ def run_and_write(
 class _EarlyFiles(Callback):
     """Settings and poses lie in the folder before the adjustment of the whole map, should that be killed."""
 
-    def __init__(self, output: Output) -> None:
+    def __init__(self, output: Output, settings: SlamSettings) -> None:
         self._output = output
+        self._settings = {**output.flags, **changed(settings)}
 
     def on_begin(self, name: str, total: int | None) -> None:
         self._output.folder.mkdir(parents=True, exist_ok=True)
 
     def on_adjust(self, slam: Slam) -> None:
-        write_settings(self._output.folder / "settings.toml", self._output.flags)
+        write_settings(self._output.folder / "settings.toml", self._settings)
         write_trajectories(self._output.folder, slam)
 
 

@@ -12,11 +12,11 @@ from vggtgeo.models.stubs import SimulatedVggt
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.paper_bench.courses import Course
 from vggtgeo.slam.setting_groups import (
-    ConfidenceSettings,
     DepthSettings,
     KeyframeSettings,
     LineSettings,
     RefinementSettings,
+    WeightSettings,
 )
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import Tables, updated
@@ -55,8 +55,8 @@ class Variant:
         """The settings of a run on `course`: the paper's sliding window, nothing adjusted after the end."""
         base = SlamSettings(
             keyframes=KeyframeSettings(course.keyframe_distance, math.radians(course.keyframe_angle)),
-            confidence=ConfidenceSettings(confidence_gain=_GAIN, confidence_floor=_FLOOR),
-            lines=LineSettings(line_weight=_LINE_WEIGHT),
+            weights=WeightSettings(confidence_gain=_GAIN, confidence_floor=_FLOOR),
+            line=LineSettings(line_weight=_LINE_WEIGHT),
             depth=DepthSettings(depth_weight=_DEPTH_WEIGHT),
             refinement=RefinementSettings(global_adjustment=False),
         )
@@ -71,19 +71,19 @@ VARIANTS: dict[str, Variant] = {
     for variant in (
         Variant(FULL, "full system"),
         Variant("A", "A: without depth prior", {"depth": {"depth_weight": 0.0}}),
-        Variant("B", "B: without confidence", {"confidence": {"use_confidence": False}}),
-        Variant("C", "C: without lines", {"lines": {"use_lines": False}}),
+        Variant("B", "B: without confidence", {"weights": {"use_confidence": False}}),
+        Variant("C", "C: without lines", {"line": {"use_lines": False}}),
         Variant("D", "D: constant-velocity start", start=lambda vggt: ConstantVelocity()),
         Variant("pnp", "start from PnP alone", start=lambda vggt: PnpGeometry()),
-        Variant("heavy-lines", "lines x 5", {"lines": {"line_weight": 5 * _LINE_WEIGHT}}),
-        Variant("manhattan", "rotations from vanishing directions", {"lines": {"manhattan": True}}),
+        Variant("heavy-lines", "lines x 5", {"line": {"line_weight": 5 * _LINE_WEIGHT}}),
+        Variant("manhattan", "rotations from vanishing directions", {"line": {"manhattan": True}}),
         Variant("window-5", "window of 5 keyframes", {"window": {"size": 5}}),
         Variant("window-15", "window of 15 keyframes", {"window": {"size": 15}}),
         Variant("huber", "Huber kernel, 1.5 px (the paper)", {"window": {"kernel": "huber 1.5"}}),
         Variant(
             "huber-B",
             "Huber kernel, without confidence",
-            {"window": {"kernel": "huber 1.5"}, "confidence": {"use_confidence": False}},
+            {"window": {"kernel": "huber 1.5"}, "weights": {"use_confidence": False}},
         ),
         Variant("square", "no robust kernel", {"window": {"kernel": "square"}}),
         Variant("alpha", "depth prior of every slot x 2.0 (the paper)", {"depth": {"depth_weight": 2.0}}),
@@ -96,6 +96,6 @@ VARIANTS: dict[str, Variant] = {
             {"refinement": {"global_adjustment": True}, "depth": {"surface_points": 0.0}},
         ),
         Variant("accurate-depth", "a tenth of the depth errors", depth_errors=0.1),
-        Variant("two-ends", "two unknowns a segment", {"lines": {"two_ends_lines": True}}),
+        Variant("two-ends", "two unknowns a segment", {"line": {"two_ends_lines": True}}),
     )
 }

@@ -115,7 +115,7 @@ def _observed(
         depth_sigma=np.where(has_prior, sigma, 1.0),
         depth_weight=weight if settings.depth.depth_weight > 0 else np.zeros_like(weight),
         alpha=settings.depth.depth_weight,
-        segment=_segments(keyframes, points, lines) if settings.lines.two_ends_lines else None,
+        segment=_segments(keyframes, points, lines) if settings.line.two_ends_lines else None,
     )
     return observations, depths, np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
 
@@ -205,15 +205,15 @@ def _line_rows(
             samples.pixels[chosen], samples.inverse_depth[chosen], keyframes[host].pose, intrinsics
         )
         near = supported(
-            places, target.pose, own_ends, intrinsics, reach=settings.lines.line_spacing, gate=settings.lines.line_gate
+            places, target.pose, own_ends, intrinsics, reach=settings.line.line_spacing, gate=settings.line.line_gate
         )
         edge_ids.append(np.full(len(chosen), number))
         landmarks.append(offset + lines.table[host][chosen])
         coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
         weight = _weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen], settings)
-        if settings.lines.two_ends_lines:
-            weight = weight * sample_shares(keyframes[host].sample_segment, settings.lines.segment_samples)[chosen]
-        weights.append(np.where(near, weight * settings.lines.line_weight, 0.0))
+        if settings.line.two_ends_lines:
+            weight = weight * sample_shares(keyframes[host].sample_segment, settings.line.segment_samples)[chosen]
+        weights.append(np.where(near, weight * settings.line.line_weight, 0.0))
     return {
         "line_edge": np.concatenate(edge_ids),
         "line_landmark": np.concatenate(landmarks),
@@ -223,15 +223,15 @@ def _line_rows(
 
 
 def _prior_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
-    if not settings.confidence.use_confidence:
+    if not settings.weights.use_confidence:
         return np.ones_like(own)
     return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth.depth_trust]
 
 
 def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:
-    if not settings.confidence.use_confidence:
+    if not settings.weights.use_confidence:
         return np.ones_like(confidence)
-    return settings.confidence.confidence_gain * confidence + settings.confidence.confidence_floor
+    return settings.weights.confidence_gain * confidence + settings.weights.confidence_floor
 
 
 def _initial_depths(

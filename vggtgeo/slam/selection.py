@@ -58,11 +58,11 @@ class Selection:
         for keyframe, count in zip(keyframes, counts, strict=True):
             known = np.isfinite(keyframe.samples.prior)
             taken = np.ones(len(known), bool)
-            if settings.lines.two_ends_lines:
-                taken = spread_samples(keyframe.sample_segment, settings.lines.segment_samples)
+            if settings.line.two_ends_lines:
+                taken = spread_samples(keyframe.sample_segment, settings.line.segment_samples)
             length = np.bincount(keyframe.sample_segment[taken], minlength=len(count))
-            if settings.lines.two_ends_lines:
-                length = np.full_like(length, settings.lines.segment_samples)
+            if settings.line.two_ends_lines:
+                length = np.full_like(length, settings.line.segment_samples)
             order = np.argsort(-count, kind="stable")
             order = order[count[order] > 0]
             order = order[np.cumsum(length[order]) <= settings.window.line_slots]

@@ -81,12 +81,12 @@ class LineSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.SlamSettings(lines=vg.LineSettings(use_lines=False)).lines.use_lines
+        >>> vg.SlamSettings(line=vg.LineSettings(use_lines=False)).line.use_lines
         False
 
     """
 
-    group: ClassVar[str] = "lines"
+    group: ClassVar[str] = "line"
     use_lines: bool = switch(True)
     line_gate: float = positive(12.0)
     """Largest distance of a line sample from its matched segment, before each adjustment, pixels."""
@@ -126,17 +126,17 @@ class DepthSettings(CheckedSettings):
 
 
 @dataclass(frozen=True)
-class ConfidenceSettings(CheckedSettings):
+class WeightSettings(CheckedSettings):
     """Weight of a match: `gain * confidence + floor`.
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.ConfidenceSettings(use_confidence=False).confidence_floor
+        >>> vg.WeightSettings(use_confidence=False).confidence_floor
         0.1
 
     """
 
-    group: ClassVar[str] = "confidence"
+    group: ClassVar[str] = "weights"
     use_confidence: bool = switch(True)
     confidence_gain: float = not_negative(1.0)
     confidence_floor: float = not_negative(0.1)

@@ -20,13 +20,13 @@ from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector,
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.setting_groups import (
     CameraSettings,
-    ConfidenceSettings,
     DepthSettings,
     KeyframeSettings,
     LineSettings,
     MatchingSettings,
     RefinementSettings,
     TrackingSettings,
+    WeightSettings,
     WindowSettings,
 )
 
@@ -72,7 +72,7 @@ class SlamSettings:
 
     Example:
         >>> import vggtgeo as vg
-        >>> settings = vg.SlamSettings(window=vg.WindowSettings(size=8), lines=vg.LineSettings(manhattan=True))
+        >>> settings = vg.SlamSettings(window=vg.WindowSettings(size=8), line=vg.LineSettings(manhattan=True))
         >>> settings.window.size, settings.tracking.least_inliers
         (8, 50)
 
@@ -81,9 +81,9 @@ class SlamSettings:
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     matching: MatchingSettings = field(default_factory=MatchingSettings)
-    lines: LineSettings = field(default_factory=LineSettings)
+    line: LineSettings = field(default_factory=LineSettings)
     depth: DepthSettings = field(default_factory=DepthSettings)
-    confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
+    weights: WeightSettings = field(default_factory=WeightSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
@@ -91,7 +91,7 @@ class SlamSettings:
     @property
     def padded_samples(self) -> int | None:
         """Samples of a segment in a problem's padded size; None where samples stand alone."""
-        return self.lines.segment_samples if self.lines.two_ends_lines else None
+        return self.line.segment_samples if self.line.two_ends_lines else None
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -101,6 +101,6 @@ class SlamSettings:
         samples = self.padded_samples
         if samples is not None and self.window.line_slots % samples:
             raise InputError(
-                f"`window.line_slots` is {self.window.line_slots}; with `lines.two_ends_lines` it must be a multiple "
-                f"of `lines.segment_samples`, which is {samples}"
+                f"`window.line_slots` is {self.window.line_slots}; with `line.two_ends_lines` it must be a multiple "
+                f"of `line.segment_samples`, which is {samples}"
             )

@@ -51,7 +51,7 @@ def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State
         point_landmark=np.zeros(1, int),
         point_target=np.zeros((1, 2)),
         point_weight=np.ones(1),
-        segment=np.full(1, -1) if settings.lines.two_ends_lines else None,
+        segment=np.full(1, -1) if settings.line.two_ends_lines else None,
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
     intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
@@ -150,7 +150,7 @@ def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
     """How many factors of each kind a window holds: one static shape for all windows of a run."""
     room: dict[type, int] = {MeasuredRelativePose: 2 * settings.window.size}
     room |= {} if metric else {MeasuredBaseline: 1}
-    return room | ({MeasuredRotation: settings.window.size} if settings.lines.manhattan else {})
+    return room | ({MeasuredRotation: settings.window.size} if settings.line.manhattan else {})
 
 
 def window_edges(slam: Slam) -> list[Directed]:
