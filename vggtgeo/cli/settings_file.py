@@ -52,7 +52,8 @@ def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
     """The file's values become the defaults of the command's other parameters."""
     if path is None or context.resilient_parsing:
         return SettingsInUse(context)
-    given, tables = _read(path), {}
+    given = _read(path)
+    tables: dict[str, dict[str, Any]] = {}
     if any(parameter.name == "assignments" for parameter in context.command.params):
         tables = {key: value for key, value in given.items() if isinstance(value, dict)}
     flags = {key: value for key, value in given.items() if key not in tables}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from vggtgeo.slam.setting_groups import is_kernel
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
 
-KERNELS: dict[str, type[AbstractKernel]] = {
+KERNELS: dict[str, Callable[..., AbstractKernel]] = {
     kind.__name__.lower(): kind for kind in (Barron, Cauchy, GemanMcClure, Huber, Square)
 }
 GROUPS = tuple(entry.name for entry in dataclasses.fields(SlamSettings))
@@ -86,7 +86,7 @@ def changed(settings: SlamSettings) -> dict[str, dict[str, Any]]:
 
 
 def _plain(group: CheckedSettings) -> dict[str, Any]:
-    values = {entry.name: getattr(group, entry.name) for entry in dataclasses.fields(group)}  # type: ignore[arg-type]
+    values = {entry.name: getattr(group, entry.name) for entry in dataclasses.fields(group)}
     texts = {name: _kernel_text(value) for name, value in values.items() if isinstance(value, AbstractKernel)}
     numbers = {name: value.item() for name, value in values.items() if isinstance(value, np.generic)}
     return {**values, **texts, **numbers}
@@ -107,6 +107,7 @@ def _value(name: str, value: Any) -> Any:
 
 def _kernel(name: str, text: str) -> AbstractKernel:
     kind, *numbers = text.split() or [""]
+    kernel: AbstractKernel | None
     try:
         kernel = KERNELS[kind.lower()](*map(float, numbers))
     except (KeyError, TypeError, ValueError):
