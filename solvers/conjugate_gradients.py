@@ -20,7 +20,6 @@ from vggtgeo.solvers.arrow import (
     ArrowVector,
     back_substitute,
     carry_to_nodes,
-    couple,
     dense_gradient,
     from_relative,
     hessian_times,
@@ -50,16 +49,6 @@ class AbstractProduct(eqx.Module):
     @abc.abstractmethod
     def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
         """`W V^-1 W' dense`."""
-
-
-class ImplicitProduct(AbstractProduct):
-    """Through the landmarks: two passes over the cross terms `[n, b k + q + 2, s]` a product, nothing stored."""
-
-    def prepare(self, system: ArrowSystem) -> Array:
-        return inverse_landmark_hessian(system)
-
-    def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
-        return carry_to_nodes(system, prepared * couple(system, dense, 0.0))
 
 
 class HostProduct(AbstractProduct):

@@ -19,7 +19,6 @@ from vggtgeo.solvers.conjugate_gradients import (
     BlockJacobi,
     ConjugateGradients,
     HostProduct,
-    ImplicitProduct,
 )
 from vggtgeo.solvers.flat_directions import flat_stiffness
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
@@ -39,7 +38,6 @@ TIGHT: dict[str, Any] = {"rtol": 1e-13, "max_iterations": 400}
 SOLVERS = {
     "band": BandCholesky(REACH),
     "conjugate gradients, block Jacobi": ConjugateGradients(BlockJacobi(), HostProduct(), **TIGHT),
-    "conjugate gradients, nothing stored": ConjugateGradients(BlockJacobi(), ImplicitProduct(), **TIGHT),
     "conjugate gradients, narrow band": ConjugateGradients(BandPreconditioner(1), HostProduct(), **TIGHT),
 }
 Step = tuple[ArrowVector, jax.Array]

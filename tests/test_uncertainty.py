@@ -1,6 +1,5 @@
 """Covariances: against dense inverses of the energy's own Hessian, and against the errors of 200 solved problems."""
 
-import functools
 from collections.abc import Callable
 
 import degenerate_scenes as lacking
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import monte_carlo
 import numpy as np
 import pytest
-from degenerate_scenes import QUICK, WELL, packed
+from degenerate_scenes import WELL, packed
 from test_arrow import DENSE, assemble, free_part, random_system
 from vggtgeo.solvers.arrow import ArrowVector
 from vggtgeo.solvers.covariance import covariance
@@ -30,10 +29,10 @@ Estimate = Callable[[Problem, State], Covariances]
 @pytest.fixture(scope="module")
 def estimated() -> Estimate:
     """`covariances`, compiled once for all tests of this file."""
-    return jax.jit(covariances, compiler_options=QUICK)
+    return jax.jit(covariances)
 
 
-@functools.partial(jax.jit, compiler_options=QUICK)
+@jax.jit
 def dense_information(problem: Problem, state: State) -> jax.Array:
     """Exact Hessian of the readable energy by all unknowns; at zero residuals the Gauss-Newton matrix is the same."""
     slots = state.inverse_depth.shape

@@ -10,7 +10,7 @@ variance of the M-estimator, Huber 1964, against `1 / E[rho']`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,9 +32,6 @@ DENSE_KEYFRAMES = 300
 """Most keyframes whose information is inverted as a dense matrix: 26 MB, some seconds."""
 ITERATIVE_KEYFRAMES = 32
 """Most keyframes whose covariances are solved for column by column: some 60 systems each."""
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class Covariances(Readable):
@@ -89,22 +86,6 @@ class Covariances(Readable):
             "inverse_depths_determined": int(np.isfinite(np.asarray(self.inverse_depth)).sum()),
             "variance_factor": float(self.variance_factor),
         }
-
-    def plot(
-        self, state: State, truth: Float[np.ndarray, "n 3"] | None = None, *, sigmas: float | None = None
-    ) -> Figure:
-        """The camera centres of `state` from above, in the axes of its first camera, with an ellipse each (outside
-        `jit`, for one solution).
-
-        Args:
-            state: the solution that the covariances belong to.
-            truth: camera centres in the world, metres, where they are known.
-            sigmas: standard deviations that the ellipses reach; by default as many as can be seen well.
-
-        """
-        from vggtgeo.figures.uncertainty import covariance_figure
-
-        return covariance_figure(self, state, truth, sigmas)
 
     def __str__(self) -> str:
         blocks = np.asarray(self.poses, np.float64)[:, :3, :3]
