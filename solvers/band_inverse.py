@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
-from vggtgeo.solvers.arrow import ArrowSystem
+from vggtgeo.solvers.arrow import ArrowSystem, dense_gradient
 from vggtgeo.solvers.bands import Bands, damped_band
 from vggtgeo.solvers.block_band import BandLayout
 from vggtgeo.solvers.block_elimination import (
@@ -47,7 +47,7 @@ def band_elimination(system: ArrowSystem, bands: Bands) -> BandElimination:
     """Eliminate the undamped Schur complement."""
     shared = len(bands.hessian.corner)
     moves = bands.layout.columns(system.free[:, None], shared)
-    scale = bands.layout.columns(balance(system, bands.diagonal)[:, None], shared)
+    scale = bands.layout.columns(_scale(system)[:, None], shared)
     tolerance = rank_tolerance(len(system.free), system.cross.dtype)
     matrix = damped_band(system, bands, jnp.zeros((), system.cross.dtype))
     found = eliminate(matrix, moves, scale, tolerance)
@@ -60,7 +60,7 @@ def band_inverse(system: ArrowSystem, bands: Bands, hosts: Int[Array, " h"]) -> 
     factor = band_elimination(system, bands)
     known, unknown = (_local(system, factor.layout, part, hosts) for part in selected_inverse(factor.elimination))
     index = local_coordinates(system, hosts)
-    scale = balance(system, bands.diagonal)[index]
+    scale = _scale(system)[index]
     free = system.free[index]
     both = free[:, :, None] & free[:, None, :]
     carried = lambda local: jnp.where(both, local, 0.0) / scale[:, :, None] / scale[:, None, :]
@@ -74,6 +74,13 @@ def band_inverse(system: ArrowSystem, bands: Bands, hosts: Int[Array, " h"]) -> 
         undetermined=(outside > visible(outside.dtype)) & free,
         rank=factor.elimination.rank - (beyond - jnp.sum(system.free)) - jnp.sum(bands.stiffness > 0),
     )
+
+
+def _scale(system: ArrowSystem) -> Float[Array, " c"]:
+    """Root of the Hessian's diagonal, without its sign: of an indefinite one it is negative in places, and a pivot
+    whose rows differ in size by orders of magnitude loses as many digits.
+    """
+    return balance(system, jnp.abs(dense_gradient(system)[1]))
 
 
 def _held_correction(

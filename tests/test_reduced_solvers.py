@@ -227,14 +227,25 @@ def test_the_choice_follows_the_graph() -> None:
     i = np.arange(60)
     chain = np.stack([i[:-2], i[2:]], 1)
     loops = np.stack([i[:5], i[-5:]], 1)
-    scattered = np.stack([i, (i * 31 + 20) % 60], 1)
-    scattered = scattered[scattered[:, 0] != scattered[:, 1]]
     assert choose_reduced_solver(many(20, chain[:18])) == DenseCholesky()
     assert choose_reduced_solver(many(60, chain)) == BandCholesky(2)
-    assert choose_reduced_solver(many(60, np.concatenate([chain, loops]))) == ConjugateGradients(BandPreconditioner(2))
-    assert choose_reduced_solver(many(60, scattered)) == ConjugateGradients()
+    assert choose_reduced_solver(many(60, chain).with_term(no_prior(60, jnp.float64))) == DenseCholesky()
+    closed = choose_reduced_solver(many(60, np.concatenate([chain, loops])))
+    assert isinstance(closed, BandCholesky)
+    assert closed.reach <= 6
     ring = choose_reduced_solver(many(60, np.stack([i, (i + 2) % 60], 1)))
     assert isinstance(ring, BandCholesky)
     assert ring.reach <= 4
     assert sorted(np.asarray(ring.place)) == list(i)
     assert choose_reduced_solver(many(60, chain).with_term(no_prior(60, jnp.float64))) == DenseCholesky()
+    # Random chords make a graph without any narrow order.
+    many_nodes = np.arange(200)
+    chain = np.stack([many_nodes[:-2], many_nodes[2:]], 1)
+    chords = np.random.default_rng(0).permutation(200).reshape(-1, 2)
+    chords = chords[np.abs(chords[:, 0] - chords[:, 1]) > 20]
+    assert choose_reduced_solver(many(200, np.concatenate([chain, chords]))) == ConjugateGradients(
+        BandPreconditioner(2)
+    )
+    scattered = np.random.default_rng(1).integers(0, 200, (600, 2))
+    scattered = np.unique(scattered[scattered[:, 0] != scattered[:, 1]], axis=0)
+    assert choose_reduced_solver(many(200, scattered)) == ConjugateGradients()
