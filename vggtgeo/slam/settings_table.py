@@ -119,5 +119,5 @@ def _kernel(name: str, text: str) -> AbstractKernel:
 
 
 def _kernel_text(kernel: AbstractKernel) -> str:
-    fields = dataclasses.fields(kernel)  # type: ignore[arg-type]
+    fields = dataclasses.fields(kernel)
     return " ".join((type(kernel).__name__.lower(), *(repr(float(getattr(kernel, entry.name))) for entry in fields)))
