@@ -11,7 +11,6 @@ from degenerate_scenes import (
     HELD,
     KEYFRAMES,
     POINTS,
-    QUICK,
     WELL,
     one_plane,
     packed,
@@ -38,7 +37,7 @@ NO_PRIOR = {"intrinsics_sigma": None}
 @pytest.fixture(scope="module")
 def observed() -> Observe:
     """`observability`, compiled once for all tests of this file."""
-    return jax.jit(observability, compiler_options=QUICK)
+    return jax.jit(observability)
 
 
 @pytest.mark.parametrize(

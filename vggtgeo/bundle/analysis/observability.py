@@ -30,9 +30,12 @@ from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
-from vggtgeo.solvers.arrow import ArrowSystem, NodeFactors, reduce
-from vggtgeo.solvers.covariance import balance
+from vggtgeo.solvers.arrow import ArrowSystem, NodeFactors, dense_gradient, reduce
+from vggtgeo.solvers.local_inverse import balance
 from vggtgeo.solvers.segments import join_segments
+
+DENSE_KEYFRAMES = 300
+"""Most keyframes whose spectra are computed: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
 
 
 def observability(problem: Problem, state: State) -> Observability:
@@ -42,17 +45,27 @@ def observability(problem: Problem, state: State) -> Observability:
         problem: observations and priors; the kernel's weights at `state` count, so outliers say little.
         state: where to linearise, best a solution.
 
+    Raises:
+        ValueError: more keyframes than a dense spectrum is for; `covariances` takes any number.
+
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.jit(vg.observability)(problem, solution.state)
         >>> bool(found.whole.values[0, 0] > 1e-6)  # nothing is undetermined
         True
 
     """
+    if problem.num_keyframes > DENSE_KEYFRAMES:
+        raise ValueError(
+            f"`observability` of {problem.num_keyframes} keyframes would take {2 * len(problem.terms) + 1} dense "
+            f"spectra of {problem.num_camera} coordinates; above {DENSE_KEYFRAMES} keyframes look at a part of the "
+            "map, or at `covariances(problem, state, reduced_solver=choose_reduced_solver(problem))`: it is infinite "
+            "where nothing determines a coordinate"
+        )
     ready = prepared(problem)
     systems = [linearise(replace(ready.with_terms((term,)), fraction=None), state) for term in ready.terms]
     count = len(systems)
     everything = _combine(systems, jnp.ones(count, state.inverse_depth.dtype), problem.fraction)
-    scale = balance(everything, reduce(everything))
+    scale = balance(everything, dense_gradient(everything)[1])
     free = everything.free
     directions = jnp.where(free, named_directions(problem, state), 0.0)
     selections = jnp.concatenate([jnp.ones((1, count)), jnp.eye(count), 1 - jnp.eye(count)]).astype(scale.dtype)

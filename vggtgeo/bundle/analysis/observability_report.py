@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.analysis.directions import direction_names
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.covariance import rank_tolerance
+from vggtgeo.solvers.local_inverse import rank_tolerance
 
 WEAK = 1e-6
 """Eigenvalue below which a direction is weak: its standard deviation is a thousand times what it were if all else were
