@@ -40,7 +40,7 @@ def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
         InputError: a name that is no setting, or a value that it may not have.
 
     """
-    groups: dict[str, CheckedSettings] = {}
+    groups: dict[str, Any] = {}
     for group, values in tables.items():
         if group not in GROUPS:
             raise InputError(f"`{group}` is no group of settings; it must be one of {', '.join(GROUPS)}")
