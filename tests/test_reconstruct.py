@@ -96,6 +96,15 @@ def test_the_notebook_and_the_command_line_write_the_same_folder(folder: Path, t
     for changing in ("settings", "seconds_by_stage", "frames_per_second", "peak_memory_gb"):
         del first[changing], second[changing]
     assert first == second
+    again = tmp_path / "again"
+    done = CliRunner().invoke(
+        make_app(), ["run", "--settings", str(program / "settings.toml"), "-o", str(again), "--no-quiet"]
+    )
+    assert done.exit_code == 0, done.output
+    assert done.stdout.strip().splitlines()[-1] == f"verdict: {result.verdict.level}"
+    assert (again / "trajectory.txt").read_bytes() == (program / "trajectory.txt").read_bytes()
+    written = [tomllib.loads((place / "settings.toml").read_text()) for place in (program, again)]
+    assert written[1] == {**written[0], "output": str(again), "quiet": False}
 
 
 def test_a_saved_result_is_read_again(folder: Path, tmp_path: Path) -> None:

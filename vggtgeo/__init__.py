@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from vggtgeo import learning as learning
     from vggtgeo.bundle.analysis.covariances import Covariances as Covariances
     from vggtgeo.bundle.analysis.covariances import covariances as covariances
-    from vggtgeo.bundle.analysis.observability import Observability as Observability
     from vggtgeo.bundle.analysis.observability import observability as observability
+    from vggtgeo.bundle.analysis.observability_report import Observability as Observability
     from vggtgeo.bundle.batches import pack_batch as pack_batch
     from vggtgeo.bundle.batches import solve_batch as solve_batch
     from vggtgeo.bundle.graduation import Graduation as Graduation
@@ -126,7 +126,8 @@ _HOME = {
     "bundle.terms.view": ("View",),
     "geometry.cameras": ("AbstractCamera", "KannalaBrandt", "Pinhole", "RadialTangential"),
     "bundle.marginalisation": ("marginalise", "no_prior", "reorder"),
-    "bundle.analysis.observability": ("Observability", "observability"),
+    "bundle.analysis.observability": ("observability",),
+    "bundle.analysis.observability_report": ("Observability",),
     "bundle.packing": ("Observations", "PaddedSize", "pack"),
     "paper_bench.runner": ("BenchReport", "bench"),
     "bundle.problem": ("Problem", "State"),

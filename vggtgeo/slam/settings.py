@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
@@ -95,8 +96,9 @@ class SlamSettings:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            kind, value = entry.default_factory, getattr(self, entry.name)
-            if not (isinstance(kind, type) and isinstance(value, kind)):
+            kind: Any = entry.default_factory
+            value = getattr(self, entry.name)
+            if not isinstance(value, kind):
                 raise InputError(f"`{entry.name}` is {value!r}; it must be a `vggtgeo.{entry.type}`")
         samples = self.padded_samples
         if samples is not None and self.window.line_slots % samples:

@@ -40,7 +40,7 @@ def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
         InputError: a name that is no setting, or a value that it may not have.
 
     """
-    groups: dict[str, CheckedSettings] = {}
+    groups: dict[str, Any] = {}
     for group, values in tables.items():
         if group not in GROUPS:
             raise InputError(f"`{group}` is no group of settings; it must be one of {', '.join(GROUPS)}")
@@ -119,5 +119,5 @@ def _kernel(name: str, text: str) -> AbstractKernel:
 
 
 def _kernel_text(kernel: AbstractKernel) -> str:
-    fields = dataclasses.fields(kernel)  # type: ignore[arg-type]
+    fields = dataclasses.fields(kernel)
     return " ".join((type(kernel).__name__.lower(), *(repr(float(getattr(kernel, entry.name))) for entry in fields)))
