@@ -23,8 +23,8 @@ from scenes import Scene
 from vggtgeo.solvers.arrow import ArrowVector
 
 from vggtgeo.bundle.analysis.directions import MOTIONS, direction_names, named_directions
-from vggtgeo.bundle.analysis.observability import WEAK, Observability, observability
-from vggtgeo.bundle.analysis.observability_report import undetermined_landmarks, weak_directions
+from vggtgeo.bundle.analysis.observability import observability
+from vggtgeo.bundle.analysis.observability_report import WEAK, Observability, undetermined_landmarks, weak_directions
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State
 
