@@ -27,11 +27,13 @@ install_import_hook("vggtgeo", "typechecker.check")
 
 LONGEST = (
     "test_pipeline",
-    "test_gradients",
     "test_notebooks",
+    "test_gradients",
     "test_tracking",
     "test_user_terms",
     "test_optimised",
+    "test_examples",
+    "test_batches",
 )
 """Files of more than 30 s: they begin, so that no worker waits long for another's last file (`make test` keeps this
 order by `--no-loadscope-reorder`; pytest-xdist would begin with the files of most tests)."""

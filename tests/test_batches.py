@@ -19,8 +19,8 @@ from vggtgeo.bundle.solution import solve
 from vggtgeo.io.errors import InputError
 
 SOLVER = SchurLevenbergMarquardt(max_iterations=40, rtol=1e-12)
-SCENES = [
-    make_scene(3, points=6, lines=1, samples=3, noise=0.5, seed=1),
+SCENES = [  # two shapes, to compile no more than those
+    make_scene(3, points=4, lines=2, samples=4, noise=0.5, seed=1),
     make_scene(4, points=9, lines=0, noise=0.5, seed=2),
     make_scene(3, points=4, lines=2, samples=4, noise=0.5, seed=3),
 ]

@@ -39,7 +39,7 @@ def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
     monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
     monkeypatch.setattr("vggtgeo.results.reconstruction.run_frames", interrupted)
     (tmp_path / "trajectory.txt").write_text("of an earlier run")
-    result = CliRunner().invoke(make_app(), ["demo", "--frames", "3", "-o", str(tmp_path), "--json"])
+    result = CliRunner().invoke(make_app(), ["demo", "--scene", "room", "--frames", "3", "-o", str(tmp_path), "--json"])
     assert result.exit_code == 130, result.output
     assert result.stderr.strip() == "interrupted"
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("trajectory.txt", "of an earlier run")]

@@ -12,10 +12,14 @@ import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 LONGEST_CELL = 25
-SMALL_WINDOW = "window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False"
+WINDOW = "size=6, point_slots=160, line_slots=64)"
+SMALL_WINDOW = (
+    "size=4, point_slots=96, line_slots=48, window_iterations=8), "
+    "refinement=vg.RefinementSettings(global_adjustment=False)"
+)
 # What the quick test replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.
 SHORTER: dict[str, dict[str, str]] = {
-    "own_video": {"frames=45": "frames=16", "window=6, point_slots=160, line_slots=64": SMALL_WINDOW},
+    "own_video": {"frames=45": "frames=16", WINDOW: SMALL_WINDOW},
     "evaluate": {'"small"': '"small", scenes=["room"], seeds=1'},
     "differentiate": {
         "tracked_windows(sequence, 8,": "tracked_windows(sequence, 3,",

@@ -86,7 +86,9 @@ def test_a_run_asks_every_network_and_from_a_cache_none(
         assert set(counted) == expected
         said = found.facts()["networks"]
         assert {name: network["calls"] for name, network in said.items() if network["calls"]} == counted
-        assert all((network["seconds"] > 0) == (network["calls"] > 0) for network in said.values())
+        # Rounded to milliseconds, so a single tiny network may well have taken none.
+        assert not any(network["seconds"] for network in said.values() if not network["calls"])
+        assert (sum(network["seconds"] for network in said.values()) > 0) == bool(expected)
         assert len(slam.frames) == 8
         assert len(slam.keyframes) >= 2
         poses.append(frame_trajectory(slam).poses)
