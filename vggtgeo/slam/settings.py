@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +13,7 @@ from vggtgeo.models.classical import (
     BandLineMatcher,
     LsdDetector,
     NoDepth,
+    OrbMatcher,
     PnpGeometry,
     SensorDepth,
     SiftMatcher,
@@ -44,13 +45,23 @@ class Roles:
     alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
     """Aligns a frame's picture and depth to a keyframe's as a whole, beside its key points; None leaves that out."""
 
-    def tracking_depth(self, sensor_depth: np.ndarray | None) -> np.ndarray | None:
-        """What of a frame's own depth is used to track it; a network's depth costs too much for every frame."""
+    def tracking_depth(self, sensor_depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
+        """What of a frame's own depth is used to track it, metres and relative standard deviation, float32 [H, W].
+
+        Jumps are not looked for: the alignment leaves them out. A network's depth costs too much for every frame.
+        """
         if sensor_depth is None or not isinstance(self.depth, SensorDepth):
             return None
         near, far = self.depth.nearest, self.depth.farthest
         with np.errstate(invalid="ignore"):
-            return np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.nan)
+            depth = np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.float32(np.nan))
+        return depth, self.depth.noise(depth)
+
+    @property
+    def coarse_points(self) -> PointMatcher:
+        """The matcher without sub-pixel refinement, for poses that an alignment of the whole picture refines anyway."""
+        refined = isinstance(self.points, SiftMatcher | OrbMatcher) and self.points.refinement is not None
+        return replace(self.points, refinement=None) if refined else self.points  # type: ignore[type-var]
 
     @property
     def metric(self) -> bool:
@@ -113,9 +124,12 @@ class SlamSettings:
     depth_trust: str = "own"
     """What scales the depth prior of a pixel. "own": the confidence of the depth itself; "saliency": the Omega that
     weights the matches, as in the paper's formula; "complement": 1 - Omega, as the paper's text describes it."""
-    known_intrinsics_sigma: float = 1e-4
+    known_intrinsics_sigma: float = 1e-6
     """Standard deviation of the prior on known intrinsics, relative to the focal length: so small that they are held.
-    With 1 % they took up every error of the poses, 495.6 became 424 on building-walk."""
+    With 1 % they took up every error of the poses, 495.6 became 424 on building-walk; with 0.01 % still 493."""
+    refine_intrinsics: str = "auto"
+    """Whether the last adjustment may move known intrinsics: "auto", where the images determine them and it pays (see
+    `slam/calibration.py`); "always", where the images determine them; "never"."""
     guessed_intrinsics_sigma: float = 0.3
     """The same for guessed ones."""
     window_iterations: int = 12
@@ -144,6 +158,8 @@ class SlamSettings:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
         if self.depth_trust not in ("own", "saliency", "complement"):
             raise InputError(f"`depth_trust` is {self.depth_trust!r}; it must be own, saliency or complement")
+        if self.refine_intrinsics not in ("auto", "always", "never"):
+            raise InputError(f"`refine_intrinsics` is {self.refine_intrinsics!r}; it must be auto, always or never")
         if self.two_ends_lines and (self.segment_samples < 2 or self.line_slots % self.segment_samples):
             raise InputError(
                 f"`segment_samples` is {self.segment_samples} and `line_slots` {self.line_slots}; with "
