@@ -66,6 +66,14 @@ def run(
     ] = True,
     init: Annotated[Init, typer.Option(help="How a new frame's pose starts.")] = "pnp",
     features: Annotated[Features, typer.Option(help="Key points.")] = "sift",
+    refine_intrinsics: Annotated[
+        bool | None,
+        typer.Option(
+            "--refine-intrinsics/--fix-intrinsics",
+            help="Whether the last adjustment may move known intrinsics; by default where it pays.",
+            show_default=False,
+        ),
+    ] = None,
     preset: Annotated[
         Preset, typer.Option(help="Who perceives: classical code, or networks (see `vggtgeo models list`).")
     ] = "classical",
@@ -105,6 +113,7 @@ def run(
         use_confidence=confidence,
         depth_weight=SlamSettings.depth_weight if depth_prior else 0.0,
         global_adjustment=global_adjustment,
+        refine_intrinsics="auto" if refine_intrinsics is None else "always" if refine_intrinsics else "never",
     )
     if preset == "paper" and features != "sift":
         raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
