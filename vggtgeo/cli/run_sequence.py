@@ -257,6 +257,8 @@ def _print_report(
         lines.append("scale: free, there is no metric depth; lengths have no unit")
     elif not verdict.metric:
         lines.append("scale: doubtful, lengths may be no metres")
+    else:
+        lines.append(f"scale: metric, by {outputs.SCALE_BASIS}")
     if report is not None:
         se3, sim3 = report.se3.statistics.rmse, report.sim3.statistics.rmse
         lines.append(f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment")
