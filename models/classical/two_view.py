@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_array
-from vggtgeo.models.classical.pinhole import intrinsics_matrix
 from vggtgeo.models.roles import GeometryResult, StartGuess
 
 
@@ -54,7 +54,7 @@ class TwoViewStart:
             essential, mask = cv2.findEssentialMat(
                 np.ascontiguousarray(pixels_i, dtype=np.float64),
                 np.ascontiguousarray(pixels_j, dtype=np.float64),
-                intrinsics_matrix(intrinsics),
+                pinhole.matrix(intrinsics),
                 cv2.USAC_MAGSAC,
                 self.confidence,
                 self.threshold,
@@ -76,8 +76,7 @@ class TwoViewStart:
 
 
 def _rays(pixels: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    fx, fy, cx, cy = (float(value) for value in intrinsics)
-    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
+    rays = pinhole.rays(pixels, intrinsics)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
