@@ -30,7 +30,7 @@ def pairs(window: vg.SimulatedWindow) -> list[CameraPair]:
         landmark = seen.point_landmark[rows]
         relative = poses[target] @ rigid.invert(poses[host])
         depth = 1.0 / seen.depth_mean[landmark]
-        found.append(CameraPair(seen.pixel[landmark], seen.point_target[rows], depth, relative, min(host, target)))
+        found.append(CameraPair(seen.pixel[landmark], seen.point_target[rows], depth, relative, int(min(host, target))))
     return found
 
 

@@ -25,8 +25,9 @@ LEAST_FLOW = 3.0
 """Pixels: a camera that stands still says nothing of its lens."""
 BLOCK = 5
 """Frames in a block of time."""
-SIGMAS = 5.0
-"""How sure a deviation must be to be told."""
+SIGMAS, CHANCE = 5.0, 1e-4
+"""How sure a deviation must be to be told: standard deviations, and with few blocks of time what Student's t makes of
+this chance. Forty frames of redkitchen "wanted" the principal point 48 px away."""
 MOST_MOVED = 0.05
 """Of the focal length: how far a run may move the camera to count as settled. Healthy ones moved it by at most 3.8 %
 with a loose prior, and by less than 1 % with the one that holds it."""
@@ -54,7 +55,8 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
     found = []
     focal, x, y, radial = (float(value) for value in opinion.value)
     moved = bool(np.any(np.abs(estimate.intrinsics - estimate.given) > MOST_MOVED * estimate.given[0]))
-    sure = np.abs(opinion.value) > (0.8 if moved else 1.0) * SIGMAS * opinion.sigma
+    needed = max(SIGMAS, opinion.quantile(CHANCE))
+    sure = np.abs(opinion.value) > (0.8 if moved else 1.0) * needed * opinion.sigma
     much = 0.5 if moved else 1.0
     if sure[0] and abs(focal) > much * MOST_FOCAL:
         wanted = float(np.exp(focal) * estimate.intrinsics[0])
