@@ -74,7 +74,7 @@ def match_keyframes(
     for one, other in ((first, second), (second, first)):
         seen = some_points(one, intrinsics)
         if len(seen):
-            if overlap(seen, other, intrinsics) < settings.least_overlap:
+            if overlap(seen, other, intrinsics) < settings.matching.least_overlap:
                 return None
             break
     relative = second.pose @ rigid.invert(first.pose)
@@ -82,7 +82,7 @@ def match_keyframes(
     points = points.select(_consistent(points, first, relative, intrinsics, settings))
     view = RelativeView(relative, intrinsics, first.line_depths)
     lines = roles.line_matches.match(first.lines, second.lines, view)
-    if len(points) < settings.least_matches and len(lines) < settings.least_line_matches:
+    if len(points) < settings.matching.least_matches and len(lines) < settings.matching.least_line_matches:
         return None
     return Pair(first.number, second.number, points, lines)
 
@@ -126,4 +126,6 @@ def _consistent(
     normal = np.cross(relative[:3, 3], ray @ relative[:3, :3].T)
     lever = np.linalg.norm(normal[:, :2], axis=1)
     epipolar = np.abs((normal * seen).sum(1)) / np.maximum(lever, 1e-12) * float(intrinsics[0])
-    return np.where(known, off < settings.match_gate, (epipolar < settings.epipolar_gate) | (lever < 1e-9))
+    return np.where(
+        known, off < settings.matching.match_gate, (epipolar < settings.matching.epipolar_gate) | (lever < 1e-9)
+    )

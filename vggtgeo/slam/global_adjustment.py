@@ -53,7 +53,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = _surfaces(slam)
     given = slam.given_intrinsics
-    for number in range(settings.global_rounds):
+    for number in range(settings.refinement.global_rounds):
         adjustment = build(
             slam.keyframes,
             edges,
@@ -66,7 +66,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             terms=_terms(slam, surfaces, settings),
         )
         solver = SchurLevenbergMarquardt(
-            max_iterations=settings.global_iterations,
+            max_iterations=settings.refinement.global_iterations,
             rtol=1e-5,
             reduced_solver=choose_reduced_solver(adjustment.problem),
         )
@@ -74,7 +74,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
         slam = _taken(slam, adjustment, solution.state)
-        if number == 0 and slam.calibrated and settings.refine_intrinsics != "never":
+        if number == 0 and slam.calibrated and settings.camera.refine_intrinsics != "never":
             again = lambda problem, state, solver=solver: solve_jit(problem, state, solver=solver).state
             found = try_camera(keyframe_pairs(slam, edges), adjustment.problem, solution.state, again)
             before, slam = slam, _taken_camera(slam, adjustment, found, settings)
@@ -98,7 +98,7 @@ def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, 
     if found is None:
         return slam
     notes = [*slam.notes, *_lens_note(found, slam.keyframes[0].image.shape)]
-    always = settings.refine_intrinsics == "always"
+    always = settings.camera.refine_intrinsics == "always"
     if found.state is not None and (found.pays or always):
         slam = _taken(slam, adjustment, found.state)
         if found.change > MUCH:
@@ -124,10 +124,10 @@ def _terms(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> tuple
     for factor in slam.factors:
         room[type(factor)] = room.get(type(factor), 0) + 1
     terms = factor_terms(slam.factors, places, room)
-    if not surfaces or settings.surface_points <= 0:
+    if not surfaces or settings.depth.surface_points <= 0:
         return terms
     pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
-    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.surface_points))
+    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points))
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:
@@ -135,7 +135,7 @@ def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list
     kept = []
     for host in range(keyframes):
         own = sorted((edge for edge in edges if edge.host == host), key=lambda edge: -len(edge.slots))
-        kept += own[: settings.global_neighbours]
+        kept += own[: settings.refinement.global_neighbours]
     return kept
 
 
@@ -145,14 +145,16 @@ def _candidates(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]])
     samples = [some_points(keyframe, slam.intrinsics) for keyframe in slam.keyframes]
     for second in slam.keyframes:
         scored = []
-        for first in slam.keyframes[: max(second.number - settings.window, 0)]:
+        for first in slam.keyframes[: max(second.number - settings.window.size, 0)]:
             if (first.number, second.number) in known:
                 continue
             share = overlap(samples[first.number], second, slam.intrinsics)
             turned = rigid.angle_between(first.pose, second.pose)
             if share > 0.4 and turned < np.deg2rad(40):
                 scored.append((share - turned, first.number))
-        chosen += [(number, second.number) for _, number in sorted(scored, reverse=True)[: settings.loop_candidates]]
+        chosen += [
+            (number, second.number) for _, number in sorted(scored, reverse=True)[: settings.refinement.loop_candidates]
+        ]
     return chosen
 
 
@@ -166,7 +168,7 @@ def _verified(
     matches, inverse = matches.select(known), inverse[known]
     points = rigid.unproject(matches.pixels_i, inverse, first.pose, intrinsics)
     guess = roles.geometry.locate(PoseQuery(second.image, intrinsics, points, matches.pixels_j, matches.confidence))
-    if guess.result is not GeometryResult.SUCCESS or guess.inlier_count <= settings.least_covisible:
+    if guess.result is not GeometryResult.SUCCESS or guess.inlier_count <= settings.matching.least_covisible:
         return None
     empty = np.zeros(0, int)
     return Pair(first.number, second.number, matches.select(guess.inliers), LineMatches(empty, empty, np.zeros(0)))
