@@ -6,7 +6,7 @@ a whole map knows better. So, once, in the last adjustment:
 1. Pairs of keyframes with depth say what camera they want, with the distortion of the lens free, and how surely
    (`camera_of_pairs.py`). Left to the adjustment, which knows no distortion, the focal length runs away and still
    predicts better: redkitchen, 525 given, goes to 534 (543 without depth); pairs say 521 +- 3, COLMAP 522 and 520.
-2. That and the prior, of standard deviation `PRIOR`, are averaged by information, in the directions in which the pairs
+2. That and the prior (`PRIOR`, `CENTRE`) are averaged by information, in the directions in which the pairs
    know more than the prior (`SHARE`); `f_x / f_y` stays. In all others the camera stays.
 3. Where the result differs from the given camera by more than chance, a share of the matches is set aside, the map is
    adjusted to the others with either camera held, and both predict the matches that neither has seen. The new camera is
@@ -36,6 +36,8 @@ from vggtgeo.slam.state import Slam
 
 PRIOR = 0.01
 """Standard deviation of a given calibration, relative to the focal length: what makers and calibration tools reach."""
+CENTRE = 0.002
+"""The same of the principal point, whose shift looks like a turn: two clips of one camera "wanted" 1 and 8 px."""
 SHARE = 0.5
 """Most variance of a direction by the pairs, of the prior's, for it to be moved at all."""
 CHANCE = 1e-3
@@ -134,9 +136,9 @@ def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
 def _averaged(opinion: CameraOpinion, given: np.ndarray) -> tuple[np.ndarray, bool]:
     """The mean of prior and pairs, float64 [4], and whether it differs from the given camera by more than chance.
 
-    In units of the prior: `y = (log factor, dx / fx, dy / fx) / PRIOR`, so that its covariance is the unit matrix.
+    In units of the prior, `y = (log factor / PRIOR, (dx, dy) / (CENTRE fx))`: its covariance is the unit matrix.
     """
-    units = np.array([1.0, 1.0 / given[0], 1.0 / given[0]]) / PRIOR
+    units = 1.0 / np.array([PRIOR, CENTRE * given[0], CENTRE * given[0]])
     shares, directions = np.linalg.eigh(opinion.covariance[:3, :3] * np.outer(units, units))
     kept = shares <= SHARE
     along = directions.T @ (units * opinion.value[:3])
