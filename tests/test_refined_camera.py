@@ -58,7 +58,7 @@ def test_a_wrong_camera_is_mended(seed: int) -> None:
     assert left[0] < 0.01 * window.intrinsics[0], found.wanted
     assert left[2:].max() < 1.0, found.wanted
     assert found.wanted[0] / found.wanted[1] == pytest.approx(wrong[0] / wrong[1], rel=1e-6)
-    assert found.change == pytest.approx(np.abs(found.wanted - wrong).max() / wrong[0], rel=1e-6)
+    assert found.change == pytest.approx(np.abs(found.wanted - wrong).max() / wrong[0], rel=1e-4)
 
 
 def test_a_right_camera_is_left_alone() -> None:

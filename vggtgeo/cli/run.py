@@ -55,7 +55,7 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
-    from vggtgeo.cli.pipeline_settings import pipeline_settings
+    from vggtgeo.cli.pipeline_settings import Switches, pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
     from vggtgeo.slam.setting_groups import DepthSettings
@@ -63,7 +63,7 @@ def run(
 
     rerun = check_target(rerun) if rerun else None
     check_flags(preset, features, memory_limit_gb)
-    switches = {
+    switches: Switches = {
         "lines": {"line": {"use_lines": lines}},
         "confidence": {"weights": {"use_confidence": confidence}},
         "depth_prior": {"depth": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},

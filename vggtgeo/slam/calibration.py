@@ -119,8 +119,8 @@ def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
     """Matches of keyframes with a depth that is no result of the camera: the measured one, else the estimate."""
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
     found = []
-    chosen = np.unique(np.linspace(0, len(edges) - 1, MOST_PAIRS).astype(int)) if edges else []
-    for edge in (edges[row] for row in chosen):
+    chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MOST_PAIRS).astype(int))
+    for edge in (edges[row] for row in chosen if row < len(edges)):
         host, target = by_number[edge.host], by_number[edge.target]
         inverse = (host.points.prior if slam.metric else host.points.inverse_depth)[edge.slots]
         known = np.isfinite(inverse) & (inverse > 0)

@@ -111,7 +111,7 @@ def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, 
 def _lens_note(found: Refinement, shape: tuple[int, ...]) -> list[str]:
     """A word on distortion that is sure and moves corners of the image by more than the noise of matches."""
     (k1, sigma), focal = found.distortion, float(found.given[0])
-    warp = abs(k1) * (np.hypot(*shape[:2]) / 2 / focal) ** 3 * focal
+    warp = abs(k1) * (float(np.hypot(shape[0], shape[1])) / 2 / focal) ** 3 * focal
     if abs(k1) < SURE * sigma or warp < MOST_WARP:
         return []
     return [f"the lens distorts, and the calibration does not say so: k1 about {k1:.3f}, {warp:.0f} px in the corners"]

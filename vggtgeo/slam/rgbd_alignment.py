@@ -66,7 +66,8 @@ class RgbdAlignment:
         rows = None
         for level in reversed(range(LEVELS)):
             step = 2 if level else 1
-            samples = tuple(values[::step] for values in source.samples)
+            points, normals, noise = source.samples
+            samples = points[::step], normals[::step], noise[::step]
             for _ in range(self.iterations[level]):
                 rows = self._rows(source, target, level, samples, motion)
                 if rows is None:
@@ -86,7 +87,7 @@ class RgbdAlignment:
         source: RgbdView,
         target: RgbdView,
         level: int,
-        samples: tuple[np.ndarray, ...],
+        samples: tuple[np.ndarray, np.ndarray, np.ndarray],
         motion: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, tuple[float, float, int, int, float]] | None:
         """Normal equations `H, g` of both terms at `motion`, and how far they agree."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from vggtgeo.models.classical import (
     BandLineMatcher,
     LsdDetector,
     NoDepth,
-    OrbMatcher,
     PnpGeometry,
     SensorDepth,
     SiftMatcher,
@@ -68,8 +68,11 @@ class Roles:
     @property
     def coarse_points(self) -> PointMatcher:
         """The matcher without sub-pixel refinement, for poses that an alignment of the whole picture refines anyway."""
-        refined = isinstance(self.points, SiftMatcher | OrbMatcher) and self.points.refinement is not None
-        return replace(self.points, refinement=None) if refined else self.points  # type: ignore[type-var]
+        points: Any = self.points
+        coarse: PointMatcher = points
+        if getattr(points, "refinement", None) is not None:
+            coarse = replace(points, refinement=None)
+        return coarse
 
     @property
     def metric(self) -> bool:
