@@ -37,6 +37,7 @@ from degradations import DEGRADATIONS, record, write
 
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
@@ -145,18 +146,28 @@ def _measured(case: Case, folder: Path, truth: Path, run: Path, code: int | None
     if code in (0, 3) and (run / "summary.json").is_file():
         summary = json.loads((run / "summary.json").read_text())
         estimate, true = Trajectory.load_tum(run / "trajectory.txt"), Trajectory.load_tum(truth)
-        report = evaluate_trajectory(estimate, true)
+        facts |= _errors(estimate, true)
         facts |= {
             "level": summary["verdict"]["level"],
             "reasons": tuple(summary["verdict"]["reasons"]),
             "scale": summary["scale"],
             "written": summary["frames"],
             "tracked": summary["frames_tracked"],
-            "ate_se3": report.se3.statistics.rmse,
-            "ate_sim3": report.sim3.statistics.rmse,
-            "turn": float(np.degrees(report.relative.rotation_statistics.rmse)),
         }
     return Outcome(case.source, case.name, code, **facts)
+
+
+def _errors(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
+    """None where too few frames have a pose to be compared, as where a run never began."""
+    try:
+        report = evaluate_trajectory(estimate, true)
+    except InputError:
+        return {}
+    return {
+        "ate_se3": report.se3.statistics.rmse,
+        "ate_sim3": report.sim3.statistics.rmse,
+        "turn": float(np.degrees(report.relative.rotation_statistics.rmse)),
+    }
 
 
 def _clip_cases(options: argparse.Namespace) -> Iterator[Case]:

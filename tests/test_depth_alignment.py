@@ -23,6 +23,8 @@ SIZE = (240, 320)
 WALLS = np.array([[1.0, 0.1, -0.05, 1.3], [-0.05, 1.0, 0.1, 1.1], [0.1, -0.1, 1.0, 3.0]])
 """A corner: planes `n . x = c` to the right, below, and ahead."""
 EFFECTIVE = 300.0
+SIGMA = np.array([1 / 256, 1 / 128, 1 / 64])
+"""Relative standard deviation of each view's depth, as by three sensors; exact in float16."""
 
 
 def corner(pose: np.ndarray) -> np.ndarray:
@@ -41,8 +43,8 @@ def moved(pose: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     return expm(twist) @ pose
 
 
-def keyframe(number: int, pose: np.ndarray, depth: np.ndarray) -> Keyframe:
-    """A keyframe that has seen depth alone."""
+def keyframe(number: int, pose: np.ndarray, depth: np.ndarray, sigma: float = 0.01) -> Keyframe:
+    """A keyframe that has seen depth alone, of relative standard deviation `sigma`."""
     none, nobody = np.zeros(0), np.zeros((0, 2))
     slots = Slots(nobody, none, none, none, none, none)
     segments = Segments(np.zeros((0, 2, 2)), none)
@@ -56,6 +58,7 @@ def keyframe(number: int, pose: np.ndarray, depth: np.ndarray) -> Keyframe:
         lines=LineFeatures(segments, None),
         line_depths=nobody,
         depth=depth.astype(np.float16),
+        depth_sigma=np.full(SIZE, sigma, np.float16),
         depth_confidence=np.full(SIZE, 255, np.uint8),
         points=slots,
         samples=slots,
@@ -68,7 +71,7 @@ def keyframes() -> list[Keyframe]:
     """Three views of the corner at their true poses."""
     steps = ([0.0] * 6, [0.1, -0.02, 0.05, 0.02, -0.06, 0.01], [-0.05, 0.06, 0.1, -0.04, 0.05, 0.03])
     poses = [moved(np.eye(4), np.array(step)) for step in steps]
-    return [keyframe(number, pose, corner(pose)) for number, pose in enumerate(poses)]
+    return [keyframe(number, pose, corner(pose), SIGMA[number]) for number, pose in enumerate(poses)]
 
 
 def residuals_of(source: Surface, target: Surface, at: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -76,7 +79,7 @@ def residuals_of(source: Surface, target: Surface, at: np.ndarray) -> tuple[np.n
     fx, fy, cx, cy = target.intrinsics
     rows = []
     for point, normal in zip(source.points.reshape(-1, 3), source.normals.reshape(-1, 3), strict=True):
-        p, facing = at[:3, :3] @ point + at[:3, 3], at[:3, :3] @ normal
+        p, facing, own = at[:3, :3] @ point + at[:3, 3], at[:3, :3] @ normal, point[2]
         if not np.isfinite(normal).all() or p[2] <= 0.1:
             continue
         column, row = round(p[0] / p[2] * fx + cx), round(p[1] / p[2] * fy + cy)
@@ -84,11 +87,11 @@ def residuals_of(source: Surface, target: Surface, at: np.ndarray) -> tuple[np.n
             continue
         q, n = target.points[row, column], target.normals[row, column]
         if np.linalg.norm(p - q) < FARTHEST and n @ facing > LEAST_COSINE:
-            rows.append((p, q, n))
-    p, q, n = (np.array(column) for column in zip(*rows, strict=True))
-    residual, z = np.sum(n * (p - q), 1), q[:, 2]
-    # Depth noise of a structured-light sensor (Nguyen et al., 2012), and 0.3 % of calibration; twice, for two views.
-    sigma = np.sqrt(2 * ((0.0012 + 0.0019 * (z - 0.4) ** 2) ** 2 + (0.003 * z) ** 2))
+            rows.append((p, q, n, own))
+    p, q, n, own = (np.array(column) for column in zip(*rows, strict=True))
+    residual = np.sum(n * (p - q), 1)
+    # Each view's depth has the noise that its keyframe states.
+    sigma = np.sqrt((SIGMA[0] * own) ** 2 + (SIGMA[1] * q[:, 2]) ** 2)
     reach = max(4.7 * np.median(np.abs(residual / sigma)), 3.0)
     weight = np.clip(1 - (residual / sigma / reach) ** 2, 0, None) ** 2 / sigma**2
     return p, q, n, weight * min(EFFECTIVE / len(p), 1.0)
@@ -116,6 +119,16 @@ def test_normal_equations_are_those_of_the_residuals(keyframes: list[Keyframe]) 
     np.testing.assert_allclose(found.hessian, hessian, atol=1e-7 * np.abs(hessian).max())
     np.testing.assert_allclose(found.gradient, gradient, atol=1e-7 * np.abs(gradient).max())
     assert np.abs(gradient).max() > 10
+
+
+def test_a_depth_twice_as_uncertain_knows_a_quarter(keyframes: list[Keyframe]) -> None:
+    # Proves that the noise of a depth is the keyframe's own, and no sensor's formula. Oracle: information is 1/sigma^2.
+    truth = keyframes[1].pose @ rigid.invert(keyframes[0].pose)
+    found = []
+    for factor in (1.0, 2.0):
+        views = [replace(each, depth_sigma=np.full(SIZE, 0.01 * factor, np.float16)) for each in keyframes]
+        found.append(align(0, 1, [Surface.of(each, INTRINSICS) for each in views], truth, EFFECTIVE))
+    np.testing.assert_allclose(found[0].hessian, 4 * found[1].hessian, rtol=2e-2)
 
 
 def test_surfaces_bring_keyframes_back(keyframes: list[Keyframe]) -> None:

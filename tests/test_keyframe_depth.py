@@ -30,6 +30,7 @@ def keyframe(number: int, depth: np.ndarray, slots: Slots | None = None) -> Keyf
         lines=LineFeatures(Segments(np.zeros((0, 2, 2)), none)),
         line_depths=np.zeros((0, 2)),
         depth=depth.astype(np.float16),
+        depth_sigma=np.full(SIZE, 0.01, np.float16),
         depth_confidence=np.full(SIZE, 255, np.uint8),
         points=slots or empty,
         samples=empty,

@@ -45,6 +45,7 @@ WRONG = {
     "weights.confidence_floor": (float("nan"),),
     "camera.known_intrinsics_sigma": (0.0,),
     "camera.guessed_intrinsics_sigma": (-0.3,),
+    "camera.refine_intrinsics": ("sometimes", True),
     "window.size": (2, 10.0),
     "window.point_slots": (0,),
     "window.line_slots": (0,),
@@ -58,7 +59,7 @@ WRONG = {
     "refinement.loop_candidates": (-1, 1.5),
 }
 OTHER = {bool: lambda value: not value, int: lambda value: 2 * value + 2, float: lambda value: 0.5 * value}
-WORDS = {"depth.depth_trust": "saliency", "window.kernel": "huber 1.25"}
+WORDS = {"depth.depth_trust": "saliency", "window.kernel": "huber 1.25", "camera.refine_intrinsics": "never"}
 
 
 def _other(name: str) -> Any:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from vggtgeo.models.classical import PnpGeometry, SiftMatcher, place_vector
-from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery
+from vggtgeo.models.classical import NoDepth, PnpGeometry, SiftMatcher, place_vector
+from vggtgeo.models.roles import DepthEstimate, GeometryResult, PoseGuess, PoseQuery
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
@@ -18,6 +18,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
@@ -25,6 +26,7 @@ from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking import Sight
 
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
@@ -52,6 +54,24 @@ def _black(frame: Frame) -> Frame:
     return replace(frame, image=np.zeros_like(frame.image), depth=np.full(frame.image.shape[:2], np.nan, np.float32))
 
 
+def _unlit(frame: Frame) -> Frame:
+    return replace(frame, image=np.zeros_like(frame.image))
+
+
+def _view(frame: Frame, intrinsics: np.ndarray, factor: float = 1.0) -> RgbdView:
+    """As the sensor sees it, with `factor` times its noise."""
+    depth, sigma = ROLES.tracking_depth(frame.depth)
+    return RgbdView.of(frame.image, (depth, factor * sigma), intrinsics)
+
+
+class _Guessing:
+    """A depth from nowhere, 7 % off by its own account."""
+
+    def estimate(self, image: np.ndarray, sensor_depth: object = None, intrinsics: object = None) -> DepthEstimate:
+        whole = np.full(image.shape[:2], 2.0, np.float32)
+        return DepthEstimate(whole, np.ones_like(whole), np.full_like(whole, 0.07))
+
+
 def _error(slam: Slam, truth: Trajectory) -> float:
     return evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
 
@@ -63,7 +83,7 @@ def test_alignment_brings_a_wrong_start_to_the_true_motion(room: Room) -> None:
     """
     frames, camera, truth = room
     intrinsics = np.array(camera.intrinsics)
-    views = [RgbdView.of(frames[i].image, frames[i].depth, intrinsics) for i in (0, 2)]
+    views = [_view(frames[i], intrinsics) for i in (0, 2)]
     poses = rigid.invert(truth.poses[[0, 2]])
     motion = poses[1] @ rigid.invert(poses[0])
     wrong = motion.copy()
@@ -80,12 +100,37 @@ def test_alignment_brings_a_wrong_start_to_the_true_motion(room: Room) -> None:
     assert off < 5 * sigma, f"{1000 * off:.1f} mm with a standard deviation of {1000 * sigma:.1f} mm"
 
 
+def test_tracking_takes_the_noise_that_the_depth_states(room: Room) -> None:
+    """Surfaces alone (black pictures), once as the sensor states its noise and once with twice that: the information
+    falls to a quarter. Oracle: information is 1 / sigma^2.
+    """
+    frames, camera, truth = room
+    poses = rigid.invert(truth.poses[[0, 2]])
+    found = []
+    for factor in (1.0, 2.0):
+        views = [_view(_unlit(frames[i]), np.array(camera.intrinsics), factor) for i in (0, 2)]
+        found.append(RgbdAlignment().align(*views, poses[1] @ rigid.invert(poses[0])))
+    once, twice = (each.information for each in found)
+    np.testing.assert_allclose(once, 4 * twice, atol=0.01 * np.abs(once).max())
+
+
+def test_a_network_depth_states_its_own_noise(room: Room) -> None:
+    """A role other than a sensor tells keyframes its noise, and tracking nothing; oracle: the role's own numbers."""
+    frames, camera, _ = room
+    roles = replace(ROLES, depth=_Guessing())
+    slam = _run(frames[:1], camera, roles)
+    np.testing.assert_allclose(slam.keyframes[0].depth_sigma, 0.07, rtol=1e-3)
+    assert roles.tracking_depth(frames[0].depth) is None
+    depth, sigma = ROLES.tracking_depth(np.full((4, 4), 2.0, np.float32))
+    np.testing.assert_allclose(sigma, ROLES.depth.noise(depth))
+
+
 def test_alignment_of_different_places_says_that_they_differ(room: Room) -> None:
     """Two views that share nothing get a correlation below the level of belief; oracle: the frames' true overlap."""
     frames, camera, _ = room
     intrinsics = np.array(camera.intrinsics)
     other = simulate("room", 2000, 0, SIZE, rate=10.0).frame(60)
-    views = [RgbdView.of(frame.image, frame.depth, intrinsics) for frame in (frames[0], other)]
+    views = [_view(frame, intrinsics) for frame in (frames[0], other)]
     found = RgbdAlignment().align(*views, np.eye(4))
     assert found is None or found.correlation < 0.3
 
@@ -212,3 +257,27 @@ def test_pieces_join_where_they_meet(room: Room) -> None:
     slam = finish(slam, ROLES, updated(SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 10}}))
     times = np.arange(len(numbers)) / 10
     assert _error(slam, Trajectory(times, truth.poses[numbers])) < 0.04
+
+
+def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
+    """The second half of a map whose scale is free, 1.6 times too large and elsewhere, comes back where it was when its
+    newest keyframe shows the first half. Oracle: the map before it was taken apart.
+    """
+    frames, camera, _ = room
+    roles = replace(ROLES, depth=NoDepth())
+    seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:16], *frames[14:4:-1]))]
+    whole = replace(_run(seen, camera), metric=False)
+    origin = len(whole.keyframes) // 2
+    apart = scaled_piece(replace(whole, origins=(0, origin)), 1.6)
+    moved = np.eye(4)
+    moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
+    moved[:3, 3] = [0.5, -1.0, 2.0]
+    torn = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
+    newest = whole.keyframes[-1]
+    sight = Sight(seen[newest.frame], newest.features, None)
+    joined = join_pieces(replace(apart, keyframes=torn), sight, roles, SETTINGS)
+    assert joined.origins == (0,), joined.notes
+    for before, after in zip(whole.keyframes[origin:], joined.keyframes[origin:], strict=True):
+        off = np.linalg.norm(rigid.centre(before.pose) - rigid.centre(after.pose))
+        assert off < 0.05, f"keyframe {before.number} is {100 * off:.1f} hundredths of the unit off"
+        np.testing.assert_allclose(after.points.inverse_depth, before.points.inverse_depth, rtol=0.05)

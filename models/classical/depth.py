@@ -18,8 +18,11 @@ class SensorDepth:
     sigma_z = axial + quadratic (z - near)^2 metres: Nguyen, Izadi, Lovell, "Modeling Kinect sensor noise for improved
     3D reconstruction and tracking", 3DIMPVT 2012; its growth with z^2 is that of triangulation from disparity
     (Khoshelham and Oude Elberink, "Accuracy and resolution of Kinect depth data", Sensors 2012). `floor` adds, in
-    quadrature and relative to z, what calibration leaves behind. Near a jump of depth the pixel may belong to either
-    side, so confidence falls there and sigma_rel grows with the jump.
+    quadrature and relative to z, what calibration leaves behind between views; what it leaves in all of them alike is
+    no noise. With 0.3 %, surfaces of pairs of frames differ by 0.2 to 0.4 of the stated sigma on two HoloLens clips, a
+    Kinect's and a simulated one (cells of 16 pixels, median); with 1 %, by 0.1, and motions between neighbouring frames
+    are a third less accurate (6.1 instead of 4.5 mm, 6.9 instead of 5.2). Near a jump of depth the pixel may belong to
+    either side, so confidence falls there and sigma_rel grows with the jump.
 
     nearest, farthest: depths outside are dropped, metres. edge: relative jump between neighbours at which confidence
     has fallen to one half. reach: how far from a jump it is felt, pixels.
@@ -28,7 +31,7 @@ class SensorDepth:
     axial: float = 0.0012
     quadratic: float = 0.0019
     near: float = 0.4
-    floor: float = 0.01
+    floor: float = 0.003
     nearest: float = 0.2
     farthest: float = 8.0
     edge: float = 0.05
@@ -59,14 +62,16 @@ class SensorDepth:
         valid = (depth >= self.nearest) & (depth <= self.farthest)
         jump = _relative_jump(np.where(valid, depth, np.nan), self.reach)
         confidence = np.where(valid, 1.0 / (1.0 + (jump / self.edge) ** 2), 0.0)
-        safe = np.where(valid, depth, np.float32(1.0))
-        sigma = np.hypot((self.axial + self.quadratic * (safe - self.near) ** 2) / safe, self.floor)
-        sigma = np.where(valid, np.hypot(sigma, 0.5 * jump), np.nan)
+        sigma = np.where(valid, np.hypot(self.noise(np.where(valid, depth, np.float32(1.0))), 0.5 * jump), np.nan)
         return DepthEstimate(
             np.where(valid, depth, np.float32(np.nan)),
             confidence.astype(np.float32),
             sigma.astype(np.float32),
         )
+
+    def noise(self, depth: np.ndarray) -> np.ndarray:
+        """Relative standard deviation of a depth (metres, any shape) away from jumps."""
+        return np.hypot((self.axial + self.quadratic * (depth - self.near) ** 2) / depth, self.floor)
 
 
 @dataclass(frozen=True)

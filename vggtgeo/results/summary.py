@@ -48,12 +48,16 @@ def summarise(
         "origins": len(slam.origins),
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
         "scale": scale_name(slam, verdict),
+        **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
         "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
         "notes": list(slam.notes),
         **counts,
     }
     return values if report is None else {**values, "truth": report.as_dict()}
+
+
+SCALE_BASIS = "the depth alone: images do not tell a constant factor on it"
 
 
 def scale_name(slam: Slam, verdict: Verdict) -> str:

@@ -1,7 +1,7 @@
 """Dense depth between keyframes: projective point-to-plane alignment as a quadratic on relative poses, so that surfaces
 without texture speak in the adjustment too (Chen & Medioni 1991; Newcombe et al., KinectFusion, 2011).
 
-At the current poses every pair (i, j) gives residuals `n . (T_ji p - q)` in standard deviations of the sensor, where
+At the current poses every pair (i, j) gives residuals `n . (T_ji p - q)` in standard deviations of both depths, where
 `q, n` is the surface of j at the pixel that `p` of i falls on. Their normal equations `H, g` over the left tangent
 `eta` of `T_ji` enter the adjustment as a term on the pair. Relinearising after each adjustment makes it Gauss-Newton on
 the sum of both.
@@ -30,25 +30,23 @@ LEAST_POINTS = 300
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A keyframe's depth as points float64 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = none."""
+    """A keyframe's depth as points float64 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = none.
+
+    sigma: standard deviation of the depth, metres, [h, w].
+    """
 
     points: np.ndarray
     normals: np.ndarray
+    sigma: np.ndarray
     intrinsics: np.ndarray
 
     @classmethod
     def of(cls, keyframe: Keyframe, intrinsics: np.ndarray) -> Surface:
         """Block medians of the depth, and normals from central differences that do not cross a depth jump."""
-        depth = keyframe.depth
-        height, width = depth.shape[0] // CELL, depth.shape[1] // CELL
-        blocks = depth[: height * CELL, : width * CELL].astype(np.float64).reshape(height, CELL, width, CELL)
-        ordered = np.sort(blocks.transpose(0, 2, 1, 3).reshape(height, width, -1), axis=2)
-        count = np.isfinite(ordered).sum(2)
-        middle = np.take_along_axis(ordered, np.maximum(count // 2, 0)[..., None].clip(0, CELL**2 - 1), 2)[..., 0]
-        middle = np.where(count >= CELL**2 // 2, middle, np.nan)
+        middle = _block_medians(keyframe.depth)
         coarse = pinhole.coarser(intrinsics, CELL)
-        points = pinhole.grid_rays((height, width), coarse) * middle[..., None]
-        return cls(points, _normals(points), coarse)
+        points = pinhole.grid_rays(middle.shape, coarse) * middle[..., None]
+        return cls(points, _normals(points), _block_medians(keyframe.depth_sigma) * middle, coarse)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +74,13 @@ def align(
     inside, rows, columns = pinhole.visible(points, target.intrinsics, target.normals.shape[:2])
     points, normals = points[inside], normals[inside]
     n, q = target.normals[rows, columns], target.points[rows, columns]
+    sigma = np.hypot(source.sigma[good][inside], target.sigma[rows, columns])
     with np.errstate(invalid="ignore"):
         one = (np.linalg.norm(points - q, axis=1) < FARTHEST) & ((n * normals).sum(1) > LEAST_COSINE)
     if np.count_nonzero(one) < LEAST_POINTS:
         return None
-    points, q, n = points[one], q[one], n[one]
+    points, q, n, sigma = points[one], q[one], n[one], sigma[one]
     residual = (n * (points - q)).sum(1)
-    sigma = np.sqrt(2) * np.hypot(0.0012 + 0.0019 * (q[:, 2] - 0.4) ** 2, 0.003 * q[:, 2])
     # Tukey's biweight, wide enough for a pose that is off by a few standard deviations.
     scale = max(float(np.median(np.abs(residual / sigma))) * 4.7, 3.0)
     weight = np.maximum(1 - (residual / sigma / scale) ** 2, 0.0) ** 2 / sigma**2
@@ -106,6 +104,16 @@ def align_pairs(
         if found is not None:
             hessians[row], gradients[row] = found.hessian, found.gradient
     return surface_term(pairs, relative, hessians, gradients)
+
+
+def _block_medians(values: np.ndarray) -> np.ndarray:
+    """Medians of blocks of `CELL` x `CELL`, float64 [h, w]; NaN where fewer than half of a block is known."""
+    height, width = values.shape[0] // CELL, values.shape[1] // CELL
+    blocks = values[: height * CELL, : width * CELL].astype(np.float64).reshape(height, CELL, width, CELL)
+    ordered = np.sort(blocks.transpose(0, 2, 1, 3).reshape(height, width, -1), axis=2)
+    count = np.isfinite(ordered).sum(2)
+    middle = np.take_along_axis(ordered, (count // 2)[..., None].clip(0, CELL**2 - 1), 2)[..., 0]
+    return np.where(count >= CELL**2 // 2, middle, np.nan)
 
 
 def _normals(points: np.ndarray) -> np.ndarray:

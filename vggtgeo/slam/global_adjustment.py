@@ -8,11 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
-from vggtgeo.slam.adjustment import build, write_back
+from vggtgeo.slam.adjustment import Adjustment, build, write_back
+from vggtgeo.slam.calibration import Refinement, keyframe_pairs, try_camera
 from vggtgeo.slam.covisibility import Directed, Pair, directions, overlap, some_points
 from vggtgeo.slam.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.factors import factor_terms
@@ -21,6 +23,11 @@ from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window import solve_jit, window_size
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+
+MUCH = 0.01
+"""Relative change of the camera beyond which the user is told."""
+SURE, MOST_WARP = 5.0, 3.0
+"""Standard deviations, and pixels in the corners of the image, beyond which a distortion is told."""
 
 
 def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
@@ -44,15 +51,16 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     ranks = max(np.bincount([edge.host for edge in edges]))
     size = replace(window_size(settings), keyframes=len(slam.keyframes), ranks=int(ranks), edges=len(edges))
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
-    surfaces = [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
-    for _ in range(settings.refinement.global_rounds):
+    surfaces = _surfaces(slam)
+    given = slam.given_intrinsics
+    for number in range(settings.refinement.global_rounds):
         adjustment = build(
             slam.keyframes,
             edges,
             slam.intrinsics,
             settings,
             size=size,
-            given_intrinsics=slam.given_intrinsics,
+            given_intrinsics=given,
             intrinsics_sigma=slam.intrinsics_sigma,
             fixed_pose=fixed,
             terms=_terms(slam, surfaces, settings),
@@ -65,9 +73,48 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
-        keyframes, intrinsics = write_back(slam.keyframes, adjustment, solution.state)
-        slam = replace(slam, keyframes=keyframes, intrinsics=intrinsics, solved=None)
+        slam = _taken(slam, adjustment, solution.state)
+        if number == 0 and slam.calibrated and settings.camera.refine_intrinsics != "never":
+            again = lambda problem, state, solver=solver: solve_jit(problem, state, solver=solver).state
+            found = try_camera(keyframe_pairs(slam, edges), adjustment.problem, solution.state, again)
+            before, slam = slam, _taken_camera(slam, adjustment, found, settings)
+            if not np.array_equal(before.intrinsics, slam.intrinsics):
+                given, surfaces = slam.intrinsics, _surfaces(slam)
     return slam
+
+
+def _surfaces(slam: Slam) -> list[Surface]:
+    return [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
+
+
+def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
+    """The state of the run with what an adjustment found."""
+    keyframes, intrinsics = write_back(slam.keyframes, adjustment, state)
+    return replace(slam, keyframes=keyframes, intrinsics=intrinsics, solved=None)
+
+
+def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, settings: SlamSettings) -> Slam:
+    """The state of the run with a refined camera, if it pays or is asked for, and what the user should know of it."""
+    if found is None:
+        return slam
+    notes = [*slam.notes, *_lens_note(found, slam.keyframes[0].image.shape)]
+    always = settings.camera.refine_intrinsics == "always"
+    if found.state is not None and (found.pays or always):
+        slam = _taken(slam, adjustment, found.state)
+        if found.change > MUCH:
+            cameras = [", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted)]
+            change = 100 * found.change
+            notes.append(f"the camera was refined by {change:.1f} %: fx, fy, cx, cy = {cameras[0]} -> {cameras[1]} px")
+    return replace(slam, notes=tuple(notes))
+
+
+def _lens_note(found: Refinement, shape: tuple[int, ...]) -> list[str]:
+    """A word on distortion that is sure and moves corners of the image by more than the noise of matches."""
+    (k1, sigma), focal = found.distortion, float(found.given[0])
+    warp = abs(k1) * (float(np.hypot(shape[0], shape[1])) / 2 / focal) ** 3 * focal
+    if abs(k1) < SURE * sigma or warp < MOST_WARP:
+        return []
+    return [f"the lens distorts, and the calibration does not say so: k1 about {k1:.3f}, {warp:.0f} px in the corners"]
 
 
 def _terms(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> tuple[AbstractTerm, ...]:

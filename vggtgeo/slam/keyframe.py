@@ -35,8 +35,9 @@ class Keyframe:
     roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each sample); and
     place, what it looks like as a whole, float32 [n] of unit length, None = not known.
 
-    depth: float16 [H, W] metres, NaN = none (its rounding, 0.5 mm at 1 m, is below any sensor's noise);
-    depth_confidence: uint8 [H, W], 255 is 1. A map lives as long as the run, so what it holds is small.
+    depth: float16 [H, W] metres, NaN = none (its rounding, 0.5 mm at 1 m, is below any sensor's noise); depth_sigma:
+    float16 [H, W], its relative standard deviation as the role states it; depth_confidence: uint8 [H, W], 255 is 1. A
+    map lives as long as the run, so what it holds is small.
     """
 
     number: int
@@ -48,6 +49,7 @@ class Keyframe:
     lines: LineFeatures
     line_depths: np.ndarray
     depth: np.ndarray
+    depth_sigma: np.ndarray
     depth_confidence: np.ndarray
     points: Slots
     samples: Slots
@@ -84,6 +86,7 @@ def make_keyframe(
         lines=lines,
         line_depths=line_depths,
         depth=depth.depth.astype(np.float16),
+        depth_sigma=depth.sigma_rel.astype(np.float16),
         depth_confidence=np.rint(255 * depth.confidence).astype(np.uint8),
         points=points,
         samples=_with_line_depth(samples, on_line),

@@ -169,7 +169,9 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     """A window of the keyframes around an old one, held where it is: the camera has come back to it."""
     low = max(max((origin for origin in slam.origins if origin <= number), default=0), number - NEIGHBOURS)
     window = tuple(range(low, min(number + NEIGHBOURS + 1, len(slam.keyframes))))[-(settings.window.size - 1) :]
-    return replace(slam, window=window, prior=None, solved=None, held=(number,))
+    # Without metric depth one held pose leaves the unit free: two hold it.
+    held = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
+    return replace(slam, window=window, prior=None, solved=None, held=held)
 
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:

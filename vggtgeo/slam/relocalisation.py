@@ -48,7 +48,8 @@ def view_of(keyframe: Keyframe, slam: Slam, roles: Roles) -> RgbdView | None:
         return None
     if slam.reference is not None and slam.reference[0] == keyframe.number:
         return slam.reference[1]
-    return RgbdView.of(keyframe.image, keyframe.depth.astype(np.float32), slam.intrinsics)
+    depth = keyframe.depth.astype(np.float32), keyframe.depth_sigma.astype(np.float32)
+    return RgbdView.of(keyframe.image, depth, slam.intrinsics)
 
 
 def wait(slam: Slam, frame: Frame, features: Features, most: int) -> tuple[Waiting, ...]:
@@ -79,8 +80,7 @@ def sight_of(frame: Frame, features: Features, slam: Slam, roles: Roles) -> Sigh
     """The frame as it is tracked."""
     view = None
     if roles.alignment is not None and slam.metric:
-        depth = roles.tracking_depth(frame.depth)
-        view = RgbdView.of(frame.image, depth, slam.intrinsics)
+        view = RgbdView.of(frame.image, roles.tracking_depth(frame.depth), slam.intrinsics)
     return Sight(frame, features, view)
 
 

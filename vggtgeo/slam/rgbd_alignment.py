@@ -63,37 +63,37 @@ class RgbdAlignment:
     def align(self, source: RgbdView, target: RgbdView, start: np.ndarray) -> Aligned | None:
         """The motion source -> target from `start` float64 [4, 4]; None where they share too little."""
         motion = start
-        points, normals = source.samples
         rows = None
         for level in reversed(range(LEVELS)):
             step = 2 if level else 1
+            points, normals, noise = source.samples
+            samples = points[::step], normals[::step], noise[::step]
             for _ in range(self.iterations[level]):
-                rows = self._rows(source, target, level, points[::step], normals[::step], motion)
+                rows = self._rows(source, target, level, samples, motion)
                 if rows is None:
                     return None
                 change = _solve(*rows[:2])
                 motion = _exponential(change) @ motion
                 if np.abs(change).max() < (1e-5 if level == 0 else 1e-4):
                     break
-        rows = self._rows(source, target, 0, points, normals, motion)
+        rows = self._rows(source, target, 0, source.samples, motion)
         if rows is None:
             return None
         information, _, evidence = rows
-        return Aligned(motion, information, *evidence, overlap=evidence[3] / max(len(points), 1))
+        return Aligned(motion, information, *evidence, overlap=evidence[3] / max(len(source.samples[0]), 1))
 
     def _rows(
         self,
         source: RgbdView,
         target: RgbdView,
         level: int,
-        points: np.ndarray,
-        normals: np.ndarray,
+        samples: tuple[np.ndarray, np.ndarray, np.ndarray],
         motion: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, tuple[float, float, int, int, float]] | None:
         """Normal equations `H, g` of both terms at `motion`, and how far they agree."""
         hessian, gradient = np.zeros((6, 6)), np.zeros(6)
         edges = _brightness(source, target, level, motion)
-        surface = _planes(points, normals, target, motion)
+        surface = _planes(*samples, target, motion)
         shares, counts = [float("nan")] * 2, [0, 0]
         correlation = float("nan")
         if edges is not None:
@@ -143,9 +143,12 @@ def _brightness(
 
 
 def _planes(
-    points: np.ndarray, normals: np.ndarray, target: RgbdView, motion: np.ndarray
+    points: np.ndarray, normals: np.ndarray, noise: np.ndarray, target: RgbdView, motion: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rows of `r_D` [m, 6] and residuals [m], both in standard deviations of the sensor."""
+    """Rows of `r_D` [m, 6] and residuals [m], both in standard deviations of the two depths.
+
+    Along the normal the error is at most that of the depth: a standard deviation on the safe side.
+    """
     if len(points) < LEAST_SAMPLES or not len(target.surface):
         return None
     turn, shift = motion[:3, :3].astype(np.float32), motion[:3, 3].astype(np.float32)
@@ -159,9 +162,8 @@ def _planes(
         one = (np.abs(residual) < FARTHEST) & ((n * turned).sum(1) > LEAST_COSINE)
     if np.count_nonzero(one) < LEAST_SAMPLES:
         return None
-    x, n, residual, depth = x[one], n[one], residual[one], q[one, 2]
-    # Nguyen, Izadi, Lovell 2012, as in `SensorDepth`, of both views; the relative part is what calibration leaves.
-    sigma = np.sqrt(2) * np.hypot(0.0012 + 0.0019 * (depth - 0.4) ** 2, 0.003 * depth)
+    x, n, residual = x[one], n[one], residual[one]
+    sigma = np.hypot(noise[inside][one], target.sigma[rows, columns][one])
     return np.concatenate([n, np.cross(x, n)], 1) / sigma[:, None], residual / sigma
 
 

@@ -39,36 +39,38 @@ class RgbdView:
     """What an alignment needs of one image.
 
     levels: finest first. surface: float32 [h, w, 3] points in the camera frame, metres, and normals: the same of unit
-    normals towards the camera, NaN = none; surface_intrinsics of that grid. samples: points and normals float32 [n, 3]
-    of cells spread over the image. edges: float64 [m, 3] points in the camera
-    frame with a strong gradient, and edge_values: one float32 [m] of brightness for each level.
+    normals towards the camera, NaN = none; sigma: float32 [h, w], standard deviation of their depth, metres;
+    surface_intrinsics of that grid. samples: points and normals float32 [n, 3] and standard deviations [n] of cells
+    spread over the image. edges: float64 [m, 3] points in the camera frame with a strong gradient, and edge_values:
+    one float32 [m] of brightness for each level.
     """
 
     levels: tuple[Gray, ...]
     surface: np.ndarray
     normals: np.ndarray
+    sigma: np.ndarray
     surface_intrinsics: np.ndarray
-    samples: tuple[np.ndarray, np.ndarray]
+    samples: tuple[np.ndarray, np.ndarray, np.ndarray]
     edges: np.ndarray
     edge_values: tuple[np.ndarray, ...]
 
     @classmethod
-    def of(cls, image: np.ndarray, depth: np.ndarray | None, intrinsics: np.ndarray) -> RgbdView:
-        """From an image uint8 [H, W, 3] and its depth float [H, W], metres, NaN = none."""
+    def of(cls, image: np.ndarray, depth: tuple[np.ndarray, np.ndarray] | None, intrinsics: np.ndarray) -> RgbdView:
+        """From an image uint8 [H, W, 3], its depth float [H, W], metres, NaN = none, and that one's relative sigma."""
         factor = max(round(image.shape[1] / WIDTH), 1)
         gray = _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), factor)
         own = pinhole.coarser(intrinsics, factor)
         levels = _pyramid(gray, own)
-        if depth is None or not np.isfinite(depth).any():
+        if depth is None or not np.isfinite(depth[0]).any():
             nothing = np.full((1, 1, 3), np.nan, np.float32)
             none, empty = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-            return cls(levels, nothing, nothing, own, (none, none), none, (empty,) * LEVELS)
-        cells = _cell_means(depth, factor * BLOCK)
+            return cls(levels, nothing, nothing, nothing[..., 0], own, (none, none, empty), none, (empty,) * LEVELS)
+        cells, sigma = _cell_means(*depth, factor * BLOCK)
         coarse = pinhole.coarser(intrinsics, factor * BLOCK)
         surface = _unproject_grid(cells, coarse)
         normals = _normals(surface)
         edges, values = _edge_samples(levels, cells)
-        return cls(levels, surface, normals, coarse, _spread(surface, normals), edges, values)
+        return cls(levels, surface, normals, sigma, coarse, _spread(surface, normals, sigma), edges, values)
 
 
 def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
@@ -88,8 +90,10 @@ def _pyramid(gray: np.ndarray, intrinsics: np.ndarray) -> tuple[Gray, ...]:
     return tuple(levels)
 
 
-def _cell_means(depth: np.ndarray, factor: int) -> np.ndarray:
-    """Mean inverse depth's depth of blocks, float32 [h, w]; NaN where half a block is unknown, or across a jump."""
+def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean inverse depth's depth of blocks and its sigma, metres, float32 [h, w]; NaN where half a block is unknown, or
+    across a jump. Neighbouring pixels share their errors (smoothing, interpolation), so a block knows no more than one.
+    """
     height, width = depth.shape[0] // factor * factor, depth.shape[1] // factor * factor
     known = np.isfinite(depth[:height, :width])
     inverse = np.where(known, 1.0 / np.where(known, depth[:height, :width], 1.0), 0.0).astype(np.float32)
@@ -100,7 +104,9 @@ def _cell_means(depth: np.ndarray, factor: int) -> np.ndarray:
     mean, square = mean / safe, square / safe
     spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
     good = (share >= 0.5) & (spread < 0.05 * mean)
-    return np.where(good, 1.0 / np.maximum(mean, 1e-6), np.nan).astype(np.float32)
+    cells = np.where(good, 1.0 / np.maximum(mean, 1e-6), np.nan).astype(np.float32)
+    noise = np.where(known, sigma[:height, :width], 0.0).astype(np.float32)
+    return cells, cells * cv2.resize(noise, size, interpolation=cv2.INTER_AREA) / safe
 
 
 def _unproject_grid(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
@@ -123,13 +129,13 @@ def _normals(points: np.ndarray) -> np.ndarray:
     return normals
 
 
-def _spread(surface: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals of at most about `MOST_POINTS` cells, evenly spread."""
+def _spread(surface: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals and standard deviations of at most about `MOST_POINTS` cells, evenly spread."""
     known = np.nonzero(np.isfinite(normals[..., 0]).ravel())[0]
     # A fixed shuffle: a regular stride would take whole columns of the grid.
     order = np.random.default_rng(0).permutation(len(known))[:MOST_POINTS]
     chosen = np.sort(known[order])
-    return surface.reshape(-1, 3)[chosen], normals.reshape(-1, 3)[chosen]
+    return surface.reshape(-1, 3)[chosen], normals.reshape(-1, 3)[chosen], sigma.ravel()[chosen]
 
 
 def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:

@@ -144,7 +144,7 @@ class WeightSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class CameraSettings(CheckedSettings):
-    """How far the intrinsics may move: standard deviations of their prior, relative to the focal length.
+    """How far the intrinsics may move: standard deviations of their prior, relative to the focal length, and the end.
 
     Example:
         >>> import vggtgeo as vg
@@ -154,11 +154,14 @@ class CameraSettings(CheckedSettings):
     """
 
     group: ClassVar[str] = "camera"
-    known_intrinsics_sigma: float = positive(1e-4)
+    known_intrinsics_sigma: float = positive(1e-6)
     """Of known intrinsics: so small that they are held. With 1 % they took up every error of the poses, 495.6 became
-    424 on building-walk."""
+    424 on building-walk; with 0.01 % still 493."""
     guessed_intrinsics_sigma: float = positive(0.3)
     """Of guessed ones."""
+    refine_intrinsics: str = one_of("auto", "always", "never")
+    """Whether the last adjustment may move known intrinsics: "auto", where the images ask for it and it pays (see
+    `slam/calibration.py`); "always", where the images ask for it; "never"."""
 
 
 _KERNEL = "a kernel of a width above 0, such as `cauchy 2.0` (`vggtgeo.Cauchy(2.0)`)"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -53,13 +53,26 @@ class Roles:
     alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
     """Aligns a frame's picture and depth to a keyframe's as a whole, beside its key points; None leaves that out."""
 
-    def tracking_depth(self, sensor_depth: np.ndarray | None) -> np.ndarray | None:
-        """What of a frame's own depth is used to track it; a network's depth costs too much for every frame."""
+    def tracking_depth(self, sensor_depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
+        """What of a frame's own depth is used to track it, metres and relative standard deviation, float32 [H, W].
+
+        Jumps are not looked for: the alignment leaves them out. A network's depth costs too much for every frame.
+        """
         if sensor_depth is None or not isinstance(self.depth, SensorDepth):
             return None
         near, far = self.depth.nearest, self.depth.farthest
         with np.errstate(invalid="ignore"):
-            return np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.nan)
+            depth = np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.float32(np.nan))
+        return depth, self.depth.noise(depth)
+
+    @property
+    def coarse_points(self) -> PointMatcher:
+        """The matcher without sub-pixel refinement, for poses that an alignment of the whole picture refines anyway."""
+        points: Any = self.points
+        coarse: PointMatcher = points
+        if getattr(points, "refinement", None) is not None:
+            coarse = replace(points, refinement=None)
+        return coarse
 
     @property
     def metric(self) -> bool:

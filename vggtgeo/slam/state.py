@@ -98,6 +98,11 @@ class Slam:
         return f"Slam({frames} frame{'s' * (frames != 1)}, {keyframes} keyframe{'s' * (keyframes != 1)}, {doing})"
 
     @property
+    def calibrated(self) -> bool:
+        """Whether the camera was given, not guessed."""
+        return bool(self.intrinsics_sigma[0] < 0.1 * self.given_intrinsics[0])
+
+    @property
     def ties(self) -> tuple[MeasuredRelativePose, ...]:
         """The tracked motions between keyframes."""
         return tuple(factor for factor in self.factors if isinstance(factor, MeasuredRelativePose))
