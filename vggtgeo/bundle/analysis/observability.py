@@ -31,7 +31,6 @@ from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
-from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, NodeFactors, reduce
 from vggtgeo.solvers.covariance import balance, rank_tolerance
 from vggtgeo.solvers.segments import join_segments
@@ -83,10 +82,12 @@ class Observability(eqx.Module):
     terms: tuple[str, ...] = eqx.field(static=True)
     """Names of the terms, in the order of the rows of `alone` and `without`."""
     keyframes: int = eqx.field(static=True)
+    parameters: tuple[str, ...] = eqx.field(static=True)
+    """Names of the cameras' parameters."""
 
     def direction_names(self) -> tuple[str, ...]:
         """Names of the rows of `named`."""
-        return direction_names(self.keyframes, len(self.free) - lie.TANGENT * self.keyframes)
+        return direction_names(self.keyframes, self.parameters)
 
     def report(self) -> str:
         """The findings in words (outside `jit`, for one problem)."""
@@ -163,6 +164,7 @@ def observability(problem: Problem, state: State) -> Observability:
         landmark_used=_used(problem),
         terms=tuple(term.name for term in problem.terms),
         keyframes=problem.num_keyframes,
+        parameters=problem.parameter_names,
     )
 
 
