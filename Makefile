@@ -24,7 +24,7 @@ demo: $(READY)  ## run the system in a synthetic office; OUT=runs/demo
 	$(BIN)/vggtgeo demo -o $(OUT)
 
 test: $(READY)  ## run the tests (a few minutes); ARGS="-k name" for some
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: $(READY)  ## run the slow tests: real clips, long sequences
 	$(BIN)/python -m pytest -m slow $(ARGS)

@@ -6,7 +6,8 @@
 For each size and number of iterations: the time of `solve` alone, the time of `jax.value_and_grad` of a loss of its
 state, and the difference in units of one iteration of the solve (medians over interleaved rounds); the polish that the
 derivative needs is part of it. Memory is what XLA sets aside for the compiled program beyond its arguments and results:
-it must not grow with the iterations. The size `global` is 200 keyframes, solved by a band and differentiated densely.
+it must not grow with the iterations. The size `global` is 200 keyframes, solved and differentiated
+by a band.
 Writes `gradients.md` and `gradients.json`. It runs on whatever device JAX has.
 """
 

@@ -12,7 +12,6 @@ reference, and the detector's milliseconds an image on one thread.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -26,10 +25,11 @@ from vggtgeo.models.onnx.mlsd import MlsdDetector
 from vggtgeo.models.onnx.session import open_session
 from vggtgeo.models.roles import LineDetector, Segments
 
-from vggtgeo.cli.run import run_and_write
 from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.slam.setting_groups import LineSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
 
 DRAWN = 4
@@ -57,9 +57,10 @@ def main() -> None:
 def line(name: str, detector: LineDetector | None, data: Path, folder: Path, end: int | None) -> str:
     """One run, as a line of the table."""
     roles = Roles() if detector is None else replace(Roles(), lines=detector)
-    settings = SlamSettings(use_lines=detector is not None)
-    slam = run_and_write(open_sequence(data), roles, settings, folder, {"lines": name}, (0, end, 1), quiet=True)
-    truth = json.loads((folder / "summary.json").read_text())["truth"]
+    settings = SlamSettings(line=LineSettings(use_lines=detector is not None))
+    result = reconstruct(data, roles, settings, end=end)
+    result.save(folder, settings={"lines": name})
+    slam, truth = result.record.slam, result.summary["truth"]
     reference = data / "reference-colmap.txt"
     report = evaluate_trajectory(Trajectory.load_tum(folder / "trajectory.txt"), Trajectory.load_tum(reference))
     cells = [

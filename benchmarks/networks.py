@@ -32,7 +32,7 @@ from vggtgeo.models.exporters.recipes import RECIPES
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.session import choose_provider
 
-from vggtgeo.cli.presets import NEEDED
+from vggtgeo.slam.presets import NEEDED
 
 CALLS = 3
 FRONT_END_FRAMES = 20
@@ -186,8 +186,8 @@ def front_end(folder: Path, frames: int, provider: str) -> dict:
     import numpy as np
     from vggtgeo.models.roles import PoseQuery
 
-    from vggtgeo.cli.presets import perception
     from vggtgeo.simulation.sequence import simulate
+    from vggtgeo.slam.presets import perception
     from vggtgeo.slam.settings import Roles
 
     walk = list(simulate("room", frames + 1, 0, (640, 480), rate=10.0).frames())

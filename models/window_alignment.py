@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from vggtgeo.models.checks import check_array
 from vggtgeo.models.roles import WindowGuess
 
@@ -33,7 +34,8 @@ def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndar
         return None
     placed = guess.poses.copy()
     placed[:, :3, 3] *= scale
-    rotation = _mean_rotation(np.swapaxes(placed[use, :3, :3], 1, 2) @ poses[use, :3, :3])
+    between = np.swapaxes(placed[use, :3, :3], 1, 2) @ poses[use, :3, :3]
+    rotation = Rotation.from_matrix(between).mean().as_matrix()
     to_window = np.eye(4)
     to_window[:3, :3] = rotation
     to_window[:3, 3] = (_centres(placed[use]) - _centres(poses[use]) @ rotation.T).mean(axis=0)
@@ -82,8 +84,3 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 def _centres(poses: np.ndarray) -> np.ndarray:
     return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-
-
-def _mean_rotation(rotations: np.ndarray) -> np.ndarray:
-    left, _, right = np.linalg.svd(rotations.sum(axis=0))
-    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right

@@ -1,1 +1,1 @@
-"""Structured nonlinear least squares on optimistix and lineax. Knows nothing of cameras."""
+"""Structured nonlinear least squares on optimistix. Knows nothing of cameras."""

@@ -12,6 +12,12 @@ differentiated, it is polished first by chord steps, `y <- y - H0^-1 g(y)` with 
 ended. One costs a gradient and a back-substitution, and so near the optimum gains almost the digits of a Newton step.
 Then the Hessian is taken once more. Cost: two exact Hessians, their factorisations, and a gradient for each step.
 
+The linear algebra is that of the solver's own `reduced_solver`: a dense factor, a band, or minimum residuals, where no
+matrix over all nodes is formed. The exact Hessian need not be definite (at a saddle, or under a redescending kernel):
+the dense factor and the band take pivots of either sign, and minimum residuals, unlike conjugate gradients, do not ask
+for a definite matrix; their preconditioner is made of the reweighted Hessian, which is. A band's groups are eliminated
+in their order, so it also asks that no leading part of the graph is singular alone, which holds at every minimum.
+
 Second derivatives: the rule differentiates what it returns. `y*` in it is the differentiable optimum again, and the
 linear solve knows its operator as the derivative of `g`, so `jax.grad` of `jax.grad` and `jax.hessian` work.
 
@@ -26,23 +32,19 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import jax.scipy as jsp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
     ArrowVector,
-    carry_to_nodes,
-    couple,
     dense_gradient,
-    inverse_landmark_hessian,
     moving_landmarks,
-    reduce,
 )
-from vggtgeo.solvers.levenberg_marquardt import LevenbergMarquardtState
+from vggtgeo.solvers.exact_model import ExactModel, exact_model
+from vggtgeo.solvers.levenberg_marquardt import LevenbergMarquardtState, SchurLevenbergMarquardt
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
-from vggtgeo.solvers.reduced import MIN_DIAGONAL, gauge_stiffness
+from vggtgeo.solvers.reduced import AbstractReducedSolver
 from vggtgeo.solvers.segments import expand, restrict
 
 STATIONARY = 1e-6
@@ -89,8 +91,9 @@ class ArrowAdjoint(optx.AbstractAdjoint):
 
         point, rest = primal_fn((*detached, loop))
         state = _only(LevenbergMarquardtState, rest)
+        reduced_solver = _only(SchurLevenbergMarquardt, detached).reduced_solver
         start = Polish(jnp.asarray(False), state.gradient_norm)
-        point, polish = _attach_derivative(problem, point, start, self)
+        point, polish = _attach_derivative(problem, point, start, self, reduced_solver)
         told = eqx.tree_at(
             lambda s: (s.polished, s.gradient_residual), state, (polish.polished, polish.gradient_residual)
         )
@@ -120,24 +123,24 @@ class Polish(eqx.Module):
 
 @eqx.filter_custom_jvp
 def _attach_derivative(
-    problem: AbstractArrowProblem, point: Point, polish: Polish, options: ArrowAdjoint
+    problem: AbstractArrowProblem, point: Point, polish: Polish, options: ArrowAdjoint, solver: AbstractReducedSolver
 ) -> tuple[Point, Polish]:
     """`point`, differentiable as the optimum of `problem`."""
-    del problem, options
+    del problem, options, solver
     return point, polish
 
 
 @_attach_derivative.def_jvp
 def _implicit_derivative(primals: Any, tangents: Any) -> Any:
-    problem, point, _, options = primals
+    problem, point, _, options, solver = primals
     moved = tangents[0]
     absent = jax.tree.map(lambda leaf: leaf is None, moved, is_leaf=lambda leaf: leaf is None)
     fixed, moving = eqx.partition(problem, absent, is_leaf=lambda leaf: leaf is None)
-    optimum, model = _polish(_detached(problem), _detached(point), options.polish)
+    optimum, model = _polish(_detached(problem), _detached(point), options.polish, solver)
     left = model.largest(_gradient(_detached(problem), optimum, model.system))
     told = _detached(Polish(jnp.asarray(True), left))
     # The optimum as a function of the problem once more, for derivatives of this derivative.
-    at, _ = _attach_derivative(problem, _detached(optimum), told, options)
+    at, _ = _attach_derivative(problem, _detached(optimum), told, options, solver)
     system = _detached(model.system)
 
     def stationarity(moving: Any, point: Point) -> ArrowVector:
@@ -201,56 +204,25 @@ def _gradient(problem: AbstractArrowProblem, point: Any, system: ArrowSystem) ->
     return _free(_restricted(_along(system, problem), problem.gradient(point)), system)
 
 
-class ExactModel(eqx.Module):
-    """A Hessian, definite or not, and the factors of its Schur complement `S` over the free coordinates."""
-
-    system: ArrowSystem
-    factors: tuple[Float[Array, "c c"], Int[Array, " c"]]
-    diagonal: Float[Array, " c"]
-
-    def __init__(self, system: ArrowSystem):
-        reduced = reduce(system)
-        self.system = system
-        self.diagonal = jnp.maximum(jnp.diagonal(reduced.hessian), MIN_DIAGONAL)
-        stiffness = gauge_stiffness(system, reduced, self.diagonal)
-        matrix = reduced.hessian - reduced.schur + (system.gauge * stiffness) @ system.gauge.T
-        both = system.free[:, None] & system.free[None, :]
-        self.factors = jsp.linalg.lu_factor(jnp.where(both, matrix, jnp.eye(len(matrix), dtype=matrix.dtype)))
-
-    def solve(self, vector: ArrowVector) -> ArrowVector:
-        """`H^-1 vector` over the free coordinates; zero where held, undetermined or lost.
-
-        `S x = v_c - W V^-1 v_d`, `z = V^-1 (v_d - W' x)`, with a stiffness added along flat gauge directions.
-        """
-        inverse = inverse_landmark_hessian(self.system)
-        rest = vector.dense - carry_to_nodes(self.system, inverse * vector.landmarks)
-        dense = jsp.linalg.lu_solve(self.factors, jnp.where(self.system.free, rest, 0.0))
-        dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
-        return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0)))
-
-    def largest(self, gradient: ArrowVector) -> Float[Array, ""]:
-        """Largest entry of a gradient, in units of the root of its own curvature."""
-        landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
-        dense = jnp.max(gradient.dense**2 / self.diagonal, initial=0.0)
-        return jnp.sqrt(jnp.maximum(dense, jnp.max(landmarks, initial=0.0)))
-
-    def size(self, gradient: ArrowVector) -> Float[Array, ""]:
-        """Squared norm of a gradient, each entry in units of its own curvature."""
-        landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
-        return jnp.sum(gradient.dense**2 / self.diagonal) + jnp.sum(landmarks)
-
-
-def _polish(problem: AbstractArrowProblem, point: Point, steps: int) -> tuple[Point, ExactModel]:
+def _polish(
+    problem: AbstractArrowProblem, point: Point, steps: int, solver: AbstractReducedSolver
+) -> tuple[Point, ExactModel]:
     """The optimum near `point`, and the exact model there (of the point before the last, negligible, chord steps)."""
-    empty = jax.tree.map(jnp.zeros_like, jax.eval_shape(lambda point: ExactModel(problem.hessian(point)), point))
 
-    def turn(_: Any, carry: tuple[Point, ExactModel]) -> tuple[Point, ExactModel]:
-        model = ExactModel(problem.hessian(carry[0]))
-        return _chord_steps(problem, model, carry[0], steps), model
+    def model_at(point: Point) -> ExactModel:
+        return exact_model(problem.hessian(point), solver, lambda: problem.linearise(point))
+
+    is_shape = lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct)
+    shapes, rest = eqx.partition(eqx.filter_eval_shape(model_at, point), is_shape)
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def turn(_: Any, carry: tuple[Point, Any]) -> tuple[Point, Any]:
+        model = model_at(carry[0])
+        return _chord_steps(problem, model, carry[0], steps), eqx.filter(model, eqx.is_array)
 
     # A loop, not two calls: the Hessian is compiled once.
-    polished: tuple[Point, ExactModel] = jax.lax.fori_loop(0, 2, turn, (point, empty))
-    return polished
+    polished, arrays = jax.lax.fori_loop(0, 2, turn, (point, empty))
+    return polished, eqx.combine(arrays, rest)
 
 
 def _chord_steps(problem: AbstractArrowProblem, model: ExactModel, point: Point, steps: int) -> Point:

@@ -1,7 +1,8 @@
 """Block-banded symmetric matrices with a border, their storage and their Cholesky factor.
 
 Nodes in the order of a sequence see their near neighbours only: an edge of reach `r = |i - j|` and the elimination of
-the landmarks couple nodes at most `2 r` apart. Groups of `2 r` consecutive nodes (`w` coordinates) therefore make the
+the landmarks couple nodes at most `2 r` apart. A closed loop is a sequence too, once it is folded: in the order
+`0, n - 1, 1, n - 2, ...` no edge reaches more than twice as far. Groups of `2 r` nodes (`w` coordinates) make the
 matrix block tridiagonal, with the few shared coordinates as a border:
 
     M = [ T   F ]     T_kk = L_k L_k' + Y_{k-1} Y_{k-1}',     Y_k = T_{k+1,k} L_k^-T,
@@ -36,9 +37,11 @@ from vggtgeo.solvers.arrow import (
 class BandLayout(AbstractLayout):
     """Blocks at most one group away from the diagonal, lower half, `[groups, 2, size, b, size, b]`; others are left."""
 
-    nodes: int
-    group: int
+    nodes: int = eqx.field(static=True)
+    group: int = eqx.field(static=True)
     """Nodes a group."""
+    place: Int[Array, " n"] | None = None
+    """Place of each node in the band's order; None = that of the nodes themselves."""
 
     def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
         return jnp.zeros((math.ceil(nodes / self.group), 2, *(self.group, block) * 2), dtype)
@@ -46,11 +49,61 @@ class BandLayout(AbstractLayout):
     def add(
         self, stored: Array, row: Int[Array, "*t"], column: Int[Array, "*t"], value: Float[Array, "*t b b"]
     ) -> Array:
+        row, column = self._placed(row), self._placed(column)
         below = row // self.group - column // self.group
         kept = (row < self.nodes) & (column < self.nodes) & ((below == 0) | (below == 1))
         at = jnp.where(kept, column // self.group, len(stored))
         below = jnp.clip(below, 0, 1)
         return stored.at[at, below, row % self.group, :, column % self.group, :].add(value, mode="drop")
+
+    def columns(self, columns: Shaped[Array, "c o"], shared: int) -> BandVector:
+        """Columns over the dense coordinates, `shared` of them the last, group by group; zero beyond the last node."""
+        nodes = columns[:-shared]
+        return BandVector(self.rows(nodes.reshape(self.nodes, -1, nodes.shape[1])), columns[-shared:])
+
+    def rows(self, nodes: Shaped[Array, "n b o"]) -> Shaped[Array, "k w o"]:
+        """Rows of each node, group by group."""
+        if self.place is not None:
+            nodes = jnp.zeros_like(nodes).at[self.place].set(nodes)
+        groups = math.ceil(self.nodes / self.group)
+        nodes = jnp.pad(nodes, ((0, groups * self.group - self.nodes), (0, 0), (0, 0)))
+        return nodes.reshape(groups, -1, nodes.shape[-1])
+
+    def gather(
+        self, stored: Float[Array, "k 2 w w"], row: Int[Array, "*t"], column: Int[Array, "*t"]
+    ) -> Float[Array, "*t b b"]:
+        """Blocks of a symmetric matrix whose lower half is stored as `add` stores it; zero outside the band."""
+        row, column = self._placed(row), self._placed(column)
+        below = row // self.group - column // self.group
+        above = below < 0
+        first, second = jnp.where(above, column, row), jnp.where(above, row, column)
+        blocks = stored.reshape(*stored.shape[:2], *(self.group, stored.shape[-1] // self.group) * 2)
+        at = second // self.group, jnp.minimum(jnp.abs(below), 1)
+        found = blocks[*at, first % self.group, :, second % self.group, :]
+        found = jnp.where(above[..., None, None], jnp.swapaxes(found, -1, -2), found)
+        return jnp.where((jnp.abs(below) <= 1)[..., None, None], found, 0.0)
+
+    def flat(self, vector: BandVector) -> Float[Array, "c o"]:
+        """The inverse of `columns`."""
+        nodes = self.nodes_of(vector.nodes)
+        return jnp.concatenate([nodes.reshape(-1, nodes.shape[-1]), vector.shared])
+
+    def nodes_of(self, rows: Shaped[Array, "k w o"]) -> Shaped[Array, "n b o"]:
+        """The inverse of `rows`."""
+        nodes = rows.reshape(-1, rows.shape[1] // self.group, rows.shape[-1])
+        return nodes[: self.nodes] if self.place is None else nodes[self.place]
+
+    def near(self, system: ArrowSystem, reach: int) -> Bool[Array, " e"]:
+        """Edges whose ends are at most so many places apart."""
+        return jnp.abs(self._placed(system.graph.source) - self._placed(system.graph.target)) <= reach
+
+    def _placed(self, index: Int[Array, "*t"]) -> Int[Array, "*t"]:
+        return index if self.place is None else jnp.append(self.place, self.nodes)[index]
+
+
+def band_layout(system: ArrowSystem, reach: int, place: Int[Array, " n"] | None) -> BandLayout:
+    """The layout that holds every edge that reaches over at most `reach` places."""
+    return BandLayout(system.graph.of_host.shape[0], max(2 * reach, 1), place)
 
 
 class BandMatrix(eqx.Module):
@@ -87,57 +140,37 @@ class BandFactor(eqx.Module):
     """Root of the diagonal, one column."""
 
 
-def assemble_bands(system: ArrowSystem, reach: int) -> tuple[BandMatrix, BandMatrix]:
-    """`H` and `W V^-1 W'`, as far as edges of a reach up to `reach` go.
+def assemble_bands(system: ArrowSystem, layout: BandLayout) -> tuple[BandMatrix, BandMatrix]:
+    """`H` and `W V^-1 W'`, as far as edges go whose ends are at most half a group apart.
 
     Of a longer edge the block of its far node and its share of the host's own block are kept, and what couples the two
     (or the far node to anything else) is dropped, in both matrices alike: each host's part of the Schur complement
     stays positive semi-definite (a block diagonal of one that is), so the band can precondition.
     """
-    hosts = system.graph.of_host.shape[0]
-    layout = BandLayout(hosts, max(2 * reach, 1))
-    near = jnp.abs(system.graph.source - system.graph.target) <= reach
+    near = layout.near(system, layout.group // 2)
     block = system.transport.shape[-1]
     border = jnp.where(near[:, None, None], system.gram[:, :block, block:], 0.0)
     near_system = eqx.tree_at(lambda s: s.gram, system, system.gram.at[:, :block, block:].set(border))
     hessian = add_prior_blocks(assemble_edges(near_system, layout), system, layout)
     products = jnp.where(_kept(system, near), host_products(system), 0.0)
-    return _band(hessian), _band(assemble_hosts(system, products, layout))
+    return _band(hessian, layout), _band(assemble_hosts(system, products, layout), layout)
 
 
-def add_to_diagonal(matrix: BandMatrix, diagonal: Float[Array, " c"]) -> BandMatrix:
-    """`M + diag(diagonal)`."""
-    added = to_band(matrix, diagonal[:, None])
+def add_to_diagonal(matrix: BandMatrix, added: BandVector) -> BandMatrix:
+    """The matrix with a diagonal added, given as one column."""
     eye = jnp.eye(matrix.groups.shape[-1], dtype=matrix.groups.dtype)
     return BandMatrix(
         matrix.groups.at[:, 0].add(added.nodes * eye), matrix.border, matrix.corner + jnp.diag(added.shared[:, 0])
     )
 
 
-def to_band(matrix: BandMatrix, columns: Shaped[Array, "c o"]) -> BandVector:
-    """Columns over the dense coordinates in the layout of `matrix`."""
-    groups, width, shared = matrix.border.shape
-    nodes = columns[:-shared]
-    padded = jnp.pad(nodes, ((0, groups * width - len(nodes)), (0, 0)))
-    return BandVector(padded.reshape(groups, width, -1), columns[-shared:])
-
-
-def from_band(vector: BandVector, size: int) -> Float[Array, "c o"]:
-    """The inverse of `to_band`; `size` is `c`."""
-    nodes = vector.nodes.reshape(-1, vector.nodes.shape[-1])
-    return jnp.concatenate([nodes[: size - len(vector.shared)], vector.shared])
-
-
-def factorise(matrix: BandMatrix, free: Bool[Array, " c"]) -> BandFactor:
-    """Cholesky factor over the free coordinates (the others get a unit diagonal). NaN where not definite."""
-    moves = to_band(matrix, free[:, None])
-    matrix = _hold(matrix, moves)
+def factorise(matrix: BandMatrix, moves: BandVector) -> BandFactor:
+    """Cholesky factor over the coordinates that move (the others get a unit diagonal). NaN where not definite."""
+    matrix = held(matrix, moves)
     nodes, shared = matrix.diagonal()
     scale = BandVector(_positive_root(nodes)[..., None], _positive_root(shared)[..., None])
-    after = jnp.concatenate([scale.nodes[1:], jnp.ones_like(scale.nodes[:1])])
-    groups = matrix.groups / jnp.stack([scale.nodes, after], 1) / scale.nodes[:, None, None, :, 0]
-    border = matrix.border / scale.nodes / scale.shared[:, 0]
-    corner = matrix.corner / scale.shared / scale.shared[:, 0]
+    matrix = balanced(matrix, scale)
+    groups, border, corner = matrix.groups, matrix.border, matrix.corner
     width = groups.shape[-1]
 
     def body(carry: Any, group: Any) -> tuple[Any, Any]:
@@ -178,15 +211,22 @@ def solve_band(factor: BandFactor, columns: BandVector) -> BandVector:
     return BandVector(nodes / factor.scale.nodes, shared / factor.scale.shared)
 
 
-def _band(blocks: Blocks) -> BandMatrix:
+def balanced(matrix: BandMatrix, scale: BandVector) -> BandMatrix:
+    """The matrix divided by a scale, one column, from both sides."""
+    after = jnp.concatenate([scale.nodes[1:], jnp.ones_like(scale.nodes[:1])])
+    return BandMatrix(
+        matrix.groups / jnp.stack([scale.nodes, after], 1) / scale.nodes[:, None, None, :, 0],
+        matrix.border / scale.nodes / scale.shared[:, 0],
+        matrix.corner / scale.shared / scale.shared[:, 0],
+    )
+
+
+def _band(blocks: Blocks, layout: BandLayout) -> BandMatrix:
     """Blocks as groups, without the gradient."""
     groups, _, size, block, _, _ = blocks.nodes.shape
-    shared = blocks.corner.shape[0] - 1
-    border = blocks.border[:, :, :-1].reshape(-1, shared)
-    border = jnp.pad(border, ((0, groups * size * block - len(border)), (0, 0)))
     return BandMatrix(
         blocks.nodes.reshape(groups, 2, size * block, size * block),
-        border.reshape(groups, size * block, shared),
+        layout.rows(blocks.border[:, :, :-1]),
         blocks.corner[:-1, :-1],
     )
 
@@ -202,8 +242,8 @@ def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "n t t"]:
     return classes[:, :, None] == classes[:, None, :]
 
 
-def _hold(matrix: BandMatrix, moves: BandVector) -> BandMatrix:
-    """Unit rows and columns for coordinates that do not move."""
+def held(matrix: BandMatrix, moves: BandVector) -> BandMatrix:
+    """The matrix with unit rows and columns for coordinates that do not move."""
     nodes, shared = moves.nodes[..., 0], moves.shared[..., 0]
     after = jnp.concatenate([nodes[1:], jnp.zeros_like(nodes[:1])])
     rows = jnp.stack([nodes, after], 1)

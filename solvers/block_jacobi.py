@@ -18,7 +18,7 @@ from vggtgeo.solvers.arrow import (
     dense_gradient,
     host_products,
 )
-from vggtgeo.solvers.reduced import MIN_DIAGONAL
+from vggtgeo.solvers.flat_directions import MIN_DIAGONAL
 
 
 class DiagonalLayout(AbstractLayout):

@@ -20,7 +20,6 @@ from vggtgeo.solvers.arrow import (
     ArrowVector,
     back_substitute,
     carry_to_nodes,
-    couple,
     dense_gradient,
     from_relative,
     hessian_times,
@@ -28,11 +27,13 @@ from vggtgeo.solvers.arrow import (
     inverse_landmark_hessian,
     to_relative,
 )
-from vggtgeo.solvers.band_cholesky import Bands, factorise_bands, prepare_bands
-from vggtgeo.solvers.block_band import from_band, solve_band, to_band
+from vggtgeo.solvers.bands import Bands, factorise_bands, prepare_bands
+from vggtgeo.solvers.block_band import band_layout, solve_band
 from vggtgeo.solvers.block_jacobi import JacobiBlocks, apply_blocks, invert_blocks, prepare_blocks
-from vggtgeo.solvers.flat_directions import flat_stiffness, free_gauge
-from vggtgeo.solvers.reduced import MIN_DIAGONAL, AbstractReducedSolver, predicted_decrease
+from vggtgeo.solvers.flat_directions import MIN_DIAGONAL, flat_stiffness, free_gauge
+from vggtgeo.solvers.local_inverse import LocalInverse, local_coordinates
+from vggtgeo.solvers.minres import MinresSolved, minres
+from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, predicted_decrease
 
 Apply = Callable[[Float[Array, " c"]], Float[Array, " c"]]
 Prepared = TypeVar("Prepared")
@@ -48,16 +49,6 @@ class AbstractProduct(eqx.Module):
     @abc.abstractmethod
     def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
         """`W V^-1 W' dense`."""
-
-
-class ImplicitProduct(AbstractProduct):
-    """Through the landmarks: two passes over the cross terms `[n, b k + q + 2, s]` a product, nothing stored."""
-
-    def prepare(self, system: ArrowSystem) -> Array:
-        return inverse_landmark_hessian(system)
-
-    def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
-        return carry_to_nodes(system, prepared * couple(system, dense, 0.0))
 
 
 class HostProduct(AbstractProduct):
@@ -100,15 +91,44 @@ class BandPreconditioner(AbstractPreconditioner[Bands]):
     reach: int = eqx.field(static=True)
 
     def prepare(self, system: ArrowSystem) -> Bands:
-        return prepare_bands(system, self.reach)
+        return prepare_bands(system, band_layout(system, self.reach, None))
 
     def inverse(self, system: ArrowSystem, prepared: Bands, damping: Float[Array, ""]) -> Apply:
-        factor = factorise_bands(system, prepared, damping)
+        factor, layout = factorise_bands(system, prepared, damping), prepared.layout
 
         def apply(residual: Array) -> Array:
-            return from_band(solve_band(factor, to_band(prepared.hessian, residual[:, None])), len(residual))[:, 0]
+            columns = layout.columns(residual[:, None], len(prepared.hessian.corner))
+            return layout.flat(solve_band(factor, columns))[:, 0]
 
         return apply
+
+
+class IterativeFactor(AbstractFactor):
+    """By minimum residuals: products with the exact Hessian, a preconditioner made from a definite one."""
+
+    solver: ConjugateGradients
+    product: Array
+    preconditioner: Any
+    stiffness: Float[Array, " g"]
+
+    def solve(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> Float[Array, " c"]:
+        return self.solved(system, rhs).solution
+
+    def solved(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> MinresSolved:
+        """The same, and how it was found."""
+        gauge, zero = free_gauge(system), jnp.zeros((), rhs.dtype)
+
+        def apply(dense: Array) -> Array:
+            whole = hessian_times(system, dense) - self.solver.product.apply(system, self.product, dense)
+            return jnp.where(system.free, whole + gauge @ (self.stiffness * (gauge.T @ dense)), 0.0)
+
+        inverse = self.solver.preconditioner.inverse(system, self.preconditioner, zero + _LIFT)
+        rhs = jnp.where(system.free, rhs, 0.0)
+        return minres(apply, inverse, rhs, self.solver.exact_rtol, self.solver.exact_iterations)
+
+
+_LIFT = 1e-8
+"""Damping of a preconditioner of undamped systems: what nothing determines must not stop its factorisation."""
 
 
 class _Prepared(eqx.Module):
@@ -128,6 +148,9 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
     rtol: float = 1e-2
     """Largest forcing term: fall of the residual that ends the iteration."""
     max_iterations: int = eqx.field(static=True, default=200)
+    exact_rtol: float = 1e-12
+    """Fall of the residual that ends a solve for a derivative or a covariance."""
+    exact_iterations: int = eqx.field(static=True, default=2000)
 
     def prepare(self, system: ArrowSystem) -> _Prepared:
         gradient, diagonal = dense_gradient(system)
@@ -150,6 +173,33 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         predicted = predicted_decrease(system, prepared.gradient, prepared.diagonal, step, damping)
         # The formula is that of the exact minimiser; the residual of an inexact one corrects it.
         return step, predicted + solved.solution @ solved.residual / 2
+
+    def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> IterativeFactor:
+        product, preconditioner = self.product.prepare(system), self.preconditioner.prepare(definite())
+        return IterativeFactor(self, product, preconditioner, flat_stiffness(system))
+
+    def inverse(self, system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
+        """Column by column, host after host: ask for few of them. All that converges counts as determined."""
+        factor = self.factor(system, lambda: system)
+        gauge = free_gauge(system)
+        along = jax.vmap(lambda column: factor.solve(system, column), 1, 1)(gauge)
+
+        def around(index: Int[Array, " l"]) -> tuple[Array, Array]:
+            unit = lambda at: factor.solved(system, jnp.zeros_like(gauge[:, 0]).at[at].set(1.0))
+            found = jax.vmap(unit)(index)
+            return found.solution[:, index], ~found.converged
+
+        index = local_coordinates(system, hosts)
+        covariance, undetermined = jax.lax.map(around, index)
+        flat = factor.stiffness > 0
+        size = jnp.where(flat, jnp.sum(gauge * along, 0), 1.0)
+        own = jnp.where(flat, along / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)[index]
+        return LocalInverse(
+            covariance=covariance - own @ jnp.swapaxes(own, 1, 2),
+            null=jnp.zeros_like(covariance),
+            undetermined=undetermined,
+            rank=jnp.sum(system.free) - jnp.sum(flat),
+        )
 
     def solve(self, system: ArrowSystem, prepared: _Prepared, damping: Float[Array, ""]) -> Solved:
         """The dense part of the step, and how it was found."""

@@ -1,11 +1,16 @@
-"""Directions along which the energy is flat for a known reason, without forming a matrix over all nodes."""
+"""Directions along which the energy is flat for a known reason, and how they are held."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from vggtgeo.solvers.arrow import ArrowSystem, couple, hessian_times, inverse_landmark_hessian
+from vggtgeo.solvers.arrow import ArrowSystem, Reduced, couple, hessian_times, inverse_landmark_hessian
+
+MIN_DIAGONAL = 1e-6
+"""Least curvature that damping and scaling assume of a coordinate."""
 
 
 def free_gauge(system: ArrowSystem) -> Float[Array, "c g"]:
@@ -13,8 +18,22 @@ def free_gauge(system: ArrowSystem) -> Float[Array, "c g"]:
     return jnp.where(system.free[:, None], system.gauge, 0.0)
 
 
+def gauge_stiffness(system: ArrowSystem, reduced: Reduced) -> Float[Array, " g"]:
+    """Stiffness to add along each gauge direction: zero where the energy curves along it, else the Hessian's own.
+
+    A direction counts as flat where the Schur complement takes all but `sqrt(eps)` of the Hessian's curvature away:
+    then nothing in the problem determines it, and it is held by this stiffness rather than left to the damping.
+    """
+    directions = jnp.where(system.free[:, None], system.gauge, 0.0)
+    quadratic = lambda matrix: jnp.einsum("cg,cd,dg->g", directions, matrix, directions)
+    whole = quadratic(reduced.hessian)
+    left = quadratic(reduced.hessian - reduced.schur)
+    flat = left < jnp.sqrt(jnp.finfo(left.dtype).eps) * whole
+    return jnp.where(flat, whole, 0.0)
+
+
 def flat_stiffness(system: ArrowSystem) -> Float[Array, " g"]:
-    """The stiffness of `reduced.gauge_stiffness`, from one product of the system with each gauge direction.
+    """The stiffness of `gauge_stiffness`, from one product of the system with each gauge direction.
 
     `d' H d - d' W V^-1 W' d` against `d' H d`: flat where elimination takes all but `sqrt(eps)` of the curvature away.
     """
@@ -37,3 +56,35 @@ def pins(system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Arr
     at = jnp.argmax(jnp.abs(free_gauge(system)), axis=0)
     pinned = jnp.zeros_like(system.gauge).at[at, jnp.arange(len(at))].set(1.0)
     return pinned * jnp.where(stiffness > 0, diagonal[at], 0.0)
+
+
+def pinned_update(
+    system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Array, " c"]
+) -> tuple[Float[Array, "c u"], Float[Array, " u"]]:
+    """`U, D` with `B + U D U'` the matrix that the gauge's own stiffness holds, where `B` is the pinned one:
+    `U = [G, P]` and `D = diag(K, -stiffness of pins)`.
+    """
+    pinned = pins(system, stiffness, diagonal)
+    updates = jnp.concatenate([free_gauge(system), (pinned != 0).astype(pinned.dtype)], 1)
+    return updates, jnp.concatenate([stiffness, -pinned.sum(0)])
+
+
+def solve_pinned(
+    updates: Float[Array, "c u"],
+    weights: Float[Array, " u"],
+    inverse: Callable[[Array], Array],
+    rhs: Float[Array, " c"],
+) -> Float[Array, " c"]:
+    """Solve with `B + U D U'` (the identity of Woodbury).
+
+    Args:
+        updates: `U`, and
+        weights: the diagonal of `D`, as `pinned_update` gives them.
+        inverse: `B^-1` times columns `[c, m]`.
+        rhs: right-hand side.
+
+    """
+    solved = inverse(jnp.concatenate([rhs[:, None], updates], 1))
+    first, others = solved[:, 0], solved[:, 1:]
+    small = jnp.eye(len(weights), dtype=rhs.dtype) + weights[:, None] * (updates.T @ others)
+    return first - others @ jnp.linalg.solve(small, weights * (updates.T @ first))

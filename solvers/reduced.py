@@ -3,21 +3,37 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy as jsp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, Reduced, back_substitute, reduce
-
-MIN_DIAGONAL = 1e-6
+from vggtgeo.solvers.dense_inverse import dense_inverse
+from vggtgeo.solvers.flat_directions import MIN_DIAGONAL, gauge_stiffness
+from vggtgeo.solvers.local_inverse import LocalInverse
 
 Prepared = TypeVar("Prepared", bound=eqx.Module)
 
 
+class AbstractFactor(eqx.Module):
+    """The undamped Schur complement of an exact Hessian over the free coordinates, definite or not.
+
+    Flat gauge directions are held by a stiffness.
+    """
+
+    @abc.abstractmethod
+    def solve(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> Float[Array, " c"]:
+        """`S^-1 rhs` of the system that was factorised; zero for held coordinates, whatever `rhs` says of them."""
+
+
 class AbstractReducedSolver(eqx.Module, Generic[Prepared]):
-    """Prepares what does not depend on the damping once, then solves for any damping."""
+    """Prepares what does not depend on the damping once, then solves for any damping.
+
+    The same structure serves the derivative of the optimum (`factor`) and covariances (`inverse`).
+    """
 
     @abc.abstractmethod
     def prepare(self, system: ArrowSystem) -> Prepared:
@@ -29,11 +45,32 @@ class AbstractReducedSolver(eqx.Module, Generic[Prepared]):
     ) -> tuple[ArrowVector, Float[Array, ""]]:
         """`(step, predicted decrease of the energy)` of the damped model."""
 
+    @abc.abstractmethod
+    def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> AbstractFactor:
+        """For solves without damping.
+
+        system: of the exact Hessian. definite: makes one with a positive Hessian nearby, for those that precondition.
+        """
+
+    @abc.abstractmethod
+    def inverse(self, system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
+        """The inverse around some hosts; the system must be positive semidefinite."""
+
 
 class _Prepared(eqx.Module):
     reduced: Reduced
     diagonal: Float[Array, " c"]
     gauge_stiffness: Float[Array, " g"]
+
+
+class LuFactor(AbstractFactor):
+    """By elimination with pivots; not finite where the matrix is singular."""
+
+    factors: tuple[Float[Array, "c c"], Int[Array, " c"]]
+
+    def solve(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> Float[Array, " c"]:
+        solved: Array = jsp.linalg.lu_solve(self.factors, jnp.where(system.free, rhs, 0.0))
+        return solved
 
 
 class DenseCholesky(AbstractReducedSolver[_Prepared]):
@@ -42,7 +79,7 @@ class DenseCholesky(AbstractReducedSolver[_Prepared]):
     def prepare(self, system: ArrowSystem) -> _Prepared:
         reduced = reduce(system)
         diagonal = damping_diagonal(jnp.diagonal(reduced.hessian), system.free)
-        return _Prepared(reduced, diagonal, gauge_stiffness(system, reduced, diagonal))
+        return _Prepared(reduced, diagonal, gauge_stiffness(system, reduced))
 
     def step(
         self, system: ArrowSystem, prepared: _Prepared, damping: Float[Array, ""]
@@ -55,6 +92,16 @@ class DenseCholesky(AbstractReducedSolver[_Prepared]):
         landmarks = shrink * back_substitute(system, dense)
         step = ArrowVector(dense, landmarks)
         return step, predicted_decrease(system, prepared.reduced.gradient, prepared.diagonal, step, damping)
+
+    def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> LuFactor:
+        reduced = reduce(system)
+        matrix = reduced.hessian - reduced.schur
+        matrix = matrix + (system.gauge * gauge_stiffness(system, reduced)) @ system.gauge.T
+        both = system.free[:, None] & system.free[None, :]
+        return LuFactor(jsp.linalg.lu_factor(jnp.where(both, matrix, jnp.eye(len(matrix), dtype=matrix.dtype))))
+
+    def inverse(self, system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
+        return dense_inverse(system, hosts)
 
 
 def damping_diagonal(diagonal: Float[Array, " c"], free: Bool[Array, " c"]) -> Float[Array, " c"]:
@@ -89,17 +136,3 @@ def predicted_decrease(
     dense = step.dense @ (damping * diagonal * step.dense - free_gradient)
     curved = damping * system.landmark_hessian * step.landmarks - system.landmark_gradient
     return (dense + jnp.sum(step.landmarks * curved)) / 2
-
-
-def gauge_stiffness(system: ArrowSystem, reduced: Reduced, diagonal: Float[Array, " c"]) -> Float[Array, " g"]:
-    """Stiffness to add along each gauge direction: zero where the energy curves along it, else the Hessian's own.
-
-    A direction counts as flat where the Schur complement takes all but `sqrt(eps)` of the Hessian's curvature away:
-    then nothing in the problem determines it, and it is held by this stiffness rather than left to the damping.
-    """
-    directions = jnp.where(system.free[:, None], system.gauge, 0.0)
-    quadratic = lambda matrix: jnp.einsum("cg,cd,dg->g", directions, matrix, directions)
-    whole = quadratic(reduced.hessian)
-    left = quadratic(reduced.hessian - reduced.schur)
-    flat = left < jnp.sqrt(jnp.finfo(left.dtype).eps) * whole
-    return jnp.where(flat, whole, 0.0)

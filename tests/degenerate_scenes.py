@@ -22,8 +22,6 @@ KEYFRAMES, POINTS, LINES, SAMPLES = 3, 8, 4, 2
 SIZE = PaddedSize(KEYFRAMES, POINTS, LINES * SAMPLES, KEYFRAMES - 1)
 WELL = make_scene(KEYFRAMES, POINTS, LINES, SAMPLES)
 HELD = np.ones(4, bool)
-QUICK = {"xla_backend_optimization_level": 0}
-"""Compiler options for what is compiled once and run on tiny arrays: a third less time to compile."""
 
 
 def scene_of(

@@ -5,14 +5,13 @@ estimation error squared (NEES) of an estimate of `k` numbers, `e' C^-1 e`, then
 degrees of freedom (Bar-Shalom et al., "Estimation with Applications to Tracking and Navigation", 2001, 5.4).
 """
 
-import functools
 from dataclasses import dataclass
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from degenerate_scenes import KEYFRAMES, LINES, POINTS, QUICK, SAMPLES, packed
+from degenerate_scenes import KEYFRAMES, LINES, POINTS, SAMPLES, packed
 from jaxtyping import Array
 from scenes import make_scene
 from scipy.stats import chi2
@@ -88,7 +87,7 @@ def noisy(problem: Problem, key: Array) -> Problem:
     )
 
 
-@functools.partial(jax.jit, compiler_options=QUICK)
+@jax.jit
 def _errors(problems: Problem, truths: State, keys: Array) -> dict[str, Array]:
     def one(drawing: tuple[Problem, State, Array]) -> dict[str, Array]:
         problem, truth, key = drawing

@@ -13,13 +13,17 @@ from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.run import run_frames
+from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.watching import WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecorder
 
 FRAMES = 9
 # The shape of tests/test_pipeline.py, so that a process that runs both compiles the solver once.
-SETTINGS = SlamSettings(window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False)
+SETTINGS = SlamSettings(
+    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    refinement=RefinementSettings(global_adjustment=False),
+)
 ROLES = Roles(points=SiftMatcher(count=500))
 
 
@@ -44,6 +48,6 @@ def recorded_run() -> RecordedRun:
     sequence = simulate("room", FRAMES, 0, (320, 240), rate=10.0)
     frames, states, recorder = list(sequence.frames()), [], WindowRecorder()
     for slam in run_frames(iter(frames), sequence.camera, ROLES, SETTINGS, Clock()):
-        recorder.see(slam, frames[slam.frames[-1].frame])
+        recorder.on_frame(slam, frames[slam.frames[-1].frame])
         states.append(slam)
     return RecordedRun(sequence, frames, states, recorder, map_points(slam.keyframes, slam.intrinsics))

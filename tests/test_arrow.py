@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vggtgeo.solvers.adjoint import ExactModel
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
     ArrowVector,
@@ -19,6 +18,7 @@ from vggtgeo.solvers.arrow import (
     multiply,
     reduce,
 )
+from vggtgeo.solvers.exact_model import exact_model
 from vggtgeo.solvers.reduced import DenseCholesky
 
 NODES, BLOCK, SHARED, SLOTS = 3, 2, 2, 4
@@ -162,7 +162,7 @@ def test_solve_exactly_is_the_dense_solve(pair: tuple[ArrowSystem, Dense]) -> No
     free = free_part(system)
     expected = np.zeros_like(values)
     expected[free] = np.linalg.solve(dense.matrix[np.ix_(free, free)], values[free])
-    found = flat(jax.jit(lambda system, vector: ExactModel(system).solve(vector))(system, unflat(values)))
+    found = flat(jax.jit(lambda system, vector: exact_model(system).solve(vector))(system, unflat(values)))
     error = np.abs(found - expected).max() / np.abs(expected).max()
     assert error < 1e-10
 

@@ -11,11 +11,11 @@ from vggtgeo.datasets import (
     Frame,
     ImageFolder,
     Sequence,
+    SequenceView,
     SevenScenes,
     TumRgbd,
     open_sequence,
     parse_intrinsics,
-    split,
     with_intrinsics,
     without_depth,
 )
@@ -271,12 +271,11 @@ def test_depth_can_be_left_out(tmp_path: Path) -> None:
     assert colour.ground_truth() is not None
 
 
-def test_split_hides_the_truth_from_what_estimates(tmp_path: Path) -> None:
-    # Proves that the sequence handed to an estimator has no truth, and the report has it.
-    visible, truth = split(open_sequence(tiny.seven_scenes(tmp_path)))
-    assert visible.ground_truth() is None
-    assert truth is not None
-    assert len(truth) == 3
+def test_a_view_hides_the_truth_from_what_estimates(tmp_path: Path) -> None:
+    # Proves that the sequence handed to an estimator has no truth, while the folder has one of three poses.
+    sequence = open_sequence(tiny.seven_scenes(tmp_path))
+    assert len(sequence.ground_truth()) == 3
+    assert SequenceView(sequence, sequence.camera, sequence.has_depth, has_truth=False).ground_truth() is None
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """The exact Hessian of bundle adjustment against automatic differentiation of an energy written by hand."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,7 +31,7 @@ def prior_on(state: State, strength: float) -> MarginalPrior:
     )
 
 
-@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiled long, run briefly
+@jax.jit
 def both(problem: Problem, state: State) -> tuple[jax.Array, ...]:
     """Gradient and Hessian, dense, of the solver's arrow and of the energy in the same coordinates."""
     ba = BundleAdjustment(problem)

@@ -10,24 +10,41 @@ from conftest import ROOT
 
 FILES = sorted(file for folder in ("vggtgeo", "solvers", "models") for file in (ROOT / folder).rglob("*.py"))
 ALLOWED = {
-    "solvers": {"vggtgeo.solvers", "equinox", "jax", "jaxtyping", "lineax", "numpy", "optimistix"},
+    "solvers": {"vggtgeo.solvers", "equinox", "jax", "jaxtyping", "numpy", "optimistix"},
     "models": {"vggtgeo.models", "cv2", "numpy", "onnxruntime", "scipy"},
 }
-NEVER_AT_MODULE_LEVEL = {"evo", "onnx", "onnxscript", "rerun", "submitit", "torch"}
+STAIR = (
+    ("io",),
+    ("geometry",),
+    ("bundle", "datasets", "evaluation"),
+    ("simulation", "slam"),
+    ("figures",),
+    ("report",),
+    ("results",),
+    ("learning", "paper_bench", "viewing"),
+    ("cli",),
+)
+"""Packages of `vggtgeo`, the lowest first: each imports of those below it; those of one step nothing of each other."""
+STEP = {package: step for step, packages in enumerate(STAIR) for package in packages}
+LATE = {"vggtgeo.cli"}
+"""Packages whose functions import the project: a command's help must not load what the command needs."""
+NEVER_AT_MODULE_LEVEL = {"evo", "onnx", "onnxscript", "rerun", "torch"}
 
 
-def _statements(body: ast.AST, in_functions: bool) -> Iterator[ast.AST]:
-    """The nodes below `body`, those inside functions only if asked for."""
+def _statements(body: ast.AST, in_functions: bool, for_types: bool = True) -> Iterator[ast.AST]:
+    """The nodes below `body`, those inside functions and those below `if TYPE_CHECKING` only if asked for."""
     for node in ast.iter_child_nodes(body):
         yield node
-        if in_functions or not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            yield from _statements(node, in_functions)
+        late = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if (in_functions or not late) and (for_types or not types):
+            yield from _statements(node, in_functions, for_types)
 
 
-def imported(source: str, in_functions: bool = True) -> set[str]:
+def imported(source: str, in_functions: bool = True, for_types: bool = True) -> set[str]:
     """Dotted names of all that `source` imports: `a.b` for `from a import b`, `.` for relative ones."""
     names = set()
-    for node in _statements(ast.parse(source), in_functions):
+    for node in _statements(ast.parse(source), in_functions, for_types):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -35,8 +52,26 @@ def imported(source: str, in_functions: bool = True) -> set[str]:
     return names
 
 
+def modules(source: str, in_functions: bool = True, for_types: bool = True) -> set[str]:
+    """The modules of the project that `source` imports from: `vggtgeo.a.b` for `from vggtgeo.a.b import c`."""
+    below = [name for name in imported(source, in_functions, for_types) if _within(name, {"vggtgeo"})]
+    return {max((known for known in MODULES if _within(name, {known})), key=len) for name in below}
+
+
 def _within(name: str, packages: set[str]) -> bool:
     return any(name == package or name.startswith(f"{package}.") for package in packages)
+
+
+def _module(file: Path) -> str:
+    """The dotted name by which a source file is imported."""
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    parts = parts if parts[0] == "vggtgeo" else ("vggtgeo", *parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {_module(file): file for file in FILES}
+ABOVE = [file for file in FILES if file.is_relative_to(ROOT / "vggtgeo") and file.parent != ROOT / "vggtgeo"]
+"""The files on the stair; `vggtgeo/__init__.py` stands on top of it."""
 
 
 def test_imported_sees_every_form() -> None:
@@ -66,3 +101,39 @@ def test_optional_packages_are_imported_where_they_are_used(file: Path) -> None:
     # Proves that no module needs an optional or slow package to be imported. Oracle: the list above.
     names = imported(file.read_text(), in_functions=False)
     assert {name for name in names if _within(name, NEVER_AT_MODULE_LEVEL)} == set()
+
+
+def test_the_stair_has_a_step_for_every_package() -> None:
+    # Proves that no package is left out of the tests below. Oracle: the folders.
+    assert {file.relative_to(ROOT / "vggtgeo").parts[0] for file in ABOVE} == set(STEP)
+
+
+@pytest.mark.parametrize("file", ABOVE, ids=lambda file: str(Path(file).relative_to(ROOT)))
+def test_nothing_imports_upward(file: Path) -> None:
+    # Proves that data flows down one stair: no import at any depth, of a type or of a value, leads up or aside.
+    # Oracle: the steps above.
+    own = file.relative_to(ROOT / "vggtgeo").parts[0]
+    for module in modules(file.read_text()):
+        package = module.split(".")[1]
+        if package not in (own, "solvers", "models"):
+            assert STEP[package] < STEP[own], f"`vggtgeo.{own}` imports `{module}`"
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(Path(file).relative_to(ROOT)))
+def test_no_import_hides_in_a_function(file: Path) -> None:
+    # Proves that no circle is broken by importing late. Oracle: the same file without its functions.
+    if _within(_module(file), LATE) or _module(file) == "vggtgeo":
+        pytest.skip("loads its parts when they are asked for")
+    source = file.read_text()
+    assert modules(source) - modules(source, in_functions=False) == set()
+
+
+def test_modules_do_not_import_each_other_in_a_circle() -> None:
+    # Proves that the modules can be loaded from the bottom up. Oracle: repeated removal of those whose
+    # imports are all removed already must leave none.
+    known = {name: modules(file.read_text(), False, for_types=False) - {name} for name, file in MODULES.items()}
+    left = {name: set(needs) for name, needs in known.items() if name != "vggtgeo"}
+    while free := [name for name, needs in left.items() if not needs & left.keys()]:
+        for name in free:
+            del left[name]
+    assert left == {}

@@ -34,9 +34,9 @@ def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr("vggtgeo.cli.run_sequence.warm_up", lambda settings, metric: ())
-    monkeypatch.setattr("vggtgeo.slam.watching.WindowRecorder.warm_up", lambda self: None)
-    monkeypatch.setattr("vggtgeo.cli.run_sequence.run_frames", interrupted)
+    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
+    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
+    monkeypatch.setattr("vggtgeo.results.reconstruction.run_frames", interrupted)
     (tmp_path / "trajectory.txt").write_text("of an earlier run")
     result = CliRunner().invoke(make_app(), ["demo", "--frames", "3", "-o", str(tmp_path), "--json"])
     assert result.exit_code == 130, result.output

@@ -8,6 +8,7 @@ import pytest
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.adjustment import _prior_trust
 from vggtgeo.slam.line_support import sample_shares, spread_samples, supported
+from vggtgeo.slam.setting_groups import DepthSettings
 from vggtgeo.slam.settings import SlamSettings
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
@@ -51,12 +52,12 @@ def test_the_depth_prior_follows_the_chosen_confidence() -> None:
     own, saliency = np.array([0.2, 0.9]), np.array([0.7, 0.1])
     expected = {"own": own, "saliency": saliency, "complement": 1 - saliency}
     for name, values in expected.items():
-        settings = SlamSettings(depth_trust=name)
+        settings = SlamSettings(depth=DepthSettings(depth_trust=name))
         np.testing.assert_array_equal(_prior_trust(own, saliency, settings), values)
         without = replace(settings, use_confidence=False)
         np.testing.assert_array_equal(_prior_trust(own, saliency, without), 1.0)
     with pytest.raises(InputError, match="`depth_trust` is 'omega'"):
-        SlamSettings(depth_trust="omega")
+        DepthSettings(depth_trust="omega")
 
 
 def test_spread_samples_are_even_and_hold_both_ends() -> None:

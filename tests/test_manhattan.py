@@ -1,7 +1,5 @@
 """Rotations from lines along three perpendicular directions: the estimate, and the residual made of it."""
 
-from dataclasses import replace
-
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -125,4 +123,3 @@ def test_it_is_off_unless_asked_for() -> None:
     # Proves that a run without the setting is untouched. Oracle: the same object.
     slam = begin(Camera(tuple(INTRINSICS), 320, 240), Roles(), SlamSettings())
     assert constrain_rotation(slam, SlamSettings()) is slam
-    assert replace(SlamSettings(), manhattan=True).manhattan

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import make_scene
-from vggtgeo.solvers.adjoint import ExactModel
 from vggtgeo.solvers.arrow import ArrowVector, reduce
+from vggtgeo.solvers.exact_model import exact_model
 from vggtgeo.solvers.kernels import Square
 
 from vggtgeo.bundle.linearise import linearise
@@ -36,7 +36,7 @@ def _made(keyframes: int, points: int, lines: int, **options: Any) -> _Made:
 def _gauss_newton_step(problem: Problem, state: State) -> ArrowVector:
     system = linearise(prepared(problem), state)
     gradient = ArrowVector(reduce(system).gradient, system.landmark_gradient)
-    return ExactModel(system).solve(jax.tree.map(jnp.negative, gradient))
+    return exact_model(system).solve(jax.tree.map(jnp.negative, gradient))
 
 
 def _without(problem: Problem, dropped_edges: jax.Array, dropped_host: int | None) -> Problem:

@@ -12,19 +12,50 @@ import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 LONGEST_CELL = 25
+SMALL_WINDOW = "window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False"
+# What the quick test replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.
+SHORTER: dict[str, dict[str, str]] = {
+    "own_video": {"frames=45": "frames=16", "window=6, point_slots=160, line_slots=64": SMALL_WINDOW},
+    "evaluate": {'"small"': '"small", scenes=["room"], seeds=1'},
+    "differentiate": {
+        "tracked_windows(sequence, 8,": "tracked_windows(sequence, 3,",
+        "tracked_windows(other, 4,": "tracked_windows(other, 2,",
+        "steps=25, size=4": "steps=2, size=2",
+        "seed=201, size": "seed=101, size",  # the world that is built already
+    },
+}
 
 
 def _cells(path: Path, kind: str) -> list[dict[str, Any]]:
     return [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == kind]
 
 
+def _run(path: Path, changes: dict[str, str]) -> None:
+    """All code cells in one namespace, in order, each text of `changes` replaced."""
+    namespace: dict[str, object] = {"__name__": "__main__"}
+    unused = set(changes)
+    for number, cell in enumerate(_cells(path, "code")):
+        source = "".join(cell["source"])
+        for text, shorter in changes.items():
+            unused -= {text} if text in source else set()
+            source = source.replace(text, shorter)
+        exec(compile(source, f"{path.name}[{number}]", "exec"), namespace)
+    plt.close("all")
+    assert not unused, f"`{path.name}` no longer holds {unused}"
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """All code cells run in one namespace, in order, without an error or a warning, and print something."""
-    namespace: dict[str, object] = {"__name__": "__main__"}
-    for number, cell in enumerate(_cells(path, "code")):
-        exec(compile("".join(cell["source"]), f"{path.name}[{number}]", "exec"), namespace)
-    plt.close("all")
+    """Every cell runs, in order, without an error or a warning, and prints something; long ones on less data."""
+    _run(path, SHORTER.get(path.stem, {}))
+    assert capsys.readouterr().out, f"`{path.name}` printed nothing"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [path for path in NOTEBOOKS if path.stem in SHORTER], ids=lambda path: path.stem)
+def test_notebook_runs_as_it_stands(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same with all its data."""
+    _run(path, {})
     assert capsys.readouterr().out, f"`{path.name}` printed nothing"
 
 

@@ -11,7 +11,6 @@ from degenerate_scenes import (
     HELD,
     KEYFRAMES,
     POINTS,
-    QUICK,
     WELL,
     one_plane,
     packed,
@@ -24,8 +23,8 @@ from scenes import Scene
 from vggtgeo.solvers.arrow import ArrowVector
 
 from vggtgeo.bundle.analysis.directions import MOTIONS, direction_names, named_directions
-from vggtgeo.bundle.analysis.observability import WEAK, Observability, observability
-from vggtgeo.bundle.analysis.observability_report import undetermined_landmarks, weak_directions
+from vggtgeo.bundle.analysis.observability import observability
+from vggtgeo.bundle.analysis.observability_report import WEAK, Observability, undetermined_landmarks, weak_directions
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State
 
@@ -38,7 +37,7 @@ NO_PRIOR = {"intrinsics_sigma": None}
 @pytest.fixture(scope="module")
 def observed() -> Observe:
     """`observability`, compiled once for all tests of this file."""
-    return jax.jit(observability, compiler_options=QUICK)
+    return jax.jit(observability)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ IMPORT_ALL = """
 import importlib, pkgutil, sys
 class Absent:
     def find_spec(name, path=None, target=None):
-        if name in {"torch", "onnx", "onnxscript", "submitit", "evo", "beartype", "pytest", "setuptools"}:
+        if name in {"torch", "onnx", "onnxscript", "evo", "beartype", "pytest", "setuptools"}:
             raise ModuleNotFoundError(name)
 sys.meta_path.insert(0, Absent)
 pending = ["vggtgeo", "vggtgeo.solvers", "vggtgeo.models"]

@@ -17,7 +17,7 @@ from vggtgeo.paper_bench.courses import Course
 from vggtgeo.paper_bench.measure import Errors
 from vggtgeo.paper_bench.plan import PLANS, Group, Job, Plan
 from vggtgeo.paper_bench.runner import BenchReport, bench
-from vggtgeo.paper_bench.store import Result, Store, fingerprint
+from vggtgeo.paper_bench.store import BenchRun, Store, fingerprint
 from vggtgeo.paper_bench.variants import VARIANTS
 
 TINY = Plan("tiny", (Group(Course("room", 10, 10.0, (96, 72), key_points=200), ("full", "C"), 1),))
@@ -30,8 +30,8 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANS, "tiny", TINY)
 
 
-def result(variant: str, seed: int, ate_cm: float, scene: str = "office") -> Result:
-    return Result(scene, variant, seed, replace(ERRORS, ate_m=ate_cm / 100))
+def result(variant: str, seed: int, ate_cm: float, scene: str = "office") -> BenchRun:
+    return BenchRun(scene, variant, seed, replace(ERRORS, ate_m=ate_cm / 100))
 
 
 @pytest.mark.slow  # 30 s of compilation; notebooks/evaluate.ipynb runs the same path in the quick suite
@@ -76,7 +76,7 @@ def test_a_stored_run_of_other_settings_is_not_taken(tmp_path: Path) -> None:
     store = Store(tmp_path)
     assert store.load(job) is None
     store.save(job, ERRORS)
-    assert store.load(job) == Result("room", "full", 0, ERRORS)
+    assert store.load(job) == BenchRun("room", "full", 0, ERRORS)
     longer = replace(job, course=replace(job.course, frames=11))
     assert store.load(longer) is None
     store.path(job).write_text("{}")

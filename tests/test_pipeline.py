@@ -22,12 +22,17 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_adjustment import adjust_all, close_loops
 from vggtgeo.slam.run import finish, frame_trajectory, keyframe_trajectory, run_frames
+from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
 
 SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.
-SETTINGS = SlamSettings(window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False)
+SETTINGS = SlamSettings(
+    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    refinement=RefinementSettings(global_adjustment=False),
+)
 ROLES = Roles(points=SiftMatcher(count=500))
 
 
@@ -52,7 +57,7 @@ def test_rgbd_recovers_the_truth(room, tracked: Slam) -> None:
     report = evaluate_trajectory(frame_trajectory(tracked), room[2])
     error = report.se3.statistics.rmse
     assert all(record.tracked for record in tracked.frames)
-    assert len(tracked.keyframes) > SETTINGS.window, "no keyframe ever left the window"
+    assert len(tracked.keyframes) > SETTINGS.window.size, "no keyframe ever left the window"
     assert error < 0.015, f"ATE {error:.4f} m"
 
 
@@ -67,7 +72,7 @@ def test_single_precision_of_the_caller_changes_nothing(room, tracked: Slam) -> 
 def test_two_ends_lines_recover_the_truth(room) -> None:
     """ATE below 1.5 cm where each segment has two unknowns; oracle: the renderer's poses."""
     frames, camera, truth = room
-    slam = _run(frames, camera, settings=replace(SETTINGS, two_ends_lines=True))
+    slam = _run(frames, camera, settings=updated(SETTINGS, {"line": {"two_ends_lines": True}}))
     assert slam.solved is not None
     assert slam.solved[0].problem.fraction is not None
     assert evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse < 0.015
@@ -90,7 +95,7 @@ def test_no_recompilation_after_the_first_window(room, tracked: Slam) -> None:
         slam = _run(frames, camera)
     finally:
         jax.monitoring.clear_event_listeners()
-    assert len(slam.keyframes) > SETTINGS.window
+    assert len(slam.keyframes) > SETTINGS.window.size
     assert not compiled, f"{len(compiled)} programs were compiled"
 
 
@@ -117,7 +122,10 @@ def _shaken(slam: Slam, metres: float, degrees: float, from_keyframe: int = 1, t
 @pytest.mark.parametrize("surfaces", [300.0, 0.0], ids=["with surfaces", "matches alone"])
 def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: float) -> None:
     """Keyframes moved by 5 cm and 2 degrees each come back to below 1 cm; oracle: the renderer's poses."""
-    settings = replace(SETTINGS, global_adjustment=True, global_iterations=20, surface_points=surfaces)
+    settings = updated(
+        SETTINGS,
+        {"refinement": {"global_adjustment": True, "global_iterations": 20}, "depth": {"surface_points": surfaces}},
+    )
     wrong = _shaken(tracked, 0.05, 2.0)
     assert _keyframe_error(wrong, room[2]) > 0.03
     error = _keyframe_error(finish(wrong, ROLES, settings), room[2])
@@ -129,7 +137,10 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
 
     Oracle: the renderer's poses; and the same adjustment without the loops, which leaves the parts where they are.
     """
-    middle, settings = len(tracked.keyframes) // 2, replace(SETTINGS, global_iterations=20, surface_points=0.0)
+    middle, settings = (
+        len(tracked.keyframes) // 2,
+        updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth": {"surface_points": 0.0}}),
+    )
     apart = _shaken(tracked, 0.05, 2.0, from_keyframe=middle, together=True)
     within = [pair for pair in apart.pairs if (pair.first < middle) == (pair.second < middle)]
     tied = [f for f in apart.factors if len({number < middle for number in f.keyframes}) == 1]

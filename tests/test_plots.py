@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import vggtgeo as vg
 from vggtgeo.figures import plots
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -93,3 +94,17 @@ def test_an_empty_trajectory_is_refused(tmp_path: Path) -> None:
 def _has(image: np.ndarray, colour: str) -> bool:
     wanted = [int(colour[k : k + 2], 16) for k in (5, 3, 1)]
     return bool((np.abs(image.astype(int) - wanted).max(axis=2) < 25).sum() > 100)
+
+
+def test_plot_draws_by_the_kind_of_the_value() -> None:
+    # Proves that one function draws a trajectory as its own figure does, and says what it can draw of what it cannot.
+    # Oracle: the titles and the lines of the figure made directly.
+    walk = _walk()
+    drawn, direct = vg.plot(walk, walk), plots.trajectory_figure(walk, walk)
+    assert isinstance(drawn, plots.NotebookFigure)
+    assert drawn._repr_png_()[1:4] == b"PNG"
+    for mine, other in zip(drawn.axes, direct.axes, strict=True):
+        for line, same in zip(mine.lines, other.lines, strict=True):
+            np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
+    with pytest.raises(TypeError, match=r"`plot` has no picture of a `list`; it draws .*Observability, .*Solution"):
+        vg.plot([1.0])

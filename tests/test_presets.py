@@ -5,10 +5,8 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,13 +20,13 @@ from vggtgeo.models.roles import PoseQuery
 from vggtgeo.models.window_locator import WindowLocator
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.cli.presets import NEEDED, perception
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.simulation.sequence import SyntheticSequence, simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.slam.presets import NEEDED, Perception, perception
 from vggtgeo.slam.run import frame_trajectory, run
+from vggtgeo.slam.setting_groups import RefinementSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.trust.finding import Verdict
 
 RUN_AND_WRITE = "vggtgeo.cli.run_sequence"
 """The module from which the command takes `run_and_write`."""
@@ -79,7 +77,7 @@ def test_a_run_asks_every_network_and_from_a_cache_none(
 ) -> None:
     # Proves that a whole run goes through every network of the preset and no other, that its result is finite, and
     # that a second run with the same cache asks none and gives the same. Oracle: a count, and the first trajectory.
-    settings = SlamSettings(global_adjustment=False)
+    settings = SlamSettings(refinement=RefinementSettings(global_adjustment=False))
     poses = []
     for expected in (set(NEEDED[preset]), set()):
         found = perception(preset, Roles(), files, tmp_path / "cache")
@@ -105,7 +103,7 @@ def test_depth_that_knows_nothing_leaves_every_other_network_its_part(
     shutil.copytree(files, folder)
     tiny.moge2(folder / "moge2.onnx", SIZE, mask=0.1)
     found = perception("paper", Roles(), folder)
-    *_, slam = run(walk, found.roles, SlamSettings(global_adjustment=False), end=4)
+    *_, slam = run(walk, found.roles, SlamSettings(refinement=RefinementSettings(global_adjustment=False)), end=4)
     assert set(counted) == set(NEEDED["paper"])
     assert counted["vggt"] >= 3
     assert np.isfinite(frame_trajectory(slam).poses).all()
@@ -119,7 +117,7 @@ def test_an_interrupted_run_goes_on(
     def decoded(cache: Path, frames: int) -> int:
         counted.clear()
         roles = perception("paper", Roles(), files, cache).roles
-        for _ in run(walk, roles, SlamSettings(global_adjustment=False), end=frames):
+        for _ in run(walk, roles, SlamSettings(refinement=RefinementSettings(global_adjustment=False)), end=frames):
             pass
         return counted.get("mast3r_decoder", 0)
 
@@ -134,11 +132,8 @@ def called(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     """What `vggtgeo run` would do: the run itself is left out."""
     given: dict[str, object] = {}
 
-    def stand_in(
-        sequence: object, roles: Roles, *_: object, facts: Callable[[], dict], **__: object
-    ) -> SimpleNamespace:
-        given.update(roles=roles, facts=facts())
-        return SimpleNamespace(interrupted=False, verdict=Verdict("good"))
+    def stand_in(sequence: object, perceived: Perception, *_: object, **__: object) -> None:
+        given.update(roles=perceived.roles, facts=perceived.facts())
 
     module = importlib.import_module(RUN_AND_WRITE)
     monkeypatch.setattr(module, "run_and_write", stand_in)
@@ -209,7 +204,7 @@ def test_missing_and_wrong_files_end_the_run_before_any_frame(
         (folder / f"{name}.onnx").rename(tmp_path / f"{name}.onnx")
     result = _run(tmp_path, "--preset", "paper", "--models", folder)
     assert result.exit_code == 2
-    assert "`--preset paper` needs vggt.onnx, moge2.onnx in" in result.output
+    assert "`preset` 'paper' needs vggt.onnx, moge2.onnx in" in result.output
     for name in ("vggt", "moge2"):
         (tmp_path / f"{name}.onnx").rename(folder / f"{name}.onnx")
     result = _run(tmp_path, "--preset", "paper", "--models", folder)
@@ -233,7 +228,7 @@ def test_missing_and_wrong_files_end_the_run_before_any_frame(
 
 def test_an_unknown_preset_is_refused() -> None:
     # Proves that the name is checked where it is used.
-    with pytest.raises(InputError, match="`--preset` is 'large'; it must be one of classical, light, paper"):
+    with pytest.raises(InputError, match="`preset` is 'large'; it must be one of classical, light, paper"):
         perception("large", Roles())
 
 

@@ -16,10 +16,11 @@ from vggtgeo.solvers.kernels import Square
 
 from vggtgeo.bundle.residuals import residual_sizes
 from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.report import map_view, write_page
-from vggtgeo.slam.outputs import write_summary
+from vggtgeo.report import write_page
+from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
@@ -56,7 +57,7 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
     verdict = options.setdefault("verdict", Verdict("good"))
     settings, seconds = {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}
-    summary = write_summary(folder, slam, settings, seconds, report, verdict, **facts)
+    summary = summarise(slam, verdict, settings=settings, seconds=seconds, report=report, **facts)
     given = {"title": "a <room>", "truth": truth, "cloud": run.cloud, "records": run.recorder.records}
     write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
     return (folder / "report.html").read_text()
@@ -77,7 +78,7 @@ def test_every_adjustment_is_recorded_once(run: RecordedRun) -> None:
         assert record.units["points"] == "px"
         assert set(record.rms) == set(record.counts) <= {"points", "lines", "depth", "relative_poses"}
         assert record.energy[1] <= record.energy[0]
-        assert 1 <= record.iterations <= SETTINGS.window_iterations
+        assert 1 <= record.iterations <= SETTINGS.window.window_iterations
 
 
 class _Checker(HTMLParser):

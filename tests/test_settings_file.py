@@ -13,8 +13,9 @@ from typer.testing import CliRunner
 
 from vggtgeo.cli.main import COMMANDS, EXIT_INPUT, EXIT_INTERNAL, CommandEntry, load_command, make_app
 from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, RerunOption
-from vggtgeo.cli.settings_file import SettingsOption, write_settings
+from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.io.errors import InputError
+from vggtgeo.results.files import write_settings
 
 DEFAULTS = {"path": "clip", "count": 3, "scale": None, "rgb-only": False, "lines": True, "mode": "fast", "json": False}
 

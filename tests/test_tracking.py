@@ -21,12 +21,17 @@ from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
+from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
 
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
-SETTINGS = SlamSettings(window=4, point_slots=96, line_slots=48, window_iterations=8, global_adjustment=False)
+SETTINGS = SlamSettings(
+    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    refinement=RefinementSettings(global_adjustment=False),
+)
 ROLES = Roles(points=SiftMatcher(count=500))
 Room = tuple[list[Frame], Camera, Trajectory]
 
@@ -204,6 +209,6 @@ def test_pieces_join_where_they_meet(room: Room) -> None:
     assert any("a new piece of map" in note for note in slam.notes), slam.notes
     assert any("is joined to the one before" in note for note in slam.notes), slam.notes
     assert len(slam.origins) == 1
-    slam = finish(slam, ROLES, replace(SETTINGS, global_adjustment=True, global_iterations=10))
+    slam = finish(slam, ROLES, updated(SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 10}}))
     times = np.arange(len(numbers)) / 10
     assert _error(slam, Trajectory(times, truth.poses[numbers])) < 0.04

@@ -24,11 +24,10 @@ from typer.testing import CliRunner
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.cli.settings_file import write_settings
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.results.files import write_depth, write_settings, write_trajectories
 from vggtgeo.slam.keyframe_depth import fused_depths
-from vggtgeo.slam.outputs import write_depth, write_map, write_trajectories
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.target import check_target, has_screen
 
@@ -61,15 +60,15 @@ def iterations_of(slam: Slam) -> IterationRecord | None:
 @pytest.fixture(scope="module")
 def recording(run: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recorded run, logged frame by frame as the program does it."""
+    from vggtgeo.viewing.callback import RerunCallback
     from vggtgeo.viewing.target import open_target
-    from vggtgeo.viewing.watcher import RerunWatcher
 
     path = tmp_path_factory.mktemp("recording") / "deep" / "run.rrd"
     stream = open_target(str(path), "test", path).stream
-    watcher = RerunWatcher(stream)
+    callback = RerunCallback(stream)
     for slam in run.states:
-        watcher.see(replace(slam, iterations=iterations_of(slam)), run.frames[slam.frames[-1].frame])
-    watcher.finish(run.slam, run.cloud)
+        callback.on_frame(replace(slam, iterations=iterations_of(slam)), run.frames[slam.frames[-1].frame])
+    callback.on_finish(run.slam, run.cloud)
     stream.disconnect()
     return path
 
@@ -122,8 +121,8 @@ def test_a_run_folder_becomes_a_recording(run: RecordedRun, tmp_path: Path) -> N
     """`vggtgeo view` writes a file with path, map, depth and confidence; oracle: rerun's own reader."""
     write_trajectories(tmp_path, run.slam)
     depths = fused_depths(run.slam.keyframes, run.slam.intrinsics)
-    write_map(tmp_path, run.slam, depths)
-    write_depth(tmp_path, run.slam, depths)
+    run.cloud.save_ply(tmp_path / "map.ply")
+    write_depth(tmp_path, run.slam.keyframes, depths)
     result = CliRunner().invoke(make_app(), ["view", str(tmp_path), "--rerun", str(tmp_path / "out" / "v.rrd")])
     assert result.exit_code == 0, result.output
     found = entities_of(tmp_path / "out" / "v.rrd")

@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from vggtgeo.datasets import Frame as Frame
     from vggtgeo.datasets import open_sequence as open_sequence
     from vggtgeo.evaluation import evaluate_trajectory as evaluate_trajectory
+    from vggtgeo.figures.plot import plot as plot
     from vggtgeo.geometry.camera import Camera as Camera
     from vggtgeo.geometry.cameras import AbstractCamera as AbstractCamera
     from vggtgeo.geometry.cameras import KannalaBrandt as KannalaBrandt
@@ -73,12 +74,24 @@ if TYPE_CHECKING:
     from vggtgeo.results import Result as Result
     from vggtgeo.results import evaluate as evaluate
     from vggtgeo.results import read as read
+    from vggtgeo.results.reconstruction import reconstruct as reconstruct
     from vggtgeo.simulation import SimulatedWindow as SimulatedWindow
     from vggtgeo.simulation import simulate as simulate
     from vggtgeo.simulation import simulate_window as simulate_window
+    from vggtgeo.slam.callback import Callback as Callback
+    from vggtgeo.slam.presets import perception as perception
     from vggtgeo.slam.run import finish as finish
     from vggtgeo.slam.run import frame_trajectory as frame_trajectory
     from vggtgeo.slam.run import run as run
+    from vggtgeo.slam.setting_groups import CameraSettings as CameraSettings
+    from vggtgeo.slam.setting_groups import DepthSettings as DepthSettings
+    from vggtgeo.slam.setting_groups import KeyframeSettings as KeyframeSettings
+    from vggtgeo.slam.setting_groups import LineSettings as LineSettings
+    from vggtgeo.slam.setting_groups import MatchingSettings as MatchingSettings
+    from vggtgeo.slam.setting_groups import RefinementSettings as RefinementSettings
+    from vggtgeo.slam.setting_groups import TrackingSettings as TrackingSettings
+    from vggtgeo.slam.setting_groups import WeightSettings as WeightSettings
+    from vggtgeo.slam.setting_groups import WindowSettings as WindowSettings
     from vggtgeo.slam.settings import Roles as Roles
     from vggtgeo.slam.settings import SlamSettings as SlamSettings
     from vggtgeo.slam.trust.evidence import EvidenceRecorder as EvidenceRecorder
@@ -94,6 +107,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "bundle.batches": ("pack_batch", "solve_batch"),
+    "figures.plot": ("plot",),
     "geometry.camera": ("Camera",),
     "datasets": ("Frame", "open_sequence"),
     "bundle.objective": ("energy", "energy_terms"),
@@ -124,8 +138,22 @@ _HOME = {
     "bundle.problem_file": ("load_problem", "save_problem"),
     "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),
     "results": ("Result", "evaluate", "read"),
+    "results.reconstruction": ("reconstruct",),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
+    "slam.callback": ("Callback",),
+    "slam.presets": ("perception",),
     "slam.run": ("finish", "frame_trajectory", "run"),
+    "slam.setting_groups": (
+        "CameraSettings",
+        "WeightSettings",
+        "DepthSettings",
+        "KeyframeSettings",
+        "LineSettings",
+        "MatchingSettings",
+        "RefinementSettings",
+        "TrackingSettings",
+        "WindowSettings",
+    ),
     "slam.settings": ("Roles", "SlamSettings"),
     "slam.trust.evidence": ("EvidenceRecorder",),
     "slam.trust.finding": ("Verdict",),

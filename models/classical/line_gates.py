@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from vggtgeo.models import pinhole
 from vggtgeo.models.classical.line_geometry import line_coefficients
-from vggtgeo.models.classical.pinhole import intrinsics_matrix
 from vggtgeo.models.roles import RelativeView
 
 
@@ -49,8 +49,7 @@ def _directions(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _move(ends: np.ndarray, relative: RelativeView) -> np.ndarray:
     """Where the ends of i appear in j, float [L, 2, 2]; NaN where depth is unknown or the end is behind j."""
-    matrix = intrinsics_matrix(relative.intrinsics)
-    rays = np.concatenate([ends, np.ones_like(ends[..., :1])], axis=2) @ np.linalg.inv(matrix).T
+    rays = pinhole.rays(ends, relative.intrinsics)
     if np.linalg.norm(relative.pose[:3, 3]) < 1e-9:
         depths = np.ones(ends.shape[:2])  # Without a baseline depth has no effect.
     elif relative.depths is None:
@@ -58,10 +57,7 @@ def _move(ends: np.ndarray, relative: RelativeView) -> np.ndarray:
     else:
         depths = relative.depths
     points = (rays * depths[..., None]) @ relative.pose[:3, :3].T + relative.pose[:3, 3]
-    image = points @ matrix.T
-    with np.errstate(invalid="ignore"):
-        ahead = image[..., 2:] > 1e-3
-    return np.where(ahead, image[..., :2] / np.where(ahead, image[..., 2:], 1.0), np.nan)
+    return pinhole.project(points, relative.intrinsics)
 
 
 def _near(moved: np.ndarray, ends_j: np.ndarray, distance: float, overlap: float) -> np.ndarray:
@@ -86,7 +82,7 @@ def _on_epipolar_beam(
 ) -> np.ndarray:
     if not len(ends_i):
         return np.zeros((0, len(ends_j)), dtype=bool)
-    to_rays = np.linalg.inv(intrinsics_matrix(relative.intrinsics))
+    to_rays = np.linalg.inv(pinhole.matrix(relative.intrinsics))
     x, y, z = relative.pose[:3, 3]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     fundamental = to_rays.T @ cross @ relative.pose[:3, :3] @ to_rays
@@ -105,7 +101,7 @@ def _on_epipolar_beam(
 
 def _turned(ends: np.ndarray, relative: RelativeView) -> np.ndarray:
     """The ends as they appear after the rotation alone: how the image of a far segment turns."""
-    matrix = intrinsics_matrix(relative.intrinsics)
+    matrix = pinhole.matrix(relative.intrinsics)
     homography = matrix @ relative.pose[:3, :3] @ np.linalg.inv(matrix)
     moved = np.concatenate([ends, np.ones_like(ends[..., :1])], axis=2) @ homography.T
     return moved[..., :2] / np.maximum(moved[..., 2:], 1e-3)

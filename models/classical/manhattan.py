@@ -14,6 +14,7 @@ from itertools import permutations, product
 
 import cv2
 import numpy as np
+from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_array
 
 
@@ -110,8 +111,7 @@ class _Planes:
 
     @classmethod
     def of(cls, endpoints: np.ndarray, intrinsics: np.ndarray) -> _Planes:
-        flat = (endpoints - intrinsics[2:]) / intrinsics[:2]
-        rays = np.concatenate([flat, np.ones((len(endpoints), 2, 1))], axis=2)
+        rays = pinhole.rays(endpoints, intrinsics)
         lengths = np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=1)
         return cls(_unit(np.cross(rays[:, 0], rays[:, 1])), _unit(rays.mean(axis=1)), lengths, float(intrinsics[0]))
 

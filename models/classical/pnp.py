@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models.classical.pinhole import intrinsics_matrix
+from vggtgeo.models import pinhole
 from vggtgeo.models.classical.pose_refinement import refine_pose, residuals
 from vggtgeo.models.classical.two_view import TwoViewStart
 from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery, StartGuess
@@ -71,7 +71,7 @@ class PnpGeometry:
             found, rotation, translation, _ = cv2.solvePnPRansac(
                 query.points.astype(np.float64),
                 query.pixels.astype(np.float64),
-                intrinsics_matrix(query.intrinsics),
+                pinhole.matrix(query.intrinsics),
                 None,
                 flags=cv2.USAC_MAGSAC,
                 reprojectionError=self.threshold,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from vggtgeo.models import pinhole
 
 
 def refine_pose(
@@ -42,12 +43,9 @@ def residuals(
     pose: np.ndarray, points: np.ndarray, pixels: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reprojection errors float [n, 2] in pixels and camera-frame points [n, 3]; errors are inf behind the camera."""
-    fx, fy, cx, cy = intrinsics
     local = points @ pose[:3, :3].T + pose[:3, 3]
-    ahead = local[:, 2] > 1e-3
-    depth = np.where(ahead, local[:, 2], 1.0)
-    error = np.stack([fx * local[:, 0] / depth + cx, fy * local[:, 1] / depth + cy], axis=1) - pixels
-    return np.where(ahead[:, None], error, np.inf), local
+    error = pinhole.project(local, intrinsics) - pixels
+    return np.where(np.isnan(error), np.inf, error), local
 
 
 def pose_information(pose: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, sigma: float) -> np.ndarray:
@@ -56,7 +54,7 @@ def pose_information(pose: np.ndarray, points: np.ndarray, intrinsics: np.ndarra
     pose: [4, 4] world -> camera. points: [n, 3], the inliers. sigma: standard deviation of a match, pixels.
     """
     local = points @ pose[:3, :3].T + pose[:3, 3]
-    row_x, row_y = _pose_rows(local[local[:, 2] > 1e-3], intrinsics)
+    row_x, row_y = pinhole.projection_rows(local[local[:, 2] > 1e-3], intrinsics)
     return (row_x @ row_x.T + row_y @ row_y.T) / sigma**2
 
 
@@ -86,21 +84,11 @@ def _gauss_newton_step(
     use = np.isfinite(error[:, 0])
     error, weights = error[use], weights[use]
     weights = weights * np.minimum(1.0, delta / np.maximum(np.linalg.norm(error, axis=1), 1e-12))
-    row_x, row_y = _pose_rows(local[use], intrinsics)
+    row_x, row_y = pinhole.projection_rows(local[use], intrinsics)
     hessian = (row_x * weights) @ row_x.T + (row_y * weights) @ row_y.T
     gradient = row_x @ (weights * error[:, 0]) + row_y @ (weights * error[:, 1])
     hessian[np.diag_indices(6)] += 1e-9 * np.trace(hessian) + 1e-12
     return -np.linalg.solve(hessian, gradient)
-
-
-def _pose_rows(local: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the pixel's x and y by the left tangent of the pose, float64 [6, n] each; local: camera frame."""
-    fx, fy = intrinsics[:2]
-    x, y, z = local.T
-    zero, u, v = np.zeros_like(x), x / z, y / z
-    row_x = fx * np.stack([1 / z, zero, -u / z, -u * v, 1 + u * u, -v])
-    row_y = fy * np.stack([zero, 1 / z, -v / z, -1 - v * v, u * v, u])
-    return row_x, row_y
 
 
 def _exponential(tangent: np.ndarray) -> np.ndarray:

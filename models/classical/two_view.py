@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
+from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_array
-from vggtgeo.models.classical.pinhole import intrinsics_matrix
 from vggtgeo.models.roles import GeometryResult, StartGuess
 
 
@@ -54,7 +55,7 @@ class TwoViewStart:
             essential, mask = cv2.findEssentialMat(
                 np.ascontiguousarray(pixels_i, dtype=np.float64),
                 np.ascontiguousarray(pixels_j, dtype=np.float64),
-                intrinsics_matrix(intrinsics),
+                pinhole.matrix(intrinsics),
                 cv2.USAC_MAGSAC,
                 self.confidence,
                 self.threshold,
@@ -76,8 +77,7 @@ class TwoViewStart:
 
 
 def _rays(pixels: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    fx, fy, cx, cy = (float(value) for value in intrinsics)
-    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
+    rays = pinhole.rays(pixels, intrinsics)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
@@ -126,16 +126,11 @@ def median_parallax(points: np.ndarray, pose: np.ndarray) -> float:
 
 def _rotation_between(rays_i: np.ndarray, rays_j: np.ndarray) -> np.ndarray:
     """The rotation that best maps unit vectors i to j: Kabsch (1976), reweighted towards least absolute error."""
-    rotation = _kabsch(rays_i, rays_j, np.ones(len(rays_i)))
+    rotation, _ = Rotation.align_vectors(rays_j, rays_i)
     for _ in range(5):
-        off = np.linalg.norm(rays_i @ rotation.T - rays_j, axis=1)
-        rotation = _kabsch(rays_i, rays_j, 1.0 / np.maximum(off, 1e-4))
-    return rotation
-
-
-def _kabsch(rays_i: np.ndarray, rays_j: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    left, _, right = np.linalg.svd((rays_j * weights[:, None]).T @ rays_i)
-    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        off = np.linalg.norm(rotation.apply(rays_i) - rays_j, axis=1)
+        rotation, _ = Rotation.align_vectors(rays_j, rays_i, 1.0 / np.maximum(off, 1e-4))
+    return np.asarray(rotation.as_matrix())
 
 
 def _failed(count: int, result: GeometryResult) -> StartGuess:

@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from vggtgeo.models.classical.pinhole import intrinsics_matrix
+from vggtgeo.models import pinhole
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class EpipolarVerifier:
     def _epipolar(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         settings = (cv2.USAC_MAGSAC, self.confidence, self.threshold, self.max_iterations)
         if self.intrinsics is not None:
-            mask = _quietly(cv2.findEssentialMat, first, second, intrinsics_matrix(self.intrinsics), *settings)
+            mask = _quietly(cv2.findEssentialMat, first, second, pinhole.matrix(self.intrinsics), *settings)
         else:
             method, confidence, threshold, iterations = settings
             mask = _quietly(cv2.findFundamentalMat, first, second, method, threshold, confidence, iterations)

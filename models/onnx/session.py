@@ -220,7 +220,7 @@ def _parts(path: Path) -> list[Path]:
 
 def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int | None) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # What is wrong is said once, by the exception.
+    options.log_severity_level = 4  # The exception reports what is wrong, once.
     # An arena would keep the largest working memory of every network: half as much again, for a tenth of the time.
     options.enable_cpu_mem_arena = False
     if sum(part.stat().st_size for part in _parts(path)) > _LARGE:
@@ -238,23 +238,23 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
         raise NetworkFileError(_why_not_opened(path, str(error))) from None
 
 
-def _why_not_opened(path: Path, said: str) -> str:
-    absent = re.search(r'data path does not exist: "([^"]+)"', said)
+def _why_not_opened(path: Path, message: str) -> str:
+    absent = re.search(r'data path does not exist: "([^"]+)"', message)
     if absent:
         return (
             f"`{path}` expects its weights beside it in `{Path(absent[1]).name}`, which is not there; copy that file "
             "too, under this name, or export it again"
         )
-    short = re.search(r"offset: (\d+) size to read: (\d+) given file_length: (\d+)", said)
+    short = re.search(r"offset: (\d+) size to read: (\d+) given file_length: (\d+)", message)
     if short:
         offset, size, found = map(int, short.groups())
         return (
             f"the weights beside `{path}` are cut off: found {found} bytes, expected {offset + size} or more; "
             "copy them again, or export it again"
         )
-    reason = " ".join(said.split())
+    reason = " ".join(message.split())
     reason = f"onnxruntime: {reason if len(reason) < 200 else '... ' + reason[-200:]}"
-    if "xternal" in said and ("data" in said or "initializer" in said):
+    if "xternal" in message and ("data" in message or "initializer" in message):
         return (
             f"`{path}` lacks its external data or has too little of it, expected the data file beside it as it was "
             f"exported; copy both, or export it again ({reason})"

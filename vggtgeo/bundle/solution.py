@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
@@ -27,9 +26,6 @@ from vggtgeo.solvers.levenberg_marquardt import (
     termination_name,
 )
 from vggtgeo.solvers.problem import energy_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class Solution(Readable):
@@ -75,13 +71,6 @@ class Solution(Readable):
             "gradient_norm": float(self.gradient_norm),
             "at_bound": int(self.at_bound),
         }
-
-    def plot(self) -> Figure:
-        """The energy by iteration (outside `jit`, for one solution)."""
-        from vggtgeo.figures.plots import energy_figure
-
-        history = np.asarray(self.history)
-        return energy_figure(history[np.isfinite(history)], self.result)
 
     def __str__(self) -> str:
         before, after = float(self.history[0]), float(self.energy)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 
+from vggtgeo.bundle.node_order import narrow_order
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.terms.node import PairTerm
 from vggtgeo.solvers.band_cholesky import BandCholesky
@@ -12,8 +14,10 @@ from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_LIMIT = 40
 """Keyframes up to which a dense factor costs no more than the linearisation before it."""
-BAND_LIMIT = 12
-"""Longest reach of a band: a group of `2 * 12` keyframes has 144 coordinates."""
+BAND_LIMIT = 24
+"""Longest reach of a band: a group of `2 * 24` keyframes has 288 coordinates."""
+ORDERED_LIMIT = 12
+"""Longest reach for which no other order is looked for, and the longest of a band that only preconditions."""
 SHORT_SHARE = 0.5
 """Least share of edges that a band must hold to be worth factorising."""
 
@@ -22,8 +26,9 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
     """A linear solver for `SchurLevenbergMarquardt(reduced_solver=...)`.
 
     Small problems and those with a marginalisation prior: dense Cholesky. Sequences, whose edges join keyframes near in
-    their order: block-banded Cholesky, linear in the number of keyframes. Sequences with closed loops: conjugate
-    gradients with the band as their preconditioner. Any other graph: conjugate gradients with one block a keyframe.
+    their order, and closed loops, whose edges do so in a folded order: block-banded Cholesky, linear in the number of
+    keyframes. Sequences with many loops: conjugate gradients with the band of their short edges as preconditioner. Any
+    other graph: conjugate gradients with one block a keyframe.
 
     Args:
         problem: concrete arrays (not traced); the choice holds for every problem with the same graph.
@@ -35,26 +40,39 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
     """
     if problem.num_keyframes <= DENSE_LIMIT or problem.dense_terms:
         return DenseCholesky()
-    lengths = edge_lengths(problem)
+    ends, alone = coupled_pairs(problem)
+    lengths = _reaches(np.arange(problem.num_keyframes), ends, alone)
     reach = int(lengths.max(initial=1))
-    if reach <= BAND_LIMIT:
+    if reach <= ORDERED_LIMIT:
         return BandCholesky(reach)
-    short = lengths[lengths <= BAND_LIMIT]
+    place = narrow_order(problem.num_keyframes, ends)
+    folded = int(_reaches(place, ends, alone).max(initial=1))
+    if min(folded, reach) <= BAND_LIMIT:
+        return BandCholesky(folded, jnp.asarray(place)) if folded < reach else BandCholesky(reach)
+    short = lengths[lengths <= ORDERED_LIMIT]
     if len(short) < SHORT_SHARE * len(lengths):
         return ConjugateGradients(BlockJacobi())
     return ConjugateGradients(BandPreconditioner(int(short.max(initial=1))))
 
 
-def edge_lengths(problem: Problem) -> np.ndarray:
-    """`|i - j|` of every edge that observes anything, and half that of every pair (a band of reach `r` holds blocks
-    `2 r` apart), `int[e']`.
+def coupled_pairs(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes of every edge that observes anything and of every pair, `int [m, 2]`, and which of them are pairs alone.
+
+    Two keyframes that one host sees are coupled through its landmarks, so a band of reach `r` holds blocks `2 r` apart,
+    and a pair, which no landmark takes part in, may be twice as long as an edge.
     """
     seen = np.zeros(len(problem.edges.source), bool)
     for term in problem.edge_terms:
         seen |= np.any(np.asarray(term.present()), 1)
-    lengths = [np.abs(np.asarray(problem.edges.source) - np.asarray(problem.edges.target))[seen]]
+    ends = [np.stack([np.asarray(problem.edges.source), np.asarray(problem.edges.target)], 1)[seen]]
     for pair in problem.node_terms:
         if isinstance(pair, PairTerm):
-            apart = np.abs(np.asarray(pair.first) - np.asarray(pair.second))[np.asarray(pair.present())]
-            lengths.append((apart + 1) // 2)
-    return np.concatenate(lengths)
+            ends.append(np.stack([np.asarray(pair.first), np.asarray(pair.second)], 1)[np.asarray(pair.present())])
+    alone = np.repeat([False, *[True] * (len(ends) - 1)], [len(own) for own in ends])
+    return np.concatenate(ends), alone
+
+
+def _reaches(place: np.ndarray, ends: np.ndarray, alone: np.ndarray) -> np.ndarray:
+    """The reach that each pair of nodes asks of a band in that order."""
+    apart = np.abs(place[ends[:, 0]] - place[ends[:, 1]])
+    return np.where(alone, (apart + 1) // 2, apart)

@@ -13,7 +13,7 @@ from vggtgeo.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from vggtgeo.paper_bench.plan import Job
-    from vggtgeo.paper_bench.store import Result
+    from vggtgeo.paper_bench.store import BenchRun
 
 
 def bench(
@@ -35,7 +35,7 @@ def bench(
 
     began = time.monotonic()
 
-    def say(number: int, total: int, job: Job, result: Result) -> None:
+    def say(number: int, total: int, job: Job, result: BenchRun) -> None:
         if not (quiet or as_json):
             errors = result.errors
             typer.echo(

@@ -178,9 +178,9 @@ def _leave(error: BaseException) -> NoReturn:
 
 def _usage_message(error: Any) -> str:
     """What is wrong with the command line, and where to read how it should be."""
-    said = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
+    message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
     command = error.ctx.command_path if error.ctx is not None else "vggtgeo"
-    return f"{said} (see `{command} --help`)"
+    return f"{message} (see `{command} --help`)"
 
 
 def _stand_in() -> None:

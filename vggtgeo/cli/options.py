@@ -32,6 +32,14 @@ def _beside_output(context: Any, parameter: Any, target: str | None) -> str | No
         return target
 
 
+AssignmentsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="GROUP.FIELD=VALUE",
+        help="A setting of the pipeline, such as tracking.least_inliers=20; may be given several times.",
+    ),
+]
 RerunOption = Annotated[
     str | None,
     typer.Option(

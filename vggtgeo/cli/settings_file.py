@@ -1,7 +1,8 @@
 """Settings files: a TOML file says what the flags say, and a run leaves the settings it used in its folder.
 
 A key is the long name of a flag without its dashes (`rgb-only = true`, `lines = false`, also `no-lines = true`), or the
-name of an argument (`path = "..."`).
+name of an argument (`path = "..."`). A table holds the pipeline's own settings (`[tracking]`, `least_inliers = 20`), as
+`--set tracking.least_inliers=20` does.
 The file takes the place of the defaults, so a flag that is given wins over it.
 """
 
@@ -10,7 +11,8 @@ from __future__ import annotations
 import difflib
 import tomllib
 import typing
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +20,7 @@ import typer
 
 from vggtgeo.io.errors import InputError
 
-_NOT_SETTINGS = ("settings", "help")
+_NOT_SETTINGS = ("settings", "help", "assignments")
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("true or false", (bool,)),
     int: ("a whole number", (int,)),
@@ -32,18 +34,31 @@ class SettingsInUse:
 
     context: Any
     """The command's context."""
+    tables: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """The file's tables, by the names of group and field."""
 
     def values(self) -> dict[str, Any]:
         """Each flag and argument by its key, in the order of the help; None where not set."""
         found = {key: self.context.params.get(name) for key, name in _keys(self.context).items()}
         return {key: str(value) if isinstance(value, Path) else value for key, value in found.items()}
 
+    def on_command_line(self, name: str) -> bool:
+        """Whether the parameter was given as a flag, not by a file or by default."""
+        source = self.context.get_parameter_source(name)
+        return source is not None and source.name == "COMMANDLINE"
+
 
 def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
     """The file's values become the defaults of the command's other parameters."""
-    if path is not None and not context.resilient_parsing:
-        context.default_map = _checked(path, _affirmed(path, _read(path), context), _keys(context), _types(context))
-    return SettingsInUse(context)
+    if path is None or context.resilient_parsing:
+        return SettingsInUse(context)
+    given = _read(path)
+    tables: dict[str, dict[str, Any]] = {}
+    if any(parameter.name == "assignments" for parameter in context.command.params):
+        tables = {key: value for key, value in given.items() if isinstance(value, dict)}
+    flags = {key: value for key, value in given.items() if key not in tables}
+    context.default_map = _checked(path, _affirmed(path, flags, context), _keys(context), _types(context))
+    return SettingsInUse(context, tables)
 
 
 SettingsOption = Annotated[
@@ -59,15 +74,6 @@ SettingsOption = Annotated[
 ]
 """The option, for a command's signature. It raises InputError for a file that cannot be read or is no TOML, for a key
 that is no flag of the command, and for a value of a wrong type."""
-
-
-def write_settings(path: Path, values: dict[str, Any]) -> None:
-    """Writes a settings file that gives `values` again, atomically; what is None is left out, as TOML has no null."""
-    import tomli_w
-
-    from vggtgeo.io.files import write_text
-
-    write_text(path, tomli_w.dumps({key: value for key, value in values.items() if value is not None}))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -94,15 +100,15 @@ def _checked(path: Path, given: dict[str, Any], names: dict[str, str], types: di
 
 def _affirmed(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
     """`no-lines = true` as `lines = false`: what a flag can say, a file can."""
-    said = dict(given)
+    values = dict(given)
     for key, name in _keys(context, negated=True).items():
-        if key in said:
+        if key in values:
             positive = next(k for k, n in _keys(context).items() if n == name)
-            if positive in said:
+            if positive in values:
                 raise InputError(f"`{path}`: `{positive}` and `{key}` are one setting; give one of them")
-            value = said.pop(key)
-            said[positive] = not value if isinstance(value, bool) else value
-    return said
+            value = values.pop(key)
+            values[positive] = not value if isinstance(value, bool) else value
+    return values
 
 
 def _keys(context: Any, negated: bool = False) -> dict[str, str]:

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import typer
 
-from vggtgeo.cli.network_errors import as_input_errors
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.models.onnx import verification
 from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, PARITY_SUFFIX
 from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise

@@ -7,19 +7,19 @@ from vggtgeo.datasets.opening import KINDS, open_sequence
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
-from vggtgeo.datasets.views import split, with_intrinsics, without_depth
+from vggtgeo.datasets.views import SequenceView, with_intrinsics, without_depth
 
 __all__ = [
     "KINDS",
     "Frame",
     "ImageFolder",
     "Sequence",
+    "SequenceView",
     "SevenScenes",
     "TumRgbd",
     "VideoFile",
     "open_sequence",
     "parse_intrinsics",
-    "split",
     "with_intrinsics",
     "without_depth",
 ]

@@ -48,9 +48,3 @@ def without_depth(sequence: Sequence) -> Sequence:
     """The colour images alone; depth files are not even decoded."""
     source = replace(sequence, has_depth=False) if isinstance(sequence, FolderSequence) else sequence
     return SequenceView(source, sequence.camera, has_depth=False)
-
-
-def split(sequence: Sequence) -> tuple[Sequence, Trajectory | None]:
-    """What an estimator may see, and the truth for the report: the sequence given first has no truth any more."""
-    view = SequenceView(sequence, sequence.camera, sequence.has_depth, has_truth=False)
-    return view, sequence.ground_truth()

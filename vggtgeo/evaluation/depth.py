@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
+from vggtgeo.models import pinhole
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,8 @@ def depth_of_cloud(
     if any(camera.distortion):
         raise InputError("`camera` has distortion; give `camera.pinhole`, and undistorted depth to compare with")
     local = points @ pose[:3, :3].T + pose[:3, 3]
-    local = local[local[:, 2] > 0]
-    fx, fy, cx, cy = camera.intrinsics
-    column = np.rint(fx * local[:, 0] / local[:, 2] + cx)
-    row = np.rint(fy * local[:, 1] / local[:, 2] + cy)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    inside, rows, columns = pinhole.visible(local, camera.intrinsics, (camera.height, camera.width), nearest=0.0)
     depth = np.full((camera.height, camera.width), np.inf)
-    np.minimum.at(depth, (row[inside].astype(int), column[inside].astype(int)), local[inside, 2])
+    np.minimum.at(depth, (rows, columns), local[inside, 2])
     depth[np.isinf(depth)] = np.nan
     return depth

@@ -1,7 +1,7 @@
 """Everything the field asks of an estimated trajectory, in one value."""
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +10,6 @@ from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
 from vggtgeo.evaluation.relative import RelativeError, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 MINIMUM_MATCHES = 3
 
@@ -35,12 +32,6 @@ class TrajectoryReport:
     def to_dict(self) -> dict[str, Any]:
         """See `as_dict`."""
         return self.as_dict()
-
-    def plot(self) -> "Figure":
-        """Histogram of the errors of the camera centres after either alignment."""
-        from vggtgeo.figures.plots import errors_figure
-
-        return errors_figure(self)
 
     def __str__(self) -> str:
         se3, sim3, pairs = self.se3.statistics.rmse, self.sim3.statistics.rmse, self.relative

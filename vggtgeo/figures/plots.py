@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -22,9 +22,6 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
 
-if TYPE_CHECKING:
-    from vggtgeo.results import Result
-
 _ESTIMATE, _TRUTH, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
 _WIDTH = 11.0
 """Inches."""
@@ -33,7 +30,7 @@ _LEAST_EXTENT = 0.1
 """Metres: how much the picture of a still camera shows."""
 
 
-class Picture(Figure):
+class NotebookFigure(Figure):
     """A figure that a notebook shows, whether or not it has started matplotlib's own machinery."""
 
     def _repr_png_(self) -> bytes:
@@ -78,7 +75,7 @@ def trajectory_figure(
     with_scale: bool = False,
     title: str | None = "",
     width: float = _WIDTH,
-) -> Picture:
+) -> NotebookFigure:
     """The same as a figure, `width` inches wide; without a title where `title` is None."""
     if len(estimate) == 0:
         raise InputError("`estimate` has no pose; there is nothing to draw")
@@ -127,7 +124,7 @@ def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
     return up if up @ mean_up >= 0 else -up
 
 
-def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> Picture:
+def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> NotebookFigure:
     origin = (drawn.truth or drawn.estimate).positions[0]
     everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
     points = (np.concatenate(everything) - origin) @ axes_of_view.T
@@ -137,7 +134,7 @@ def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> P
     low, high = 0.5 * (low + high) - 0.56 * extent, 0.5 * (low + high) + 0.56 * extent
     heights = high - low
     panel = min(0.85 * width * (heights[1] + heights[2]) / heights[0], 0.82 * width)
-    figure = Picture(figsize=(width, panel + 2.2), layout="constrained")
+    figure = NotebookFigure(figsize=(width, panel + 2.2), layout="constrained")
     FigureCanvasAgg(figure)
     top, side = figure.subplots(2, 1, height_ratios=[heights[1], heights[2]], sharex=True)
     for axes, vertical, name in ((top, 1, "seen from above"), (side, 2, "seen from the side")):
@@ -184,9 +181,9 @@ def _title(drawn: _Drawn, title: str, with_scale: bool) -> str:
     return f"{title}:  {facts}" if title else facts
 
 
-def errors_figure(report: TrajectoryReport) -> Picture:
+def errors_figure(report: TrajectoryReport) -> NotebookFigure:
     """Histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
-    figure = Picture(figsize=(6.0, 3.2), layout="constrained")
+    figure = NotebookFigure(figsize=(6.0, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     found = (("SE(3)", report.se3, _ESTIMATE), ("Sim(3)", report.sim3, _TRUTH))
@@ -200,9 +197,9 @@ def errors_figure(report: TrajectoryReport) -> Picture:
     return figure
 
 
-def energy_figure(history: np.ndarray, message: str) -> Picture:
+def energy_figure(history: np.ndarray, message: str) -> NotebookFigure:
     """Energy before the first and after each iteration, logarithmic; `history` [h] without NaN."""
-    figure = Picture(figsize=(5.0, 3.0), layout="constrained")
+    figure = NotebookFigure(figsize=(5.0, 3.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.semilogy(history, ".-", color=_ESTIMATE)
@@ -211,26 +208,3 @@ def energy_figure(history: np.ndarray, message: str) -> Picture:
     axes.set_title(message, loc="left", fontsize=10, color=_INK)
     axes.grid(color=_GRID, lw=0.7)
     return figure
-
-
-def result_figure(result: Result, truth: Trajectory | None = None) -> Picture:
-    """Trajectory from above and from the side, and the map from behind and from above."""
-    from vggtgeo.report import map_view
-
-    figure = trajectory_figure(result.trajectory, truth, result.keyframes, not result.metric, title="", width=9.0)
-    if not len(result.cloud):
-        return figure
-    width, height = figure.get_size_inches()
-    whole = Picture(figsize=(width, height + 3.6))
-    FigureCanvasAgg(whole)
-    above, below = whole.subplots(2, 1, height_ratios=[height, 3.6])
-    figure.set_dpi(150)
-    canvas = figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
-    canvas.draw()
-    views = [view(result.cloud, result.trajectory, 700) for view in (map_view.walk_in, map_view.from_above)]
-    for axes, picture in ((above, np.asarray(canvas.buffer_rgba())), (below, np.concatenate(views, axis=1))):
-        axes.imshow(picture)
-        axes.axis("off")
-    whole.subplots_adjust(0, 0, 1, 1, 0, 0.01)
-    return whole

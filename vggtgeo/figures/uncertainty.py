@@ -1,4 +1,4 @@
-"""Pictures of what a problem determines: ellipses of the camera centres, and the information by kind of factor."""
+"""Figures of what a problem determines: ellipses of the camera centres, and the information by kind of factor."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 
 from vggtgeo.bundle.analysis.covariances import Covariances
-from vggtgeo.bundle.analysis.observability import WEAK, Observability
-from vggtgeo.bundle.analysis.observability_report import lost_shares
+from vggtgeo.bundle.analysis.observability_report import WEAK, Observability, lost_shares
 from vggtgeo.bundle.problem import State
-from vggtgeo.figures.plots import Picture
+from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.geometry import rigid
 
 COLOURS = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8a8f98", "#8e5fb0", "#b0413e")
@@ -27,7 +26,7 @@ _SHARE = 0.2
 
 def covariance_figure(
     found: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, sigmas: float | None = None
-) -> Picture:
+) -> NotebookFigure:
     """The camera centres of `state` in the horizontal plane of the first camera, with ellipses of `sigmas` standard
     deviations (by default as many as can be seen well), and the true centres (world frame) where they are given.
     """
@@ -62,11 +61,11 @@ def covariance_figure(
     return figure
 
 
-def observability_figure(found: Observability) -> Picture:
+def observability_figure(found: Observability) -> NotebookFigure:
     """Left: the balanced eigenvalues with all factors and without each kind. Right: the share of the information about
     each common motion and about the free intrinsics that would be lost without each kind.
     """
-    figure = Picture(figsize=(10.0, 3.8), layout="constrained")
+    figure = NotebookFigure(figsize=(10.0, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[2, 3])
     free = int(np.sum(found.free))
@@ -101,8 +100,8 @@ def _colour(k: int) -> str:
     return COLOURS[k % len(COLOURS)]
 
 
-def _figure(width: float, height: float) -> tuple[Picture, Any]:
-    figure = Picture(figsize=(width, height), layout="constrained")
+def _figure(width: float, height: float) -> tuple[NotebookFigure, Any]:
+    figure = NotebookFigure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     _tidy(axes)

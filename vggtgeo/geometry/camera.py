@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.models import pinhole
 
 GUESSED_FIELD_OF_VIEW = math.radians(60.0)
 """Of the longer image side: between phones (about 70 deg) and narrower depth and headset cameras (57 deg)."""
@@ -70,8 +71,7 @@ class Camera:
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """The calibration matrix K, float64, pixels."""
-        fx, fy, cx, cy = self.intrinsics
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return pinhole.matrix(self.intrinsics)
 
     @property
     def pinhole(self) -> Self:

@@ -13,9 +13,6 @@ import numpy as np
 
 from vggtgeo.io.errors import InputError
 
-NONE = -1
-"""Segment number of a landmark that is on no segment."""
-
 
 @dataclass(frozen=True)
 class SegmentSlots:

@@ -1,9 +1,11 @@
-"""Small numpy helpers for world -> camera poses as 4 x 4 matrices and pinhole pixels."""
+"""World -> camera poses as 4 x 4 matrices in numpy, and what a posed pinhole sees."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from vggtgeo.models import pinhole
 
 
 def invert(pose: np.ndarray) -> np.ndarray:
@@ -27,23 +29,15 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def rays(pixels: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Viewing rays with z = 1, float64 [m, 3]."""
-    return np.column_stack([(pixels - intrinsics[2:]) / intrinsics[:2], np.ones(len(pixels))])
-
-
 def unproject(pixels: np.ndarray, inverse_depth: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """World points float64 [m, 3] of pixels with inverse depths; NaN where the depth is."""
-    local = rays(pixels, intrinsics) / inverse_depth[:, None]
+    local = pinhole.rays(pixels, intrinsics) / inverse_depth[:, None]
     return (local - pose[:3, 3]) @ pose[:3, :3]
 
 
 def project(points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Pixels float64 [m, 2] of world points; NaN behind the camera."""
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    ahead = local[:, 2] > 1e-3
-    z = np.where(ahead, local[:, 2], np.nan)
-    return local[:, :2] / z[:, None] * intrinsics[:2] + intrinsics[2:]
+    return pinhole.project(points @ pose[:3, :3].T + pose[:3, 3], intrinsics)
 
 
 def to_quaternion(poses: np.ndarray) -> np.ndarray:
@@ -68,8 +62,8 @@ def triangulate(
     `d (t x r') = -(R r) x r'` in the least-squares sense; `relative` maps camera i to camera j. The information is
     `f^2 |t x r'|^2`, so several views combine by a weighted mean. Returns two float64 [m].
     """
-    turned = rays(pixels, intrinsics) @ relative[:3, :3].T
-    seen = rays(targets, intrinsics)
+    turned = pinhole.rays(pixels, intrinsics) @ relative[:3, :3].T
+    seen = pinhole.rays(targets, intrinsics)
     lever = np.cross(relative[:3, 3], seen)
     information = (lever**2).sum(1)
     value = -(lever * np.cross(turned, seen)).sum(1) / np.maximum(information, 1e-18)

@@ -7,7 +7,7 @@ import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from jaxtyping import Float
@@ -15,9 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
 _ROTATION_TOLERANCE = 1e-3
@@ -76,12 +73,6 @@ class Trajectory:
             "positions": self.positions.tolist(),
             "quaternions": quaternions.tolist(),
         }
-
-    def plot(self, truth: "Trajectory | None" = None, *, with_scale: bool = False) -> "Figure":
-        """Seen from above and from the side, the truth beside it after SE(3), or Sim(3) `with_scale`, alignment."""
-        from vggtgeo.figures.plots import trajectory_figure
-
-        return trajectory_figure(self, truth, with_scale=with_scale)
 
     def __repr__(self) -> str:
         seconds = self.timestamps[-1] - self.timestamps[0] if len(self) else 0.0

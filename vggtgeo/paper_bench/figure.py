@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.files import atomic_path
-from vggtgeo.paper_bench.store import Result
+from vggtgeo.paper_bench.store import BenchRun
 from vggtgeo.paper_bench.tables import ATE, select, values
 from vggtgeo.paper_bench.variants import FULL, VARIANTS
 
@@ -21,12 +21,12 @@ _ROW, _MARGIN = 0.32, 0.9
 """Inches."""
 
 
-def ablation_figure(results: Sequence[Result], title: str) -> Figure:
+def ablation_figure(results: Sequence[BenchRun], title: str) -> NotebookFigure:
     """ATE (logarithmic) of each variant, one panel a scene: a dot a seed, a bar at the mean."""
     scenes = list(dict.fromkeys(result.scene for result in results))
     rows = {scene: [key for key in VARIANTS if select(results, scene, key)] for scene in scenes}
     heights = [_ROW * len(rows[scene]) + _MARGIN for scene in scenes]
-    figure = Figure(figsize=(8.5, sum(heights) + 0.5), layout="constrained")
+    figure = NotebookFigure(figsize=(8.5, sum(heights) + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(len(scenes), 1, height_ratios=heights, squeeze=False)[:, 0]
     for axes, scene in zip(panels, scenes, strict=True):
@@ -36,13 +36,13 @@ def ablation_figure(results: Sequence[Result], title: str) -> Figure:
     return figure
 
 
-def write_figure(path: str | os.PathLike[str], results: Sequence[Result], title: str) -> None:
+def write_figure(path: str | os.PathLike[str], results: Sequence[BenchRun], title: str) -> None:
     """`ablation_figure` as a PNG, atomically."""
     with atomic_path(path) as temporary:
         ablation_figure(results, title).savefig(temporary, dpi=130, format="png", facecolor="white")
 
 
-def _draw(axes: Any, results: Sequence[Result], scene: str, keys: Sequence[str]) -> None:
+def _draw(axes: Any, results: Sequence[BenchRun], scene: str, keys: Sequence[str]) -> None:
     for row, key in enumerate(keys):
         errors = values(select(results, scene, key), ATE)
         colour = _FULL if key == FULL else _OTHER

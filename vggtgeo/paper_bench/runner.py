@@ -11,8 +11,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
+from vggtgeo.figures.plot import plot
+from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
 from vggtgeo.paper_bench import tables
@@ -21,10 +21,10 @@ from vggtgeo.paper_bench.figure import ablation_figure, write_figure
 from vggtgeo.paper_bench.measure import measure
 from vggtgeo.paper_bench.plan import PLANS, Job, Plan
 from vggtgeo.paper_bench.stage import Stage
-from vggtgeo.paper_bench.store import Result, Store
+from vggtgeo.paper_bench.store import BenchRun, Store
 from vggtgeo.paper_bench.variants import VARIANTS
 
-Progress = Callable[[int, int, Job, Result], None]
+Progress = Callable[[int, int, Job, BenchRun], None]
 """Called after each job with its number (from 1), the number of all, the job and its result."""
 
 
@@ -39,7 +39,7 @@ class BenchReport:
     """
 
     plan: Plan
-    results: tuple[Result, ...]
+    results: tuple[BenchRun, ...]
 
     def markdown(self) -> str:
         """The tables: mean and standard deviation over seeds."""
@@ -53,15 +53,16 @@ class BenchReport:
         """Plan and every run as plain values, SI units and degrees."""
         return {"plan": self.plan.name, "simulated": True, "runs": [asdict(result) for result in self.results]}
 
-    def plot(self) -> Figure:
-        """The error of every run, by scene and variant."""
-        return ablation_figure(self.results, f"Simulated ablations, plan `{self.plan.name}`")
-
     def write(self, folder: Path) -> None:
         """`tables.md`, `runs.csv` and `ablations.png`, each atomically."""
         write_text(folder / "tables.md", self.markdown())
         write_text(folder / "runs.csv", self.csv())
         write_figure(folder / "ablations.png", self.results, f"Simulated ablations, plan `{self.plan.name}`")
+
+
+@plot.register(BenchReport)
+def _plot(value: BenchReport) -> NotebookFigure:
+    return ablation_figure(value.results, f"Simulated ablations, plan `{value.plan.name}`")
 
 
 def bench(
@@ -105,7 +106,7 @@ def bench(
     return report
 
 
-def run_jobs(jobs: list[Job], store: Store, progress: Progress | None = None, workers: int = 1) -> list[Result]:
+def run_jobs(jobs: list[Job], store: Store, progress: Progress | None = None, workers: int = 1) -> list[BenchRun]:
     """The results of `jobs` in their order, from the store or by running them, one walk to a process at a time."""
     found = {job: result for job in jobs if (result := store.load(job)) is not None}
     say = _counted(jobs, progress)
@@ -131,7 +132,7 @@ def _by_walk(jobs: list[Job]) -> list[list[Job]]:
     return list(walks.values())
 
 
-def _run_walk(jobs: list[Job], store: Store) -> Iterator[tuple[Job, Result]]:
+def _run_walk(jobs: list[Job], store: Store) -> Iterator[tuple[Job, BenchRun]]:
     """Jobs of one course and seed: the walk is rendered once."""
     stage = Stage.set(jobs[0].course, jobs[0].seed)
     for job in jobs:
@@ -143,7 +144,7 @@ def _finish_walk(jobs: list[Job], store: Store) -> None:
         pass
 
 
-def _run_in_processes(walks: list[list[Job]], store: Store, workers: int) -> Iterator[tuple[Job, Result]]:
+def _run_in_processes(walks: list[list[Job]], store: Store, workers: int) -> Iterator[tuple[Job, BenchRun]]:
     """Results as they appear in the store. New processes, not forks: JAX has threads."""
     waiting = [job for walk in walks for job in walk]
     with ProcessPoolExecutor(min(workers, len(walks)), get_context("spawn")) as pool:
@@ -161,10 +162,10 @@ def _run_in_processes(walks: list[list[Job]], store: Store, workers: int) -> Ite
             raise
 
 
-def _counted(jobs: list[Job], progress: Progress | None) -> Callable[[Job, Result], None]:
+def _counted(jobs: list[Job], progress: Progress | None) -> Callable[[Job, BenchRun], None]:
     numbers = itertools.count(1)
 
-    def say(job: Job, result: Result) -> None:
+    def say(job: Job, result: BenchRun) -> None:
         if progress is not None:
             progress(next(numbers), len(jobs), job, result)
 

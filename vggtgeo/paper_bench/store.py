@@ -5,24 +5,19 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
-
-import equinox as eqx
-import jax
-import numpy as np
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 from vggtgeo.paper_bench.measure import Errors
 from vggtgeo.paper_bench.plan import Job
 from vggtgeo.paper_bench.variants import VARIANTS
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings_table import tables_of
 
 
 @dataclass(frozen=True)
-class Result:
+class BenchRun:
     """What one run gave."""
 
     scene: str
@@ -41,7 +36,7 @@ class Store:
         """The file of a job."""
         return self.folder / "runs" / f"{job.name}.json"
 
-    def load(self, job: Job) -> Result | None:
+    def load(self, job: Job) -> BenchRun | None:
         """The stored result; None if there is none, or one of other settings. InputError for a spoilt file."""
         path = self.path(job)
         if not path.exists():
@@ -50,11 +45,11 @@ class Store:
             values = json.loads(path.read_text())
             if values["fingerprint"] != fingerprint(job):
                 return None
-            return Result(job.course.scene, job.variant, job.seed, Errors.from_dict(values["errors"]))
+            return BenchRun(job.course.scene, job.variant, job.seed, Errors.from_dict(values["errors"]))
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"`{path}` is no finished run ({error}); delete it and call again") from None
 
-    def save(self, job: Job, errors: Errors) -> Result:
+    def save(self, job: Job, errors: Errors) -> BenchRun:
         """Write a result; it is there as a whole or not at all."""
         values = {
             "simulated": True,
@@ -66,24 +61,16 @@ class Store:
             "errors": errors.as_dict(),
         }
         write_json(self.path(job), values)
-        return Result(job.course.scene, job.variant, job.seed, errors)
+        return BenchRun(job.course.scene, job.variant, job.seed, errors)
 
 
 def fingerprint(job: Job) -> str:
     """Changes with the course, the settings of the system, the stubs' errors, and the version of the package."""
     variant = VARIANTS[job.variant]
-    settings = variant.settings(job.course)
-    chosen = [field for field in fields(SlamSettings) if field.name != "record_iterations"]  # it changes no result
     parts = {
         "course": asdict(job.course),
-        "settings": {field.name: _plain(getattr(settings, field.name)) for field in chosen},
+        "settings": tables_of(variant.settings(job.course)),
         "depth_errors": variant.depth_errors,
         "version": importlib.metadata.version("vggtgeo"),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, eqx.Module):
-        return [type(value).__name__, *(np.asarray(leaf).tolist() for leaf in jax.tree.leaves(value))]
-    return value

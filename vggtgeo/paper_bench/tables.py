@@ -11,7 +11,7 @@ import numpy as np
 
 from vggtgeo.paper_bench.measure import Errors
 from vggtgeo.paper_bench.plan import OURS, TABLE_6, Plan
-from vggtgeo.paper_bench.store import Result
+from vggtgeo.paper_bench.store import BenchRun
 from vggtgeo.paper_bench.variants import FULL, VARIANTS
 
 
@@ -36,13 +36,13 @@ COLUMNS = (
 )
 
 
-def select(results: Sequence[Result], scene: str, variant: str) -> list[Result]:
+def select(results: Sequence[BenchRun], scene: str, variant: str) -> list[BenchRun]:
     """The results of one scene and variant, by seed."""
     chosen = [r for r in results if (r.scene, r.variant) == (scene, variant)]
     return sorted(chosen, key=lambda result: result.seed)
 
 
-def values(results: Sequence[Result], column: Column) -> np.ndarray:
+def values(results: Sequence[BenchRun], column: Column) -> np.ndarray:
     """The column's numbers, float64 [n], in its unit."""
     return np.array([column.factor * getattr(result.errors, column.field) for result in results], float)
 
@@ -61,14 +61,14 @@ def cell(numbers: np.ndarray, digits: int = 2) -> str:
     return mean if np.isnan(deviation) else f"{mean} +- {deviation:.{digits}f}"
 
 
-def paired(results: Sequence[Result], scene: str, variant: str, column: Column = ATE) -> np.ndarray:
+def paired(results: Sequence[BenchRun], scene: str, variant: str, column: Column = ATE) -> np.ndarray:
     """Variant minus full system, seed by seed, over the seeds that both have; float64 [n]."""
     full = {result.seed: result for result in select(results, scene, FULL)}
     own = [result for result in select(results, scene, variant) if result.seed in full]
     return values(own, column) - values([full[result.seed] for result in own], column)
 
 
-def markdown(plan: Plan, results: Sequence[Result]) -> str:
+def markdown(plan: Plan, results: Sequence[BenchRun]) -> str:
     """All tables of a plan."""
     scenes = list(dict.fromkeys(course.scene for course in plan.courses()))
     parts = [
@@ -85,7 +85,7 @@ def markdown(plan: Plan, results: Sequence[Result]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _accuracy(results: Sequence[Result], scenes: Sequence[str]) -> str:
+def _accuracy(results: Sequence[BenchRun], scenes: Sequence[str]) -> str:
     lines = ["| scene | seeds | path m | " + " | ".join(column.head for column in COLUMNS) + " |"]
     lines.append("|---|---|---|" + "---|" * len(COLUMNS))
     for scene in scenes:
@@ -97,7 +97,7 @@ def _accuracy(results: Sequence[Result], scenes: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def _comparison(results: Sequence[Result], scenes: Sequence[str], variants: Sequence[str]) -> str:
+def _comparison(results: Sequence[BenchRun], scenes: Sequence[str], variants: Sequence[str]) -> str:
     """ATE of each variant, and by how much it is worse than the full system on the same seeds."""
     head = (
         *("scene", "variant", "seeds", "ATE cm", "worse than full by cm", "times"),
@@ -114,7 +114,7 @@ def _comparison(results: Sequence[Result], scenes: Sequence[str], variants: Sequ
     return "\n".join(lines)
 
 
-def _comparison_row(results: Sequence[Result], own: Sequence[Result], scene: str, key: str) -> list[str]:
+def _comparison_row(results: Sequence[BenchRun], own: Sequence[BenchRun], scene: str, key: str) -> list[str]:
     difference = paired(results, scene, key)
     ratio = ""
     if key != FULL and len(difference):
@@ -131,7 +131,7 @@ def _comparison_row(results: Sequence[Result], own: Sequence[Result], scene: str
     ]
 
 
-def as_csv(results: Sequence[Result]) -> str:
+def as_csv(results: Sequence[BenchRun]) -> str:
     """Every run, one a line; SI units and degrees."""
     names = [field.name for field in fields(Errors)]
     text = io.StringIO()

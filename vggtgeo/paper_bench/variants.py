@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-
-import jax.numpy as jnp
+from dataclasses import dataclass, field
 
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry
 from vggtgeo.models.roles import InitialGeometry
 from vggtgeo.models.stubs import SimulatedVggt
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.paper_bench.courses import Course
+from vggtgeo.slam.setting_groups import (
+    DepthSettings,
+    KeyframeSettings,
+    LineSettings,
+    RefinementSettings,
+    WeightSettings,
+)
 from vggtgeo.slam.settings import SlamSettings
-from vggtgeo.solvers.kernels import Huber, Square
+from vggtgeo.slam.settings_table import Tables, updated
 
-_Change = Callable[[SlamSettings], SlamSettings]
 _Start = Callable[[SimulatedVggt], InitialGeometry]
 
 
@@ -31,17 +35,8 @@ _DEPTH_WEIGHT = 0.05
 carries a fortieth of the weight that a depth camera's pixel would, 2.0."""
 
 
-def _same(settings: SlamSettings) -> SlamSettings:
-    return settings
-
-
 def _window_start(vggt: SimulatedVggt) -> InitialGeometry:
     return WindowLocator(vggt, PnpGeometry())
-
-
-def _adjusted_at_the_end(settings: SlamSettings) -> SlamSettings:
-    # Surfaces are aligned with the noise of a depth camera, which the depth of a network does not have.
-    return replace(settings, global_adjustment=True, surface_points=0.0)
 
 
 @dataclass(frozen=True)
@@ -52,22 +47,20 @@ class Variant:
 
     key: str
     title: str
-    change: _Change = _same
+    change: Tables = field(default_factory=dict)
     start: _Start = _window_start
     depth_errors: float = 1.0
 
     def settings(self, course: Course) -> SlamSettings:
         """The settings of a run on `course`: the paper's sliding window, nothing adjusted after the end."""
         base = SlamSettings(
-            keyframe_distance=course.keyframe_distance,
-            keyframe_angle=math.radians(course.keyframe_angle),
-            confidence_gain=_GAIN,
-            confidence_floor=_FLOOR,
-            line_weight=_LINE_WEIGHT,
-            depth_weight=_DEPTH_WEIGHT,
-            global_adjustment=False,
+            keyframes=KeyframeSettings(course.keyframe_distance, math.radians(course.keyframe_angle)),
+            weights=WeightSettings(confidence_gain=_GAIN, confidence_floor=_FLOOR),
+            line=LineSettings(line_weight=_LINE_WEIGHT),
+            depth=DepthSettings(depth_weight=_DEPTH_WEIGHT),
+            refinement=RefinementSettings(global_adjustment=False),
         )
-        return self.change(base)
+        return updated(base, self.change)
 
 
 FULL = "full"
@@ -77,27 +70,32 @@ VARIANTS: dict[str, Variant] = {
     variant.key: variant
     for variant in (
         Variant(FULL, "full system"),
-        Variant("A", "A: without depth prior", lambda s: replace(s, depth_weight=0.0)),
-        Variant("B", "B: without confidence", lambda s: replace(s, use_confidence=False)),
-        Variant("C", "C: without lines", lambda s: replace(s, use_lines=False)),
+        Variant("A", "A: without depth prior", {"depth": {"depth_weight": 0.0}}),
+        Variant("B", "B: without confidence", {"weights": {"use_confidence": False}}),
+        Variant("C", "C: without lines", {"line": {"use_lines": False}}),
         Variant("D", "D: constant-velocity start", start=lambda vggt: ConstantVelocity()),
         Variant("pnp", "start from PnP alone", start=lambda vggt: PnpGeometry()),
-        Variant("heavy-lines", "lines x 5", lambda s: replace(s, line_weight=5 * s.line_weight)),
-        Variant("manhattan", "rotations from vanishing directions", lambda s: replace(s, manhattan=True)),
-        Variant("window-5", "window of 5 keyframes", lambda s: replace(s, window=5)),
-        Variant("window-15", "window of 15 keyframes", lambda s: replace(s, window=15)),
-        Variant("huber", "Huber kernel, 1.5 px (the paper)", lambda s: replace(s, kernel=Huber(jnp.asarray(1.5)))),
+        Variant("heavy-lines", "lines x 5", {"line": {"line_weight": 5 * _LINE_WEIGHT}}),
+        Variant("manhattan", "rotations from vanishing directions", {"line": {"manhattan": True}}),
+        Variant("window-5", "window of 5 keyframes", {"window": {"size": 5}}),
+        Variant("window-15", "window of 15 keyframes", {"window": {"size": 15}}),
+        Variant("huber", "Huber kernel, 1.5 px (the paper)", {"window": {"kernel": "huber 1.5"}}),
         Variant(
             "huber-B",
             "Huber kernel, without confidence",
-            lambda s: replace(s, kernel=Huber(jnp.asarray(1.5)), use_confidence=False),
+            {"window": {"kernel": "huber 1.5"}, "weights": {"use_confidence": False}},
         ),
-        Variant("square", "no robust kernel", lambda s: replace(s, kernel=Square())),
-        Variant("alpha", "depth prior of every slot x 2.0 (the paper)", lambda s: replace(s, depth_weight=2.0)),
-        Variant("formula", "depth prior x Omega (the paper's formula)", lambda s: replace(s, depth_trust="saliency")),
-        Variant("text", "depth prior x (1 - Omega) (its text)", lambda s: replace(s, depth_trust="complement")),
-        Variant("global", "one adjustment of the whole map at the end", _adjusted_at_the_end),
+        Variant("square", "no robust kernel", {"window": {"kernel": "square"}}),
+        Variant("alpha", "depth prior of every slot x 2.0 (the paper)", {"depth": {"depth_weight": 2.0}}),
+        Variant("formula", "depth prior x Omega (the paper's formula)", {"depth": {"depth_trust": "saliency"}}),
+        Variant("text", "depth prior x (1 - Omega) (its text)", {"depth": {"depth_trust": "complement"}}),
+        Variant(
+            "global",
+            "one adjustment of the whole map at the end",
+            # Surfaces are aligned with the noise of a depth camera, which the depth of a network does not have.
+            {"refinement": {"global_adjustment": True}, "depth": {"surface_points": 0.0}},
+        ),
         Variant("accurate-depth", "a tenth of the depth errors", depth_errors=0.1),
-        Variant("two-ends", "two unknowns a segment", lambda s: replace(s, two_ends_lines=True)),
+        Variant("two-ends", "two unknowns a segment", {"line": {"two_ends_lines": True}}),
     )
 }

@@ -11,16 +11,17 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
-from vggtgeo.report import figures, map_view
+from vggtgeo.report import figures
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.keyframe_depth import optimised_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
-from vggtgeo.slam.watching import WindowRecord
+from vggtgeo.slam.window_recorder import WindowRecord
 
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""
@@ -107,7 +108,7 @@ def write_page(
         depth_range=(low, high) if np.isfinite(low) else None,
         stages=_stages(summary["seconds_by_stage"]),
         total=summary["seconds_by_stage"].get("all"),
-        settings={name: _plain(value) for name, value in summary["settings"].items()},
+        settings=_flat(summary["settings"]),
         versions=summary["versions"],
         intrinsics=summary["intrinsics"],
         truth_table=_truth_table(summary.get("truth")),
@@ -125,8 +126,9 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
     facts = [
         Fact(f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
         Fact(f"{summary['keyframes']}", "keyframes"),
-        Fact(f"{summary['frames_per_second']:.1f}", "frames a second"),
     ]
+    if "frames_per_second" in summary:
+        facts.append(Fact(f"{summary['frames_per_second']:.1f}", "frames a second"))
     if summary["scale"] == "metric":
         facts.append(Fact(f"{trajectory.length:.2f} m", "length of the path"))
     if "truth" in summary:
@@ -199,6 +201,17 @@ def _sample(keyframe: Keyframe, low: float, high: float) -> Sample:
 
 def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | None:
     return figures.picture(view(cloud, trajectory), 900) if len(cloud) > 100 else None
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Each setting as text; those of a table by the names of table and field."""
+    rows: dict[str, str] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            rows |= {f"{name}.{field}": _plain(own) for field, own in value.items()}
+        else:
+            rows[name] = _plain(value)
+    return rows
 
 
 def _plain(value: Any) -> str:

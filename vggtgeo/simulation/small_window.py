@@ -135,7 +135,7 @@ def simulate_window(
     line_host, line_pixel, line_depth = _segments(keyframes, lines, rng)
     edges = np.array(list(permutations(range(keyframes), 2)))
     point_edge, point_landmark = _seen(edges, host)
-    target = _project(poses, edges[point_edge], pixel[point_landmark], depth[point_landmark])
+    target = project_between(poses, edges[point_edge], pixel[point_landmark], depth[point_landmark])
     target = target + rng.normal(0, noise, target.shape)
     outlier = np.zeros(len(target), bool)
     outlier[rng.permutation(len(target))[: round(outliers * len(target))]] = True
@@ -200,7 +200,7 @@ def _seen(edges: np.ndarray, host: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return edge, landmark
 
 
-def _project(poses: np.ndarray, edges: np.ndarray, pixel: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def project_between(poses: np.ndarray, edges: np.ndarray, pixel: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Pixels in the target keyframe of each edge."""
     focal, centre = np.array(INTRINSICS[:2]), np.array(INTRINSICS[2:])
     turns = Rotation.from_quat(poses[:, :4], scalar_first=True)
@@ -218,7 +218,7 @@ def _lines(
     if not len(landmark):
         return np.zeros((0, 3))
     first = landmark // _SAMPLES * _SAMPLES
-    ends = [_project(poses, edges, pixel[end], depth[end]) for end in (first, first + _SAMPLES - 1)]
+    ends = [project_between(poses, edges, pixel[end], depth[end]) for end in (first, first + _SAMPLES - 1)]
     along = ends[1] - ends[0]
     normal = np.stack([-along[:, 1], along[:, 0]], 1) / np.linalg.norm(along, axis=1, keepdims=True)
     return np.concatenate([normal, -(normal * ends[0]).sum(axis=1, keepdims=True)], 1)

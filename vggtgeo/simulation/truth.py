@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.models import pinhole
 from vggtgeo.simulation.raster import EMPTY, NEAR, View, inverse_depth_at
 from vggtgeo.simulation.render import Picture
 from vggtgeo.simulation.scene import Scene
@@ -120,7 +121,6 @@ def _gradient(picture: Picture) -> np.ndarray:
 
 def _clipped(edges: np.ndarray, pose: np.ndarray, camera: Camera) -> list[tuple[int, np.ndarray]]:
     """Edges cut to the picture: (row, [2, 3] = (u, v, inverse depth) of both ends); affine along the segment."""
-    fx, fy, cx, cy = camera.intrinsics
     local = edges @ pose[:3, :3].T + pose[:3, 3]
     found = []
     for index in np.nonzero((local[..., 2] > NEAR).any(axis=1))[0]:
@@ -128,7 +128,8 @@ def _clipped(edges: np.ndarray, pose: np.ndarray, camera: Camera) -> list[tuple[
         if min(a[2], b[2]) < NEAR:
             cut = a + (NEAR - a[2]) / (b[2] - a[2]) * (b - a)
             a, b = (cut, b) if a[2] < NEAR else (a, cut)
-        ends = np.array([[fx * p[0] / p[2] + cx, fy * p[1] / p[2] + cy, 1.0 / p[2]] for p in (a, b)])
+        points = np.stack([a, b])
+        ends = np.column_stack([pinhole.project(points, camera.intrinsics), 1.0 / points[:, 2]])
         inside = _cut_to_picture(ends, camera)
         if inside is not None:
             found.append((int(index), inside))

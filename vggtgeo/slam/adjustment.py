@@ -16,7 +16,8 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.covisibility import Directed
 from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.line_support import sample_shares, spread_samples, supported
+from vggtgeo.slam.line_support import sample_shares, supported
+from vggtgeo.slam.selection import Selection
 from vggtgeo.slam.settings import SlamSettings
 
 LEAST_INVERSE_DEPTH = 1e-3
@@ -59,31 +60,9 @@ def build(
     (of the segments with the most) take part.
     """
     local = {keyframe.number: i for i, keyframe in enumerate(keyframes)}
-    points = _Selection.points(keyframes, edges, local, settings)
-    lines = _Selection.lines(keyframes, edges, local, settings)
-    depths, informed = _initial_depths(keyframes, edges, local, points, intrinsics)
-    host = np.concatenate([points.host, lines.host])
-    slots = [(keyframes[h].points, s) for h, s in zip(points.host, points.slot, strict=True)]
-    slots += [(keyframes[h].samples, s) for h, s in zip(lines.host, lines.slot, strict=True)]
-    read = lambda name: np.array([getattr(group, name)[s] for group, s in slots], np.float64)
-    prior, sigma = read("prior"), read("sigma")
-    has_prior = np.isfinite(prior) & np.isfinite(sigma)
-    depths = np.concatenate([depths, np.where(np.isfinite(prior[len(points.host) :]), prior[len(points.host) :], 0.5)])
-    weight = np.where(has_prior, _prior_trust(read("prior_confidence"), read("confidence"), settings), 0.0)
-    point_rows = _point_rows(keyframes, edges, local, points, settings)
-    line_rows = _line_rows(keyframes, edges, local, lines, settings, len(points.host), intrinsics)
-    observations = Observations(
-        edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),
-        host=host,
-        pixel=read("pixels").reshape(-1, 2),
-        **point_rows,
-        **line_rows,
-        depth_mean=np.where(has_prior, prior, 1.0),
-        depth_sigma=np.where(has_prior, sigma, 1.0),
-        depth_weight=weight if settings.depth_weight > 0 else np.zeros_like(weight),
-        alpha=settings.depth_weight,
-        segment=_segments(keyframes, points, lines) if settings.two_ends_lines else None,
-    )
+    points = Selection.points(keyframes, edges, local, settings)
+    lines = Selection.lines(keyframes, edges, local, settings)
+    observations, depths, informed = _observed(keyframes, edges, local, (points, lines), intrinsics, settings)
     problem, initial, index = pack(
         observations,
         rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
@@ -93,7 +72,7 @@ def build(
         intrinsics_mean=given_intrinsics,
         intrinsics_sigma=intrinsics_sigma,
         fixed_pose=fixed_pose,
-        kernel=settings.kernel,
+        kernel=settings.window.kernel,
         terms=terms,
     )
     return Adjustment(
@@ -101,11 +80,46 @@ def build(
         problem=problem,
         initial=initial,
         index=index,
-        host=host,
+        host=observations.host,
         slot=np.concatenate([points.slot, lines.slot]),
-        is_line=np.arange(len(host)) >= len(points.host),
-        informed=np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior,
+        is_line=np.arange(len(observations.host)) >= len(points.host),
+        informed=informed,
     )
+
+
+def _observed(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    selected: tuple[Selection, Selection],
+    intrinsics: np.ndarray,
+    settings: SlamSettings,
+) -> tuple[Observations, np.ndarray, np.ndarray]:
+    """Matches and depth priors of the selected points and line samples, where their inverse depths start, and for which
+    of them anything tells it.
+    """
+    points, lines = selected
+    depths, informed = _initial_depths(keyframes, edges, local, points, intrinsics)
+    slots = [(keyframes[h].points, s) for h, s in zip(points.host, points.slot, strict=True)]
+    slots += [(keyframes[h].samples, s) for h, s in zip(lines.host, lines.slot, strict=True)]
+    read = lambda name: np.array([getattr(group, name)[s] for group, s in slots], np.float64)
+    prior, sigma = read("prior"), read("sigma")
+    has_prior = np.isfinite(prior) & np.isfinite(sigma)
+    depths = np.concatenate([depths, np.where(np.isfinite(prior[len(points.host) :]), prior[len(points.host) :], 0.5)])
+    weight = np.where(has_prior, _prior_trust(read("prior_confidence"), read("confidence"), settings), 0.0)
+    observations = Observations(
+        edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),
+        host=np.concatenate([points.host, lines.host]),
+        pixel=read("pixels").reshape(-1, 2),
+        **_point_rows(keyframes, edges, local, points, settings),
+        **_line_rows(keyframes, edges, local, lines, settings, len(points.host), intrinsics),
+        depth_mean=np.where(has_prior, prior, 1.0),
+        depth_sigma=np.where(has_prior, sigma, 1.0),
+        depth_weight=weight if settings.depth.depth_weight > 0 else np.zeros_like(weight),
+        alpha=settings.depth.depth_weight,
+        segment=_segments(keyframes, points, lines) if settings.line.two_ends_lines else None,
+    )
+    return observations, depths, np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
 
 
 def write_back(
@@ -129,62 +143,7 @@ def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.
     return replace(slots, inverse_depth=inverse)
 
 
-@dataclass(frozen=True, eq=False)
-class _Selection:
-    """Chosen slots, sorted by host, and a table from (host, slot) to landmark, -1 = not chosen."""
-
-    host: np.ndarray
-    slot: np.ndarray
-    table: tuple[np.ndarray, ...]
-
-    @classmethod
-    def of(cls, chosen: list[np.ndarray], sizes: list[int]) -> _Selection:
-        host = np.repeat(np.arange(len(chosen)), [len(c) for c in chosen])
-        starts = np.cumsum([0, *(len(c) for c in chosen)])
-        tables = []
-        for size, slots, start in zip(sizes, chosen, starts[:-1], strict=True):
-            table = np.full(size, -1)
-            table[slots] = start + np.arange(len(slots))
-            tables.append(table)
-        return cls(host, np.concatenate([*chosen, np.zeros(0, int)]).astype(int), tuple(tables))
-
-    @classmethod
-    def points(
-        cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], local: dict[int, int], settings: SlamSettings
-    ) -> _Selection:
-        counts = [np.zeros(len(keyframe.features)) for keyframe in keyframes]
-        for edge in edges:
-            counts[local[edge.host]][edge.slots] += 1 + 0.1 * edge.confidence
-        chosen = []
-        for count in counts:
-            order = np.argsort(-count, kind="stable")[: settings.point_slots]
-            chosen.append(np.sort(order[count[order] > 0]))
-        return cls.of(chosen, [len(c) for c in counts])
-
-    @classmethod
-    def lines(
-        cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], local: dict[int, int], settings: SlamSettings
-    ) -> _Selection:
-        counts = [np.zeros(len(keyframe.lines)) for keyframe in keyframes]
-        for edge in edges:
-            counts[local[edge.host]][edge.line_slots] += 1 + 0.1 * edge.line_confidence
-        chosen = []
-        for keyframe, count in zip(keyframes, counts, strict=True):
-            known = np.isfinite(keyframe.samples.prior)
-            taken = np.ones(len(known), bool)
-            if settings.two_ends_lines:
-                taken = spread_samples(keyframe.sample_segment, settings.segment_samples)
-            length = np.bincount(keyframe.sample_segment[taken], minlength=len(count))
-            if settings.two_ends_lines:
-                length = np.full_like(length, settings.segment_samples)
-            order = np.argsort(-count, kind="stable")
-            order = order[count[order] > 0]
-            order = order[np.cumsum(length[order]) <= settings.line_slots]
-            chosen.append(np.nonzero(np.isin(keyframe.sample_segment, order) & known & taken)[0])
-        return cls.of(chosen, [len(keyframe.sample_segment) for keyframe in keyframes])
-
-
-def _segments(keyframes: Sequence[Keyframe], points: _Selection, lines: _Selection) -> np.ndarray:
+def _segments(keyframes: Sequence[Keyframe], points: Selection, lines: Selection) -> np.ndarray:
     """Segment of each landmark, numbered over all keyframes; -1 for points."""
     first = np.cumsum([0, *(len(keyframe.lines) for keyframe in keyframes)])
     own = [first[h] + keyframes[h].sample_segment[s] for h, s in zip(lines.host, lines.slot, strict=True)]
@@ -195,7 +154,7 @@ def _point_rows(
     keyframes: Sequence[Keyframe],
     edges: Sequence[Directed],
     local: dict[int, int],
-    points: _Selection,
+    points: Selection,
     settings: SlamSettings,
 ) -> dict[str, np.ndarray]:
     edge_ids, landmarks = [np.zeros(0, int)], [np.zeros(0, int)]
@@ -222,7 +181,7 @@ def _line_rows(
     keyframes: Sequence[Keyframe],
     edges: Sequence[Directed],
     local: dict[int, int],
-    lines: _Selection,
+    lines: Selection,
     settings: SlamSettings,
     offset: int,
     intrinsics: np.ndarray,
@@ -248,15 +207,15 @@ def _line_rows(
             samples.pixels[chosen], samples.inverse_depth[chosen], keyframes[host].pose, intrinsics
         )
         near = supported(
-            places, target.pose, own_ends, intrinsics, reach=settings.line_spacing, gate=settings.line_gate
+            places, target.pose, own_ends, intrinsics, reach=settings.line.line_spacing, gate=settings.line.line_gate
         )
         edge_ids.append(np.full(len(chosen), number))
         landmarks.append(offset + lines.table[host][chosen])
         coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
         weight = _weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen], settings)
-        if settings.two_ends_lines:
-            weight = weight * sample_shares(keyframes[host].sample_segment, settings.segment_samples)[chosen]
-        weights.append(np.where(near, weight * settings.line_weight, 0.0))
+        if settings.line.two_ends_lines:
+            weight = weight * sample_shares(keyframes[host].sample_segment, settings.line.segment_samples)[chosen]
+        weights.append(np.where(near, weight * settings.line.line_weight, 0.0))
     return {
         "line_edge": np.concatenate(edge_ids),
         "line_landmark": np.concatenate(landmarks),
@@ -266,22 +225,22 @@ def _line_rows(
 
 
 def _prior_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
-    if not settings.use_confidence:
+    if not settings.weights.use_confidence:
         return np.ones_like(own)
-    return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth_trust]
+    return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth.depth_trust]
 
 
 def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:
-    if not settings.use_confidence:
+    if not settings.weights.use_confidence:
         return np.ones_like(confidence)
-    return settings.confidence_gain * confidence + settings.confidence_floor
+    return settings.weights.confidence_gain * confidence + settings.weights.confidence_floor
 
 
 def _initial_depths(
     keyframes: Sequence[Keyframe],
     edges: Sequence[Directed],
     local: dict[int, int],
-    points: _Selection,
+    points: Selection,
     intrinsics: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth of each point landmark: its estimate, else triangulated; and whether views determine it."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.models import pinhole
 from vggtgeo.models.roles import LineMatches, PointMatches, RelativeView
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -73,7 +74,7 @@ def match_keyframes(
     for one, other in ((first, second), (second, first)):
         seen = some_points(one, intrinsics)
         if len(seen):
-            if overlap(seen, other, intrinsics) < settings.least_overlap:
+            if overlap(seen, other, intrinsics) < settings.matching.least_overlap:
                 return None
             break
     relative = second.pose @ rigid.invert(first.pose)
@@ -81,7 +82,7 @@ def match_keyframes(
     points = points.select(_consistent(points, first, relative, intrinsics, settings))
     view = RelativeView(relative, intrinsics, first.line_depths)
     lines = roles.line_matches.match(first.lines, second.lines, view)
-    if len(points) < settings.least_matches and len(lines) < settings.least_line_matches:
+    if len(points) < settings.matching.least_matches and len(lines) < settings.matching.least_line_matches:
         return None
     return Pair(first.number, second.number, points, lines)
 
@@ -117,14 +118,14 @@ def _consistent(
     What passes wrongly is left to the robust kernel.
     """
     inverse = first.points.inverse_depth[points.index_i]
-    ray = rigid.rays(points.pixels_i, intrinsics)
+    ray = pinhole.rays(points.pixels_i, intrinsics)
     known = np.isfinite(inverse)
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
-    z = np.where(moved[:, 2] > 1e-2, moved[:, 2], np.nan)
-    projected = moved[:, :2] / z[:, None] * intrinsics[:2] + intrinsics[2:]
-    off = np.linalg.norm(projected - points.pixels_j, axis=1)
-    seen = rigid.rays(points.pixels_j, intrinsics)
+    off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)
+    seen = pinhole.rays(points.pixels_j, intrinsics)
     normal = np.cross(relative[:3, 3], ray @ relative[:3, :3].T)
     lever = np.linalg.norm(normal[:, :2], axis=1)
     epipolar = np.abs((normal * seen).sum(1)) / np.maximum(lever, 1e-12) * float(intrinsics[0])
-    return np.where(known, off < settings.match_gate, (epipolar < settings.epipolar_gate) | (lever < 1e-9))
+    return np.where(
+        known, off < settings.matching.match_gate, (epipolar < settings.matching.epipolar_gate) | (lever < 1e-9)
+    )

@@ -8,6 +8,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.models import pinhole
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.keyframe_depth import fused_depths
 
@@ -85,12 +86,11 @@ def _dense_points(
 
 def _agrees(points: np.ndarray, keyframe: Keyframe, depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     local = points @ keyframe.pose[:3, :3].T + keyframe.pose[:3, 3]
+    inside, rows, columns = pinhole.visible(local, intrinsics, depth.shape)
+    z = local[inside, 2]
     with np.errstate(invalid="ignore"):
-        x, y = np.nan_to_num(rigid.project(points, keyframe.pose, intrinsics), nan=-1.0).round().astype(int).T
-    inside = (x >= 0) & (x < depth.shape[1]) & (y >= 0) & (y < depth.shape[0])
-    seen = np.where(inside, depth[np.where(inside, y, 0), np.where(inside, x, 0)], np.nan)
-    with np.errstate(invalid="ignore"):
-        return np.abs(seen - local[:, 2]) < 0.04 * local[:, 2]
+        inside[inside] = np.abs(depth[rows, columns] - z) < 0.04 * z
+    return inside
 
 
 def _average_in_voxels(points: np.ndarray, colours: np.ndarray, weight: np.ndarray, voxel: float) -> PointCloud:

@@ -16,6 +16,7 @@ import numpy as np
 
 from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment
 from vggtgeo.geometry import rigid
+from vggtgeo.models import pinhole
 from vggtgeo.slam.factors import surface_term
 from vggtgeo.slam.keyframe import Keyframe
 
@@ -45,10 +46,8 @@ class Surface:
         count = np.isfinite(ordered).sum(2)
         middle = np.take_along_axis(ordered, np.maximum(count // 2, 0)[..., None].clip(0, CELL**2 - 1), 2)[..., 0]
         middle = np.where(count >= CELL**2 // 2, middle, np.nan)
-        coarse = np.array([*intrinsics[:2], *(intrinsics[2:] - (CELL - 1) / 2)]) / CELL
-        v, u = np.mgrid[:height, :width]
-        points = np.stack([(u - coarse[2]) / coarse[0], (v - coarse[3]) / coarse[1], np.ones_like(u)], -1)
-        points = points * middle[..., None]
+        coarse = pinhole.coarser(intrinsics, CELL)
+        points = pinhole.grid_rays((height, width), coarse) * middle[..., None]
         return cls(points, _normals(points), coarse)
 
 
@@ -74,14 +73,9 @@ def align(
     good = np.isfinite(source.normals[..., 0])
     points = source.points[good] @ relative[:3, :3].T + relative[:3, 3]
     normals = source.normals[good] @ relative[:3, :3].T
-    fx, fy, cx, cy = target.intrinsics
-    height, width = target.normals.shape[:2]
-    z = np.maximum(points[:, 2], 1e-3)
-    u = np.rint(points[:, 0] / z * fx + cx).astype(int)
-    v = np.rint(points[:, 1] / z * fy + cy).astype(int)
-    inside = (points[:, 2] > 0.1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    points, normals, u, v = points[inside], normals[inside], u[inside], v[inside]
-    n, q = target.normals[v, u], target.points[v, u]
+    inside, rows, columns = pinhole.visible(points, target.intrinsics, target.normals.shape[:2])
+    points, normals = points[inside], normals[inside]
+    n, q = target.normals[rows, columns], target.points[rows, columns]
     with np.errstate(invalid="ignore"):
         one = (np.linalg.norm(points - q, axis=1) < FARTHEST) & ((n * normals).sum(1) > LEAST_COSINE)
     if np.count_nonzero(one) < LEAST_POINTS:
@@ -93,8 +87,9 @@ def align(
     scale = max(float(np.median(np.abs(residual / sigma))) * 4.7, 3.0)
     weight = np.maximum(1 - (residual / sigma / scale) ** 2, 0.0) ** 2 / sigma**2
     weight *= min(effective / len(points), 1.0)
-    rows = np.concatenate([n, np.cross(points, n)], 1)
-    return Alignment(first, second, (rows * weight[:, None]).T @ rows, rows.T @ (weight * residual), len(points))
+    jacobian = np.concatenate([n, np.cross(points, n)], 1)
+    hessian = (jacobian * weight[:, None]).T @ jacobian
+    return Alignment(first, second, hessian, jacobian.T @ (weight * residual), len(points))
 
 
 def align_pairs(

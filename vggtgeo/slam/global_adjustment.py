@@ -45,7 +45,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     size = replace(window_size(settings), keyframes=len(slam.keyframes), ranks=int(ranks), edges=len(edges))
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
-    for _ in range(settings.global_rounds):
+    for _ in range(settings.refinement.global_rounds):
         adjustment = build(
             slam.keyframes,
             edges,
@@ -58,7 +58,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             terms=_terms(slam, surfaces, settings),
         )
         solver = SchurLevenbergMarquardt(
-            max_iterations=settings.global_iterations,
+            max_iterations=settings.refinement.global_iterations,
             rtol=1e-5,
             reduced_solver=choose_reduced_solver(adjustment.problem),
         )
@@ -77,10 +77,10 @@ def _terms(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> tuple
     for factor in slam.factors:
         room[type(factor)] = room.get(type(factor), 0) + 1
     terms = factor_terms(slam.factors, places, room)
-    if not surfaces or settings.surface_points <= 0:
+    if not surfaces or settings.depth.surface_points <= 0:
         return terms
     pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
-    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.surface_points))
+    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points))
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:
@@ -88,7 +88,7 @@ def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list
     kept = []
     for host in range(keyframes):
         own = sorted((edge for edge in edges if edge.host == host), key=lambda edge: -len(edge.slots))
-        kept += own[: settings.global_neighbours]
+        kept += own[: settings.refinement.global_neighbours]
     return kept
 
 
@@ -98,14 +98,16 @@ def _candidates(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]])
     samples = [some_points(keyframe, slam.intrinsics) for keyframe in slam.keyframes]
     for second in slam.keyframes:
         scored = []
-        for first in slam.keyframes[: max(second.number - settings.window, 0)]:
+        for first in slam.keyframes[: max(second.number - settings.window.size, 0)]:
             if (first.number, second.number) in known:
                 continue
             share = overlap(samples[first.number], second, slam.intrinsics)
             turned = rigid.angle_between(first.pose, second.pose)
             if share > 0.4 and turned < np.deg2rad(40):
                 scored.append((share - turned, first.number))
-        chosen += [(number, second.number) for _, number in sorted(scored, reverse=True)[: settings.loop_candidates]]
+        chosen += [
+            (number, second.number) for _, number in sorted(scored, reverse=True)[: settings.refinement.loop_candidates]
+        ]
     return chosen
 
 
@@ -119,7 +121,7 @@ def _verified(
     matches, inverse = matches.select(known), inverse[known]
     points = rigid.unproject(matches.pixels_i, inverse, first.pose, intrinsics)
     guess = roles.geometry.locate(PoseQuery(second.image, intrinsics, points, matches.pixels_j, matches.confidence))
-    if guess.result is not GeometryResult.SUCCESS or guess.inlier_count <= settings.least_covisible:
+    if guess.result is not GeometryResult.SUCCESS or guess.inlier_count <= settings.matching.least_covisible:
         return None
     empty = np.zeros(0, int)
     return Pair(first.number, second.number, matches.select(guess.inliers), LineMatches(empty, empty, np.zeros(0)))

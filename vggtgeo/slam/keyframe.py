@@ -70,7 +70,7 @@ def make_keyframe(
     lines = _detect_lines(frame, roles, settings)
     ends = lines.segments.endpoints
     line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
-    segment, pixels, fraction = sample_segments(ends, settings.line_spacing)
+    segment, pixels, fraction = sample_segments(ends, settings.line.line_spacing)
     points = _slots_at(features.pixels, depth, confidence)
     samples = _slots_at(pixels, depth, confidence)
     on_line = _along_segments(line_depths, segment, fraction)
@@ -94,7 +94,7 @@ def make_keyframe(
 
 def _detect_lines(frame: Frame, roles: Roles, settings: SlamSettings) -> LineFeatures:
     segments = roles.lines.detect(frame.image)
-    if not settings.use_lines:
+    if not settings.line.use_lines:
         segments = type(segments)(segments.endpoints[:0], segments.scores[:0])
     return roles.line_matches.describe(frame.image, segments)
 

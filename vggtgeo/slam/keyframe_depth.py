@@ -20,6 +20,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from vggtgeo.geometry import rigid
+from vggtgeo.models import pinhole
 from vggtgeo.slam.keyframe import Keyframe
 
 CELL = 24.0
@@ -137,13 +138,8 @@ def _averaged(depth: np.ndarray, keyframe: Keyframe, others: list[np.ndarray], i
     total, views = np.zeros(cells), np.ones(cells)  # the keyframe's own view, with no correction, counts as one
     for points in others:
         local = points @ keyframe.pose[:3, :3].T + keyframe.pose[:3, 3]
-        local = local[local[:, 2] > 0.1]
-        z = local[:, 2]
-        columns = np.rint(intrinsics[0] * local[:, 0] / z + intrinsics[2]).astype(int)
-        rows = np.rint(intrinsics[1] * local[:, 1] / z + intrinsics[3]).astype(int)
-        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-        rows, columns = rows[inside], columns[inside]
-        difference = np.log(z[inside] / depth[rows, columns])
+        inside, rows, columns = pinhole.visible(local, intrinsics, (height, width))
+        difference = np.log(local[inside, 2] / depth[rows, columns])
         same = np.abs(difference) < GATE  # false where the depth is NaN
         cell = (rows[same] // STEP) * cells[1] + columns[same] // STEP
         mass, moment = (_smoothed(cell, weights, cells) for weights in (np.ones(len(cell)), difference[same]))

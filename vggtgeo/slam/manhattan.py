@@ -27,7 +27,7 @@ LARGEST_DISAGREEMENT = np.deg2rad(3.0)
 
 def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
     """The state after the newest keyframe's segments have spoken, where they show the axes of the world."""
-    if not settings.manhattan:
+    if not settings.line.manhattan:
         return slam
     keyframe = slam.keyframes[slam.window[-1]]
     rotation = keyframe.pose[:3, :3]

@@ -33,7 +33,7 @@ NEIGHBOURS = 3
 def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
     """The state before the first frame."""
     intrinsics = np.array(camera.intrinsics, np.float64)
-    relative = settings.known_intrinsics_sigma if camera.known else settings.guessed_intrinsics_sigma
+    relative = settings.camera.known_intrinsics_sigma if camera.known else settings.camera.guessed_intrinsics_sigma
     sigma = np.full(4, relative * intrinsics[0])
     return Slam(intrinsics, intrinsics, sigma, roles.metric)
 
@@ -112,7 +112,7 @@ def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Tra
         found = track(sight, keyframe, view_of(keyframe, slam, roles), expected, slam.intrinsics, roles, window)
         if best is None or _rank(found) > _rank(best):
             best = found
-        if best.accepted and (best.evidence.inliers >= settings.least_inliers or best.evidence.dense_strong):
+        if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
             break
     assert best is not None
     return best
@@ -168,7 +168,7 @@ def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     """A window of the keyframes around an old one, held where it is: the camera has come back to it."""
     low = max(max((origin for origin in slam.origins if origin <= number), default=0), number - NEIGHBOURS)
-    window = tuple(range(low, min(number + NEIGHBOURS + 1, len(slam.keyframes))))[-(settings.window - 1) :]
+    window = tuple(range(low, min(number + NEIGHBOURS + 1, len(slam.keyframes))))[-(settings.window.size - 1) :]
     return replace(slam, window=window, prior=None, solved=None, held=(number,))
 
 
@@ -193,8 +193,8 @@ def _missed(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: Slam
         slam = replace(slam, notes=(*slam.notes, note), velocity=np.eye(4))
     waiting = wait(slam, frame, features, MOST_WAITING)
     slam = replace(slam, lost=slam.lost + 1)
-    shown = sum(len(other.features) > settings.least_inliers for other in waiting)
-    if shown > LOST_PATIENCE and len(features) > settings.least_inliers:
+    shown = sum(len(other.features) > settings.tracking.least_inliers for other in waiting)
+    if shown > LOST_PATIENCE and len(features) > settings.tracking.least_inliers:
         note = (
             f"a new piece of map begins at frame {frame.index} ({frame.name}): "
             "nothing ties it to the one before, its place is only a guess"
@@ -229,9 +229,12 @@ def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | Non
     for keyframe in slam.keyframes:
         if keyframe.number == found.keyframe.number:
             continue
-        distance = np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(found.pose)) / settings.keyframe_distance
+        distance = (
+            np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(found.pose))
+            / settings.keyframes.keyframe_distance
+        )
         if distance < least:
-            turned = rigid.angle_between(keyframe.pose, found.pose) / settings.keyframe_angle
+            turned = rigid.angle_between(keyframe.pose, found.pose) / settings.keyframes.keyframe_angle
             away = max(float(distance), float(turned))
             if away < least:
                 best, least = keyframe, away
@@ -242,7 +245,7 @@ def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
     """Whether the frame sees what its keyframe, the nearest there is, does not."""
     distance = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(found.keyframe.pose))
     return bool(
-        distance > settings.keyframe_distance
-        or rigid.angle_between(found.pose, found.keyframe.pose) > settings.keyframe_angle
-        or found.evidence.inliers < settings.least_inliers
+        distance > settings.keyframes.keyframe_distance
+        or rigid.angle_between(found.pose, found.keyframe.pose) > settings.keyframes.keyframe_angle
+        or found.evidence.inliers < settings.tracking.least_inliers
     )

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from vggtgeo.models import pinhole
 from vggtgeo.slam.rgbd_view import LEVELS, RgbdView
 
 FARTHEST = 0.15
@@ -122,11 +123,10 @@ def _brightness(
     if len(source.edges) < LEAST_SAMPLES:
         return None
     x = source.edges @ motion[:3, :3].T + motion[:3, 3]
-    fx, fy, cx, cy = gray.intrinsics
     height, width = gray.value.shape
-    z = np.maximum(x[:, 2], 1e-3)
-    u, v = fx * x[:, 0] / z + cx, fy * x[:, 1] / z + cy
-    inside = (x[:, 2] > 0.1) & (u > 1) & (v > 1) & (u < width - 2) & (v < height - 2)
+    u, v = pinhole.project(x, gray.intrinsics, nearest=0.1).T
+    with np.errstate(invalid="ignore"):
+        inside = (u > 1) & (v > 1) & (u < width - 2) & (v < height - 2)
     if np.count_nonzero(inside) < LEAST_SAMPLES:
         return None
     x, u, v = x[inside], u[inside].astype(np.float32)[None], v[inside].astype(np.float32)[None]
@@ -135,6 +135,7 @@ def _brightness(
     both = float(seen @ reference)
     correlation = both / float(np.linalg.norm(seen) * np.linalg.norm(reference) + 1e-9)
     exposure = float(np.clip(both / (reference @ reference + 1e-9), 0.6, 1.7))
+    fx, fy = gray.intrinsics[:2]
     along_x, along_y = fx * dx / x[:, 2], fy * dy / x[:, 2]
     by_point = np.stack([along_x, along_y, -(along_x * x[:, 0] + along_y * x[:, 1]) / x[:, 2]], 1)
     jacobian = np.concatenate([by_point, np.cross(x, by_point)], 1)
@@ -149,13 +150,9 @@ def _planes(
         return None
     turn, shift = motion[:3, :3].astype(np.float32), motion[:3, 3].astype(np.float32)
     x = points @ turn.T + shift
-    fx, fy, cx, cy = (np.float32(value) for value in target.surface_intrinsics)
-    height, width = target.surface.shape[:2]
-    z = np.maximum(x[:, 2], 1e-3)
-    u, v = np.rint(fx * x[:, 0] / z + cx).astype(int), np.rint(fy * x[:, 1] / z + cy).astype(int)
-    inside = (x[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    x, u, v = x[inside], u[inside], v[inside]
-    q, n = target.surface[v, u], target.normals[v, u]
+    inside, rows, columns = pinhole.visible(x, target.surface_intrinsics, target.surface.shape[:2])
+    x = x[inside]
+    q, n = target.surface[rows, columns], target.normals[rows, columns]
     turned = normals[inside] @ turn.T
     residual = ((x - q) * n).sum(1)
     with np.errstate(invalid="ignore"):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.models import pinhole
 
 WIDTH = 300
 """Images are shrunk by a whole factor to about so many pixels for the brightness."""
@@ -57,14 +57,14 @@ class RgbdView:
         """From an image uint8 [H, W, 3] and its depth float [H, W], metres, NaN = none."""
         factor = max(round(image.shape[1] / WIDTH), 1)
         gray = _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), factor)
-        own = _scaled(intrinsics, factor)
+        own = pinhole.coarser(intrinsics, factor)
         levels = _pyramid(gray, own)
         if depth is None or not np.isfinite(depth).any():
             nothing = np.full((1, 1, 3), np.nan, np.float32)
             none, empty = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
             return cls(levels, nothing, nothing, own, (none, none), none, (empty,) * LEVELS)
         cells = _cell_means(depth, factor * BLOCK)
-        coarse = _scaled(intrinsics, factor * BLOCK)
+        coarse = pinhole.coarser(intrinsics, factor * BLOCK)
         surface = _unproject_grid(cells, coarse)
         normals = _normals(surface)
         edges, values = _edge_samples(levels, cells)
@@ -77,11 +77,6 @@ def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
     return cv2.resize(image, (image.shape[1] // factor, image.shape[0] // factor), interpolation=cv2.INTER_AREA)
 
 
-def _scaled(intrinsics: np.ndarray, factor: int) -> np.ndarray:
-    """Of an image of blocks of `factor` pixels; integers are pixel centres."""
-    return np.array([*intrinsics[:2], *(np.asarray(intrinsics[2:]) + 0.5 - factor / 2)]) / factor
-
-
 def _pyramid(gray: np.ndarray, intrinsics: np.ndarray) -> tuple[Gray, ...]:
     levels = []
     for level in range(LEVELS):
@@ -89,7 +84,7 @@ def _pyramid(gray: np.ndarray, intrinsics: np.ndarray) -> tuple[Gray, ...]:
         value = image - cv2.GaussianBlur(image, (0, 0), BACKGROUND)
         dx = cv2.Scharr(value, cv2.CV_32F, 1, 0, scale=1 / 32)
         dy = cv2.Scharr(value, cv2.CV_32F, 0, 1, scale=1 / 32)
-        levels.append(Gray(value, dx, dy, _scaled(intrinsics, 2**level)))
+        levels.append(Gray(value, dx, dy, pinhole.coarser(intrinsics, 2**level)))
     return tuple(levels)
 
 
@@ -109,9 +104,7 @@ def _cell_means(depth: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _unproject_grid(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]].astype(np.float32)
-    rays = np.stack([(u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], np.ones_like(u)], -1)
-    return (rays * depth[..., None]).astype(np.float32)
+    return pinhole.grid_rays(depth.shape, intrinsics, np.float32) * depth[..., None]
 
 
 def _normals(points: np.ndarray) -> np.ndarray:
@@ -155,7 +148,7 @@ def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarr
     good = np.isfinite(z) & (strength[row, column] > FAINT) & inner
     row, column, z = row[good], column[good], z[good]
     pixels = np.column_stack([column, row]).astype(np.float64)
-    points = rigid.rays(pixels, finest.intrinsics) * z[:, None]
+    points = pinhole.rays(pixels, finest.intrinsics) * z[:, None]
     values = []
     for number, level in enumerate(levels):
         x, y = ((pixels + 0.5) / 2**number - 0.5).astype(np.float32).T

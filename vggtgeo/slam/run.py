@@ -102,7 +102,7 @@ def finish(
 
     """
     roles, settings = roles or default_roles(slam.metric), settings or SlamSettings()
-    if not settings.global_adjustment or len(slam.keyframes) < 3:
+    if not settings.refinement.global_adjustment or len(slam.keyframes) < 3:
         return slam
     clock = clock or Clock()
     with clock.measure("loops"):

@@ -37,7 +37,7 @@ def begin_again_with_depth(
         return None
     blind = slam.keyframes[slam.window[-1]]
     keyframe = make_keyframe(blind.number, frame, blind.pose, features, roles, settings, slam.intrinsics)
-    if np.count_nonzero(np.isfinite(keyframe.points.inverse_depth)) < settings.least_inliers:
+    if np.count_nonzero(np.isfinite(keyframe.points.inverse_depth)) < settings.tracking.least_inliers:
         return None
     note = f"the depth of frame {blind.frame} is not known; the map begins at frame {frame.index} ({frame.name})"
     before = tuple(

@@ -31,10 +31,10 @@ solve_jit = eqx.filter_jit(solve)
 def window_size(settings: SlamSettings) -> PaddedSize:
     """The one padded shape that all windows of a run share."""
     return PaddedSize(
-        settings.window,
-        settings.point_slots,
-        settings.line_slots,
-        settings.window - 1,
+        settings.window.size,
+        settings.window.point_slots,
+        settings.window.line_slots,
+        settings.window.size - 1,
         samples=settings.padded_samples,
     )
 
@@ -53,13 +53,13 @@ def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State
         point_landmark=np.zeros(1, int),
         point_target=np.zeros((1, 2)),
         point_weight=np.ones(1),
-        segment=np.full(1, -1) if settings.two_ends_lines else None,
+        segment=np.full(1, -1) if settings.line.two_ends_lines else None,
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
     intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
-    terms = (no_prior(settings.window), *factor_terms((), {}, factor_room(settings, metric)))
+    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric)))
     problem, initial, _ = pack(
-        one, poses, intrinsics, np.ones(1), size=window_size(settings), kernel=settings.kernel, terms=terms
+        one, poses, intrinsics, np.ones(1), size=window_size(settings), kernel=settings.window.kernel, terms=terms
     )
     solution = solve_jit(problem, initial, solver=window_solver(settings))
     marginalise_jit(problem, solution.state, jnp.asarray(0)).root.block_until_ready()
@@ -69,13 +69,13 @@ def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State
 def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
     """The solver of every window: a tracker's start is near, and the next window goes on from here."""
     return SchurLevenbergMarquardt(
-        max_iterations=settings.window_iterations, rtol=1e-5, record_iterations=settings.record_iterations
+        max_iterations=settings.window.window_iterations, rtol=1e-5, record_iterations=settings.window.record_iterations
     )
 
 
 def make_room(slam: Slam, settings: SlamSettings) -> Slam:
     """Marginalise the oldest keyframe of a full window, by the last window that was solved with it."""
-    if len(slam.window) < settings.window:
+    if len(slam.window) < settings.window.size:
         return slam
     leaving, staying = slam.window[0], slam.window[1:]
     if slam.solved is None or leaving not in slam.solved[0].keyframes:
@@ -126,7 +126,7 @@ def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) 
     """The problem of the current window."""
     numbers = tuple(keyframe.number for keyframe in members)
     places = {number: row for row, number in enumerate(numbers)}
-    prior = no_prior(settings.window) if slam.prior is None else slam.prior.aligned(numbers, settings.window)
+    prior = no_prior(settings.window.size) if slam.prior is None else slam.prior.aligned(numbers, settings.window.size)
     return build(
         members,
         window_edges(slam),
@@ -150,9 +150,9 @@ def _gauge(numbers: tuple[int, ...], slam: Slam) -> np.ndarray:
 
 def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
     """How many factors of each kind a window holds: one static shape for all windows of a run."""
-    room: dict[type, int] = {MeasuredRelativePose: 2 * settings.window}
+    room: dict[type, int] = {MeasuredRelativePose: 2 * settings.window.size}
     room |= {} if metric else {MeasuredBaseline: 1}
-    return room | ({MeasuredRotation: settings.window} if settings.manhattan else {})
+    return room | ({MeasuredRotation: settings.window.size} if settings.line.manhattan else {})
 
 
 def window_edges(slam: Slam) -> list[Directed]:

@@ -12,7 +12,7 @@ import numpy as np
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.slam.outputs import DEPTH_UNIT
+from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import STAND_IN, flush
 

@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import make_parent
+from vggtgeo.viewing.blueprint import blueprint
 
 APPLICATION = "vggtgeo"
 STAND_IN = "run.rrd"
@@ -86,16 +87,12 @@ def has_screen() -> bool:
 
 
 def _save(stream: Any, path: Path) -> None:
-    from vggtgeo.viewing.blueprint import blueprint
-
     make_parent(path)
     stream.save(path, default_blueprint=blueprint())
 
 
 def _spawn(stream: Any, instead: Path) -> None:
     """A window, or the file `instead` where none opens."""
-    from vggtgeo.viewing.blueprint import blueprint
-
     reason = "there is no screen" if not has_screen() else _start_viewer(stream)
     if reason is None:
         stream.connect_grpc(default_blueprint=blueprint())
@@ -131,8 +128,6 @@ def _start_viewer(stream: Any) -> str | None:
 def _serve(stream: Any) -> str:
     """A page and the recording behind it, at the usual ports or at free ones."""
     import rerun as rr
-
-    from vggtgeo.viewing.blueprint import blueprint
 
     source = stream.serve_grpc(grpc_port=_port(VIEWER_PORT), default_blueprint=blueprint())
     web = _port(WEB_PORT)

@@ -10,12 +10,12 @@ variance of the M-estimator, Huber 1964, against `1 / E[rho']`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.analysis.redundancy import changing
 from vggtgeo.bundle.linearise import linearise
@@ -25,10 +25,14 @@ from vggtgeo.bundle.residuals import count_rows
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.readable import Readable
+from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
+from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+DENSE_KEYFRAMES = 300
+"""Most keyframes whose information is inverted as a dense matrix: 26 MB, some seconds."""
+ITERATIVE_KEYFRAMES = 32
+"""Most keyframes whose covariances are solved for column by column: some 60 systems each."""
 
 
 class Covariances(Readable):
@@ -46,12 +50,14 @@ class Covariances(Readable):
 
     """
 
-    poses: Float[Array, "n 6 6"]
+    poses: Float[Array, "h 6 6"]
     """Of the left tangent `log(T T_true^-1)`, translation first: m^2, m rad, rad^2, in the camera's own frame."""
     intrinsics: Float[Array, "q q"]
     """Of the parameters of all cameras, `Problem.parameter_names`: pixels^2 (distortion: no unit)."""
-    inverse_depth: Float[Array, "n s"]
+    inverse_depth: Float[Array, "h s"]
     """Variances, 1/m^2; infinite for slots that hold nothing."""
+    neighbours: Float[Array, "h k 6 6"]
+    """Of each pose (rows) with that of the keyframe at the other end of each edge that leaves it, `edges.of_host`."""
     variance_factor: Float[Array, ""]
     """Estimated variance of a residual of weight 1: `2 energy / (rows - unknowns)`, 1 without redundancy. About 1 if
     the weights are right; 4 to 7 % low under Huber with delta 1.5, which caps large residuals."""
@@ -62,8 +68,12 @@ class Covariances(Readable):
         """The covariances if only the ratios of the weights are trusted: times the variance factor."""
         times = lambda values: jnp.where(jnp.isfinite(values), values * self.variance_factor, values)
         return Covariances(
-            *(times(self.poses), times(self.intrinsics), times(self.inverse_depth)),
-            *(jnp.ones_like(self.variance_factor), self.parameters),
+            times(self.poses),
+            times(self.intrinsics),
+            times(self.inverse_depth),
+            times(self.neighbours),
+            jnp.ones_like(self.variance_factor),
+            self.parameters,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -81,22 +91,6 @@ class Covariances(Readable):
             "variance_factor": float(self.variance_factor),
         }
 
-    def plot(
-        self, state: State, truth: Float[np.ndarray, "n 3"] | None = None, *, sigmas: float | None = None
-    ) -> Figure:
-        """The camera centres of `state` from above, in the axes of its first camera, with an ellipse each (outside
-        `jit`, for one solution).
-
-        Args:
-            state: the solution that the covariances belong to.
-            truth: camera centres in the world, metres, where they are known.
-            sigmas: standard deviations that the ellipses reach; by default as many as can be seen well.
-
-        """
-        from vggtgeo.figures.uncertainty import covariance_figure
-
-        return covariance_figure(self, state, truth, sigmas)
-
     def __str__(self) -> str:
         blocks = np.asarray(self.poses, np.float64)[:, :3, :3]
         known = np.isfinite(blocks).all((1, 2))
@@ -108,14 +102,29 @@ class Covariances(Readable):
         )
 
 
-def covariances(problem: Problem, state: State) -> Covariances:
-    """Marginal covariances of all poses, of the intrinsics, and variances of the inverse depths at a solution.
+def covariances(
+    problem: Problem,
+    state: State,
+    *,
+    reduced_solver: AbstractReducedSolver | None = None,
+    keyframes: Int[np.ndarray, " h"] | list[int] | None = None,
+) -> Covariances:
+    """Marginal covariances of poses, of the intrinsics, and variances of the inverse depths at a solution.
 
-    Pure: works under `jit` and `vmap`. Cost: one linearisation and one symmetric eigenvalue problem of size `6 n + 4`.
+    Pure: works under `jit` and `vmap`. Cost: one linearisation and, with a dense solver, one symmetric eigenvalue
+    problem of size `6 n + 4`; with a band, a block elimination that is linear in the keyframes; with conjugate
+    gradients, a solve for each coordinate of every keyframe asked for and of its neighbours.
 
     Args:
         problem: the problem that was solved.
         state: its solution (`solve(...).state`): the information is that of the linearisation there.
+        reduced_solver: whose linear algebra inverts the information, as `choose_reduced_solver` gives it; None: dense
+            for up to 300 keyframes.
+        keyframes: which ones, `h` indices; None = all, `h = n`. The intrinsics and the variance factor are always those
+            of the whole.
+
+    Raises:
+        ValueError: too many keyframes for a dense matrix, or for conjugate gradients.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> sigma = jax.jit(vg.covariances)(problem, solution.state).poses[1, :3, :3].diagonal() ** 0.5
@@ -123,17 +132,33 @@ def covariances(problem: Problem, state: State) -> Covariances:
         True
 
     """
+    solver = DenseCholesky() if reduced_solver is None else reduced_solver
+    asked = jnp.arange(problem.num_keyframes) if keyframes is None else jnp.asarray(keyframes)
+    _check_size(solver, problem.num_keyframes, len(asked))
     ready = prepared(problem)
-    found = covariance(linearise(ready, state))
-    keyframes, camera = problem.num_keyframes, problem.num_camera - problem.num_parameters
-    blocks = found.dense[:camera, :camera].reshape(keyframes, lie.TANGENT, keyframes, lie.TANGENT)
+    found = covariance(linearise(ready, state), solver, asked)
     return Covariances(
-        poses=jnp.einsum("iaib->iab", blocks),
-        intrinsics=found.dense[camera:, camera:],
+        poses=found.nodes,
+        intrinsics=found.shared,
         inverse_depth=found.landmarks,
+        neighbours=found.neighbours,
         variance_factor=_variance_factor(ready, state, found),
         parameters=problem.parameter_names,
     )
+
+
+def _check_size(solver: AbstractReducedSolver, keyframes: int, asked: int) -> None:
+    """Refuse what would fill the memory or take hours."""
+    if isinstance(solver, DenseCholesky) and keyframes > DENSE_KEYFRAMES:
+        raise ValueError(
+            f"`covariances` of {keyframes} keyframes would invert a dense matrix of {lie.TANGENT * keyframes} rows; "
+            f"above {DENSE_KEYFRAMES} keyframes give `reduced_solver=choose_reduced_solver(problem)`, which needs none"
+        )
+    if isinstance(solver, ConjugateGradients) and asked > ITERATIVE_KEYFRAMES:
+        raise ValueError(
+            f"`covariances` of {asked} keyframes by conjugate gradients would solve a system for every coordinate of "
+            f"each; give `keyframes`, at most {ITERATIVE_KEYFRAMES} at a time"
+        )
 
 
 def _variance_factor(problem: Problem, state: State, found: ArrowCovariance) -> Float[Array, ""]:

@@ -11,117 +11,31 @@ about the scale, but both together do. So what a term is worth along a direction
 
 Spectra are those of `D^-1/2 S D^-1/2` with `D = diag(H)` of all factors: metres, radians and pixels become one unit,
 and an eigenvalue is the share of a direction's information that is left once everything else is estimated too. A
-direction is *weak* below `WEAK` and *undetermined* below the rounding error `10 c eps`. Cost: one
+direction is *weak* below `observability_report.WEAK` and *undetermined* below the rounding error `10 c eps`. Cost: one
 linearisation a term, and for `k` terms `2 k + 1` Schur complements and symmetric eigenvalue problems of size `c`.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.analysis.directions import direction_names, named_directions
+from vggtgeo.bundle.analysis.directions import named_directions
+from vggtgeo.bundle.analysis.observability_report import Observability, Spectra
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
-from vggtgeo.solvers.arrow import ArrowSystem, NodeFactors, reduce
-from vggtgeo.solvers.covariance import balance, rank_tolerance
+from vggtgeo.solvers.arrow import ArrowSystem, NodeFactors, dense_gradient, reduce
+from vggtgeo.solvers.local_inverse import balance
 from vggtgeo.solvers.segments import join_segments
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-WEAK = 1e-6
-"""Eigenvalue below which a direction is weak: its standard deviation is a thousand times what it were if all else were
-known. Well-posed windows lie above 1e-4 (tests/test_observability.py)."""
-
-
-class Spectra(eqx.Module):
-    """Eigenvalues of balanced information matrices, one a selection of factors."""
-
-    values: Float[Array, "*k c"]
-    """Ascending; infinite for held coordinates, which come last."""
-    vectors: Float[Array, "*k c c"]
-    """Columns, in balanced coordinates `D^1/2 x`."""
-    along: Float[Array, "*k m"]
-    """`d' S d` for each named direction: per m^2, rad^2, pixel^2, or per 100 % of scale or focal length."""
-
-
-class Observability(eqx.Module):
-    """What is determined and by what; a pytree of arrays, so it passes through `jit` and `vmap`. `print` it.
-
-    Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
-        >>> found = jax.eval_shape(vg.observability, problem, solution.state)
-        >>> found.without.values.shape  # one row a term: points, lines, depth, intrinsics_prior
-        (4, 28)
-        >>> vg.observability(problem, solution.state)
-        Observability(18 coordinates free, 10 held, weak: none)
-
-    """
-
-    whole: Spectra
-    """All factors (one row)."""
-    alone: Spectra
-    """Each term alone."""
-    without: Spectra
-    """All terms but each one."""
-    named: Float[Array, "m c"]
-    """The named directions in balanced coordinates, unit length; zero where held. Names: `direction_names()`."""
-    free: Bool[Array, " c"]
-    landmark_information: Float[Array, "n s"]
-    """`V d^2`: 1 / (relative variance of the inverse depth if poses and intrinsics were known)."""
-    landmark_used: Bool[Array, "n s"]
-    """Whether any term has weight on the slot."""
-    terms: tuple[str, ...] = eqx.field(static=True)
-    """Names of the terms, in the order of the rows of `alone` and `without`."""
-    keyframes: int = eqx.field(static=True)
-    parameters: tuple[str, ...] = eqx.field(static=True)
-    """Names of the cameras' parameters."""
-
-    def direction_names(self) -> tuple[str, ...]:
-        """Names of the rows of `named`."""
-        return direction_names(self.keyframes, self.parameters)
-
-    def report(self) -> str:
-        """The findings in words (outside `jit`, for one problem)."""
-        from vggtgeo.bundle.analysis.observability_report import report
-
-        return report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The findings as plain values (outside `jit`, for one problem): counts, eigenvalues, names of the weak
-        directions with all factors and without each kind, and the share of the information about each named direction
-        that would be lost without each kind.
-        """
-        from vggtgeo.bundle.analysis.observability_report import as_dict
-
-        return as_dict(self)
-
-    def plot(self) -> Figure:
-        """The eigenvalues, and what would be lost without each kind (outside `jit`, for one problem)."""
-        from vggtgeo.figures.uncertainty import observability_figure
-
-        return observability_figure(self)
-
-    def __str__(self) -> str:
-        return self.report()
-
-    def __repr__(self) -> str:
-        try:
-            known = self.to_dict()
-        except TypeError:  # inside `jit`, or of a batch
-            return eqx.Module.__repr__(self)
-        weak = "; ".join(known["weak"][:3]) + f" and {len(known['weak']) - 3} more" * (len(known["weak"]) > 3)
-        lost, used = known["inverse_depths_undetermined"], known["inverse_depths"]
-        depths = f", {lost} of {used} inverse depths undetermined" if lost else ""
-        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak or 'none'}{depths})"
+DENSE_KEYFRAMES = 300
+"""Most keyframes whose spectra are computed: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
 
 
 def observability(problem: Problem, state: State) -> Observability:
@@ -131,17 +45,27 @@ def observability(problem: Problem, state: State) -> Observability:
         problem: observations and priors; the kernel's weights at `state` count, so outliers say little.
         state: where to linearise, best a solution.
 
+    Raises:
+        ValueError: more keyframes than a dense spectrum is for; `covariances` takes any number.
+
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.jit(vg.observability)(problem, solution.state)
         >>> bool(found.whole.values[0, 0] > 1e-6)  # nothing is undetermined
         True
 
     """
+    if problem.num_keyframes > DENSE_KEYFRAMES:
+        raise ValueError(
+            f"`observability` of {problem.num_keyframes} keyframes would take {2 * len(problem.terms) + 1} dense "
+            f"spectra of {problem.num_camera} coordinates; above {DENSE_KEYFRAMES} keyframes look at a part of the "
+            "map, or at `covariances(problem, state, reduced_solver=choose_reduced_solver(problem))`: it is infinite "
+            "where nothing determines a coordinate"
+        )
     ready = prepared(problem)
     systems = [linearise(replace(ready.with_terms((term,)), fraction=None), state) for term in ready.terms]
     count = len(systems)
     everything = _combine(systems, jnp.ones(count, state.inverse_depth.dtype), problem.fraction)
-    scale = balance(everything, reduce(everything))
+    scale = balance(everything, dense_gradient(everything)[1])
     free = everything.free
     directions = jnp.where(free, named_directions(problem, state), 0.0)
     selections = jnp.concatenate([jnp.ones((1, count)), jnp.eye(count), 1 - jnp.eye(count)]).astype(scale.dtype)
@@ -191,11 +115,6 @@ def _combine(
         is_leaf=lambda leaf: leaf is None,
     )
     return system if fraction is None else join_segments(system, fraction)
-
-
-def undetermined_below(size: int, dtype: np.dtype) -> float:
-    """Eigenvalue below which a direction counts as undetermined."""
-    return rank_tolerance(size, dtype)
 
 
 def _spectrum(

@@ -1,14 +1,20 @@
-"""The words of `Observability`: weak directions by name, a table by factor kind. Plain numpy, outside `jit`."""
+"""What was found of a problem: the arrays, and in words the weak directions by name and a table by kind of factor."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.analysis.observability import WEAK, Observability, undetermined_below
+from vggtgeo.bundle.analysis.directions import direction_names
+from vggtgeo.solvers.local_inverse import rank_tolerance
 
+WEAK = 1e-6
+"""Eigenvalue below which a direction is weak: its standard deviation is a thousand times what it were if all else were
+known. Well-posed windows lie above 1e-4 (tests/test_observability.py)."""
 ALIGNED = 0.9
 """Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""
 NEW = 0.1
@@ -19,13 +25,84 @@ SHOWN = 12
 """Weak directions spelled out in a report; the rest are counted."""
 
 
+class Spectra(eqx.Module):
+    """Eigenvalues of balanced information matrices, one a selection of factors."""
+
+    values: Float[Array, "*k c"]
+    """Ascending; infinite for held coordinates, which come last."""
+    vectors: Float[Array, "*k c c"]
+    """Columns, in balanced coordinates `D^1/2 x`."""
+    along: Float[Array, "*k m"]
+    """`d' S d` for each named direction: per m^2, rad^2, pixel^2, or per 100 % of scale or focal length."""
+
+
+class Observability(eqx.Module):
+    """What is determined and by what; a pytree of arrays, so it passes through `jit` and `vmap`. `print` it.
+
+    Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
+        >>> found = jax.eval_shape(vg.observability, problem, solution.state)
+        >>> found.without.values.shape  # one row a term: points, lines, depth, intrinsics_prior
+        (4, 28)
+        >>> vg.observability(problem, solution.state)
+        Observability(18 coordinates free, 10 held, weak: none)
+
+    """
+
+    whole: Spectra
+    """All factors (one row)."""
+    alone: Spectra
+    """Each term alone."""
+    without: Spectra
+    """All terms but each one."""
+    named: Float[Array, "m c"]
+    """The named directions in balanced coordinates, unit length; zero where held. Names: `direction_names()`."""
+    free: Bool[Array, " c"]
+    landmark_information: Float[Array, "n s"]
+    """`V d^2`: 1 / (relative variance of the inverse depth if poses and intrinsics were known)."""
+    landmark_used: Bool[Array, "n s"]
+    """Whether any term has weight on the slot."""
+    terms: tuple[str, ...] = eqx.field(static=True)
+    """Names of the terms, in the order of the rows of `alone` and `without`."""
+    keyframes: int = eqx.field(static=True)
+    parameters: tuple[str, ...] = eqx.field(static=True)
+    """Names of the cameras' parameters."""
+
+    def direction_names(self) -> tuple[str, ...]:
+        """Names of the rows of `named`."""
+        return direction_names(self.keyframes, self.parameters)
+
+    def report(self) -> str:
+        """The findings in words (outside `jit`, for one problem)."""
+        return report(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The findings as plain values (outside `jit`, for one problem): counts, eigenvalues, names of the weak
+        directions with all factors and without each kind, and the share of the information about each named direction
+        that would be lost without each kind.
+        """
+        return as_dict(self)
+
+    def __str__(self) -> str:
+        return self.report()
+
+    def __repr__(self) -> str:
+        try:
+            known = self.to_dict()
+        except TypeError:  # inside `jit`, or of a batch
+            return eqx.Module.__repr__(self)
+        weak = "; ".join(known["weak"][:3]) + f" and {len(known['weak']) - 3} more" * (len(known["weak"]) > 3)
+        lost, used = known["inverse_depths_undetermined"], known["inverse_depths"]
+        depths = f", {lost} of {used} inverse depths undetermined" if lost else ""
+        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak or 'none'}{depths})"
+
+
 @dataclass(frozen=True)
 class WeakDirection:
     """A direction that a set of factors leaves open."""
 
     name: str
     eigenvalue: float
-    """Of the balanced information matrix along it; see `observability.WEAK`."""
+    """Of the balanced information matrix along it; see `WEAK`."""
     alignment: float
     """Squared cosine between the direction and the weak subspace, 0 to 1."""
     determined: bool
@@ -149,3 +226,8 @@ def _index_of(found: Observability, kind: str) -> int:
     if kind not in found.terms:
         raise ValueError(f"`without` is {kind!r}; expected one of {', '.join(found.terms)}, or None")
     return found.terms.index(kind)
+
+
+def undetermined_below(size: int, dtype: np.dtype) -> float:
+    """Eigenvalue below which a direction counts as undetermined."""
+    return rank_tolerance(size, dtype)

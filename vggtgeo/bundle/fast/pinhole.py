@@ -17,7 +17,8 @@ entries of `Y`, the second part is
 
     -(P D~' + D~ P') + (a / Y_z) (y_0 e_fx' + e_fx y_0') + (b / Y_z) (y_1 e_fy' + e_fy y_1') + G . d2Y,
 
-`D~` being `D` without the two centre terms, and `d2Y` having, for `Y = exp(eta) (R ray(k) + d t)`,
+`D~` being `D` without the two centre terms (so `P D~' = P D' - P (a e_cx + b e_cy)'`), and `d2Y` having, for
+`Y = exp(eta) (R ray(k) + d t)`,
 
     rotation, rotation:    1/2 (G Y' + Y G') - (G . Y) I        rotation, depth:       t x G
     rotation, translation: -1/2 d [G]x                          translation, depth:    G
@@ -91,61 +92,68 @@ def row(edge: OneEdge, at: Projection, a: Array, b: Array) -> list[Array]:
     ]
 
 
+def row_of_third(edge: OneEdge, at: Projection) -> list[Array]:
+    """`P`: the derivatives of `Y_z`, over `Y_z`, in the order of `row`."""
+    fx, fy = edge.intrinsics[:2]
+    rotation, translation = edge.rotation, edge.translation
+    inverse = at.inverse_z * at.in_front
+    zero, c0, c1 = jnp.zeros_like(at.depth), -rotation[2, 0] / fx * inverse, -rotation[2, 1] / fy * inverse
+    return [
+        *(zero, zero, at.depth * inverse, at.point[1] * inverse, -at.point[0] * inverse, zero),
+        *(c0 * at.ray_x, c1 * at.ray_y, c0, c1, translation[2] * inverse),
+    ]
+
+
 def second_order(
-    edge: OneEdge, at: Projection, force: Float[Array, "2 p"], bend: Float[Array, " p"]
-) -> tuple[Float[Array, "10 10"], Float[Array, "11 p"]]:
-    """What the exact Hessian adds to the Gauss-Newton one: by the shared coordinates (summed over slots), and their
-    mixed derivatives with inverse depth (the last row is the depth's own).
+    edge: OneEdge, at: Projection, force: tuple[Array, Array], third: list[Array]
+) -> tuple[Float[Array, "10 10"], list[Array]]:
+    """`d2(a u' + b v')` but for `-(P D' + D P')`, which goes with the rows' own products: by the shared coordinates
+    (summed over slots), and mixed with inverse depth, in the order of `row`.
 
     Args:
         edge: its relative pose and camera.
         at: projection of the slots.
         force: `(a, b) = w rho' r` on the projected pixel.
-        bend: `2 rho'' / rho'^2`.
+        third: `P`.
     """
     fx, fy = edge.intrinsics[:2]
-    translation = edge.translation
-    a, b = force
-    derivative = jnp.stack(row(edge, at, a, b))
-    inverse = _row_of_third(edge, at)
-    half = (0.5 * bend * derivative - inverse) @ derivative.T
-    half = half.at[:, 8:10].add(inverse @ force.T)
+    translation, (a, b) = edge.translation, force
     g = (a * fx * at.inverse_z, b * fy * at.inverse_z, -(a * fx * at.x + b * fy * at.y) * at.inverse_z * at.in_front)
-    moments = _moments(g, at)
-    half = half.at[:10, 6:8].add(_focal_products(moments, edge))
-    cross = (bend * derivative[10] - inverse[10]) * derivative - inverse * derivative[10]
-    cross = cross.at[8:10].add(inverse[10] * force)
+    moments = _moments(g, force, at)
+    half = jnp.concatenate([_focal_products(moments, edge), _centre_products(moments, edge)], 1)
+    half = jnp.pad(half, ((0, 0), (6, 0)))
+    turn = _cross_product(translation, g)
     # `y_0` and `y_1` move with inverse depth by the translation.
-    cross = cross.at[6].add(g[0] * translation[0] / fx).at[7].add(g[1] * translation[1] / fy)
-    cross = cross.at[:3].add(jnp.stack(g)).at[3:6].add(jnp.stack(_cross_product(translation, g)))
-    return (half + half.T)[:10, :10] + _curvature_of_point(moments, edge), cross
-
-
-def _row_of_third(edge: OneEdge, at: Projection) -> Float[Array, "11 p"]:
-    """`P`: the derivatives of `Y_z`, over `Y_z`."""
-    fx, fy = edge.intrinsics[:2]
-    rotation, translation = edge.rotation, edge.translation
-    zero, ones = jnp.zeros_like(at.depth), jnp.ones_like(at.depth)
-    c0, c1 = rotation[2, 0], rotation[2, 1]
-    entries = [zero, zero, at.depth, at.point[1], -at.point[0], zero]
-    entries += [-c0 / fx * at.ray_x, -c1 / fy * at.ray_y, -c0 / fx * ones, -c1 / fy * ones, translation[2] * ones]
-    return jnp.stack(entries) * (at.inverse_z * at.in_front)
+    focal = (g[0] * (translation[0] / fx), g[1] * (translation[1] / fy))
+    cross = [*g, *turn, *focal, third[10] * a, third[10] * b, jnp.zeros_like(a)]
+    return half + half.T + _curvature_of_point(moments, edge), cross
 
 
 class _Moments(NamedTuple):
-    """Sums over slots of `G` times what it meets."""
+    """Sums over slots of `G`, and of the force over `Y_z`, times what they meet."""
 
     point: Float[Array, "3 3"]
     depth: Float[Array, "3"]
     ray_x: Float[Array, "3"]
     ray_y: Float[Array, "3"]
     one: Float[Array, "3"]
+    force: Float[Array, "2 7"]
+    """By the entries of the point, depth, rays, one; nothing where `Y_z` is bounded."""
 
 
-def _moments(g: Sequence[Array], at: Projection) -> _Moments:
+def _moments(g: Sequence[Array], force: tuple[Array, Array], at: Projection) -> _Moments:
+    inverse = at.inverse_z * at.in_front
     others = jnp.stack([*at.point, at.depth, at.ray_x, at.ray_y, jnp.ones_like(at.depth)])
-    whole = jnp.stack(g) @ others.T
-    return _Moments(whole[:, :3], whole[:, 3], whole[:, 4], whole[:, 5], whole[:, 6])
+    whole = jnp.stack([*g, *(entry * inverse for entry in force)]) @ others.T
+    return _Moments(whole[:3, :3], whole[:3, 3], whole[:3, 4], whole[:3, 5], whole[:3, 6], whole[3:])
+
+
+def _centre_products(moments: _Moments, edge: OneEdge) -> Float[Array, "10 2"]:
+    """`sum P a` and `sum P b`: what `P D'` has too much, since the centre moves the pixel without `Y`."""
+    c0, c1 = -edge.rotation[2, 0] / edge.intrinsics[0], -edge.rotation[2, 1] / edge.intrinsics[1]
+    x, y, _, depth, ray_x, ray_y, one = moments.force.T
+    zero = jnp.zeros_like(one)
+    return jnp.stack([zero, zero, depth, y, -x, zero, c0 * ray_x, c1 * ray_y, c0 * one, c1 * one])
 
 
 def _focal_products(moments: _Moments, edge: OneEdge) -> Float[Array, "10 2"]:

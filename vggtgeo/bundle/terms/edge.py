@@ -53,13 +53,6 @@ class EdgeView(eqx.Module):
         focal = lie.TANGENT
         return [*rows[:focal], rows[focal] + rows[focal + 1], *rows[focal + 2 :]]
 
-    def tied_model(self, hessian: Float[Array, "10 10"], mixed: Float[Array, "10 p"]) -> tuple[Array, Array]:
-        """The same for second derivatives."""
-        if self.cameras.kind is Pinhole:
-            return hessian, mixed
-        once = jnp.stack(self.tied(list(hessian)))
-        return jnp.stack(self.tied(list(once.T))), jnp.stack(self.tied(list(mixed)))
-
     def slots(self, first: int, count: int) -> EdgeView:
         """The same for some of the slots."""
         part = lambda leaf: leaf[..., first : first + count]
@@ -214,21 +207,43 @@ class ImageTerm(EdgeTerm):
     def gradient(self, view: EdgeView) -> tuple[Float[Array, " d"], Float[Array, " p"]]:
         if view.fast is None or view.projection is None:
             return super().gradient(view)
-        force, _ = self._force(view, view.projection)
-        row = pinhole.row(view.fast, view.projection, *force)
+        row = pinhole.row(view.fast, view.projection, *self._force(view, view.projection))
         return jnp.stack([jnp.sum(column) for column in view.tied(row[:-1])]), row[-1]
 
     def model(self, view: EdgeView) -> LocalModel:
         if view.fast is None or view.projection is None:
             return super().model(view)
-        columns = self.columns(view, None)
-        coupled = times_depth_column(columns, len(view.inverse_depth))
-        flat = columns[:-1]
-        force, bend = self._force(view, view.projection)
-        added, mixed = pinhole.second_order(view.fast, view.projection, force, bend)
-        added, shared = view.tied_model(added, mixed[:-1])
-        gram = (flat @ flat.T).at[:-1, :-1].add(added)
-        return LocalModel(gram, coupled.at[:-2].add(shared).at[-1].add(mixed[-1]))
+        edge, at = view.fast, view.projection
+        residual, normal = self._image(view, at)
+        squared = self.weights * squared_norm(residual)
+        pull = self.weights * self.kernel.weight(squared)
+        bend = 2 * self.weights**2 * self.kernel.curvature(squared)
+        rows = [pinhole.row(edge, at, *of) for of in zip(*normal, strict=True)]
+        force = tuple(pull * sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal)
+        third = pinhole.row_of_third(edge, at)
+        added, mixed = pinhole.second_order(edge, at, (force[0], force[1]), third)
+        # The residual times its derivative: `D / (w rho')`.
+        along = [sum(r * row[k] for r, row in zip(residual, rows, strict=True)) for k in range(len(third))]
+        shared = range(len(third) - 1)
+        # Half of what these rows make with the plain ones is `sum w rho' J'J + 2 w^2 rho'' (J'r)(J'r)' - P D'`.
+        bent = [bend * along[k] - 2 * pull * third[k] for k in shared]
+        left = [
+            jnp.stack([*(pull * row[k] + r * bent[k] for k in shared), pull * r])
+            for r, row in zip(residual, rows, strict=True)
+        ]
+        right = [jnp.stack(row[:-1]) for row in rows]
+        both = jax.lax.optimization_barrier((jnp.concatenate(left, 1), jnp.concatenate(right, 1)))
+        products = both[0] @ both[1].T
+        half, gradient = products[:-1] / 2, products[-1]
+        gram = jnp.pad(half + half.T + added, (0, 1)).at[-1, :-1].set(gradient).at[:-1, -1].set(gradient)
+        depth = [pull * row[-1] for row in rows]
+        pulled, inverse = bend * along[-1] - pull * third[-1], -pull * along[-1]
+        coupled = [
+            sum(d * row[k] for d, row in zip(depth, rows, strict=True)) + pulled * along[k] + inverse * third[k] + extra
+            for k, extra in enumerate(mixed)
+        ]
+        own = sum(d * r for d, r in zip(depth, residual, strict=True))
+        return _tied_model(view, LocalModel(gram, jnp.stack([*coupled[:-1], own, coupled[-1]])))
 
     def _image(self, view: EdgeView, at: Projection) -> tuple[Rows, tuple[Rows, Rows]]:
         """Residuals, and their derivatives by the projected pixel's coordinates, row by row."""
@@ -245,15 +260,20 @@ class ImageTerm(EdgeTerm):
         residual, right = jax.jvp(each, pixel, (one, zero))
         return residual, (right, jax.jvp(each, pixel, (zero, one))[1])
 
-    def _force(self, view: EdgeView, at: Projection) -> tuple[Float[Array, "2 p"], Float[Array, " p"]]:
-        """`w rho' r` on the projected pixel, and `2 rho'' / rho'^2`, the bend of the kernel; zero where absent."""
+    def _force(self, view: EdgeView, at: Projection) -> tuple[Array, Array]:
+        """`w rho' r` on the projected pixel; zero where absent."""
         residual, normal = self._image(view, at)
-        s = self.weights * squared_norm(residual)
-        first, second = self.kernel.weight(s), self.kernel.curvature(s)
-        pulled = (first > 0) & (self.weights > 0)
-        bend = jnp.where(pulled, 2 * second / jnp.where(pulled, first, 1.0) ** 2, 0.0)
-        pull = self.weights * first
-        return jnp.stack([pull * sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]), bend
+        pull = self.weights * self.kernel.weight(self.weights * squared_norm(residual))
+        along = [sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]
+        return pull * along[0], pull * along[1]
+
+
+def _tied_model(view: EdgeView, model: LocalModel) -> LocalModel:
+    """A model by the pinhole's four parameters as one by the camera's own."""
+    if view.cameras.kind is Pinhole:
+        return model
+    once = jnp.stack(view.tied(list(model.gram)))
+    return LocalModel(jnp.stack(view.tied(list(once.T))), jnp.stack(view.tied(list(model.coupled))))
 
 
 def times_depth_column(columns: Float[Array, "c mp"], slots: int) -> Float[Array, "c p"]:

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 
 WIDTH = 320
@@ -55,8 +54,8 @@ class FrameEvidence:
     contrast: float
 
 
-class EvidenceRecorder:
-    """Collects a `FrameEvidence` of each frame; a `Watcher`. `vggtgeo.Result.of` takes its `frames`.
+class EvidenceRecorder(Callback):
+    """Collects a `FrameEvidence` of each frame. `vggtgeo.Result.of` takes its `frames`.
 
     Example:
         >>> import vggtgeo as vg
@@ -78,10 +77,7 @@ class EvidenceRecorder:
         self._pixels = np.zeros((0, 2), np.float32)
         self._next = 0
 
-    def warm_up(self, problem: Problem, state: State) -> None:
-        """Nothing to compile."""
-
-    def see(self, slam: Slam, frame: Frame) -> None:
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
         self.add(frame)
 
     def add(self, frame: Frame) -> None:
@@ -104,9 +100,6 @@ class EvidenceRecorder:
         self.frames.append(
             FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth, median, changed, contrast)
         )
-
-    def finish(self, slam: Slam, cloud: PointCloud) -> None:
-        """Nothing: the last adjustment is no frame."""
 
     def _compare_depth(self, depth: np.ndarray | None) -> tuple[float, float]:
         """The share of pixels that changed since the last frame, and the median; NaN where there is no depth."""

@@ -1,4 +1,4 @@
-"""What the readers said of the input: frames that never came."""
+"""Warnings of the readers: frames that never came."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ MOST_LEFT_OUT = 0.10
 """Share of the frames; as many as may be lost while the result is called good."""
 
 
-def check_input(said: Iterable[Warning | str], frames: int) -> tuple[Finding, ...]:
+def check_input(warned: Iterable[Warning | str], frames: int) -> tuple[Finding, ...]:
     """Frames that a reader left out, beside `frames` that it gave."""
-    missing = sum(warning.frames for warning in said if isinstance(warning, LeftOutWarning))
+    missing = sum(warning.frames for warning in warned if isinstance(warning, LeftOutWarning))
     if missing <= MOST_LEFT_OUT * (missing + frames):
         return ()
     text = f"{missing} of {missing + frames} frames of the input were left out (see the warnings)"

@@ -21,16 +21,16 @@ from vggtgeo.slam.trust.steps import breaks, check_steps, steps
 from vggtgeo.slam.trust.still_points import check_parts, divide
 
 
-def judge(slam: Slam, evidence: Evidence = (), said: tuple[Finding, ...] = ()) -> Verdict:
+def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
     """How far the state after the last adjustment can be trusted.
 
-    evidence: of all frames, from an `EvidenceRecorder`; without it only the run's own record speaks. said: what is
-    known of the input already.
+    evidence: of all frames, from an `EvidenceRecorder`; without it only the run's own record counts.
+    input_findings: what is known of the input already.
     """
     estimate = Estimate.of(slam)
     by_frame = {noted.frame: noted for noted in evidence}
     aligned = [by_frame[frame] for frame in estimate.frames if frame in by_frame]
-    found = [*said, *check_record(estimate), *check_speed(estimate)]
+    found = [*input_findings, *check_record(estimate), *check_speed(estimate)]
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
         height, width = slam.keyframes[0].image.shape[:2]
         found += _images(estimate, aligned, (width, height))

@@ -3,7 +3,7 @@
 At frame `i`, corners seen at `i - g`, `i` and `i + g` are triangulated twice, backwards and forwards:
 `x = log(d_back / d_ahead)`. A map of one scale has `x = 0` up to noise; the median's standard error is
 `s = 1.25 * 1.48 MAD / sqrt(n)`. With true poses of the clips the medians stay below 0.19, where `s` says 0.03: few
-corners live long enough, and they share their errors. So only jumps far beyond that are told here.
+corners live long enough, and they share their errors. So only jumps far beyond that are reported here.
 
 How far the scale drifts slowly depends on the features of the map, which live longer than these corners. A frame
 tracked with `n` inliers whose depths have a relative error of `DEPTH_ERROR` each hands the scale on with an error of

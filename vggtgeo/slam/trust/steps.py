@@ -106,7 +106,7 @@ class Break:
 
 
 def breaks(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> list[Break]:
-    """Where the images contradict the poses. Steps of lost frames are none: those are told elsewhere."""
+    """Where the images contradict the poses. Steps of lost frames are none: `check_record` counts those."""
     sure = estimate.tracked[:-1] & estimate.tracked[1:]
     wrong = np.array([step.contradicted for step in taken], bool) & sure[: len(taken)]
     found = []
@@ -131,7 +131,7 @@ def _bridged(estimate: Estimate, evidence: Evidence, before: int, after: int) ->
 
 def check_steps(estimate: Estimate, taken: list[Step], found: list[Break]) -> list[Finding]:
     """Where the images contradict the poses, and what of the run that displaces."""
-    told = []
+    findings = []
     off = displacements(estimate, found)
     local = bool(np.mean(off > 0) <= MOST_DISPLACED and np.sqrt(np.mean(off**2)) <= MOST_COST)
     for part in found:
@@ -140,11 +140,13 @@ def check_steps(estimate: Estimate, taken: list[Step], found: list[Break]) -> li
             f"frames {start} to {end}: the images contradict the poses ({100 * part.agreeing:.0f} % of the followed "
             "corners agree; with true poses it is 75 % and more)"
         )
-        told.append(Finding("steps", "degraded", text, start, end, local=local))
+        findings.append(Finding("steps", "degraded", text, start, end, local=local))
     share = sum(part.last - part.first + 1 for part in found) / max(len(taken), 1)
     if share > MOST_WRONG:
-        told.append(Finding("steps", "failed", f"the images contradict the poses in {100 * share:.0f} % of all steps"))
-    return told
+        findings.append(
+            Finding("steps", "failed", f"the images contradict the poses in {100 * share:.0f} % of all steps")
+        )
+    return findings
 
 
 def displacements(estimate: Estimate, found: list[Break]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -104,8 +105,6 @@ def _splat(
 
 
 def _with_path(image: np.ndarray, path: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
-    import cv2
-
     line = np.rint(path).astype(np.int32)[None]
     cv2.polylines(image, list(line), isClosed=False, color=(255, 255, 255), thickness=5, lineType=cv2.LINE_AA)
     cv2.polylines(image, list(line), isClosed=False, color=_PATH, thickness=2, lineType=cv2.LINE_AA)

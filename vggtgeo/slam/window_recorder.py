@@ -1,9 +1,8 @@
-"""Onlookers of a run: what draws or records while frames come in, and never changes the result."""
+"""What each adjustment of the window left, for the page of a run and for viewers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -13,27 +12,10 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import residual_sizes
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 
 _sizes_jit = eqx.filter_jit(residual_sizes)
-
-
-@runtime_checkable
-class Watcher(Protocol):
-    """Told of every frame once it is in the state, and of the end."""
-
-    def see(self, slam: Slam, frame: Frame) -> None:
-        """The state after `frame` (as it was read, before undistortion)."""
-        ...
-
-    def warm_up(self, problem: Problem, state: State) -> None:
-        """Before the first frame: compile for windows of the shape of `problem`."""
-        ...
-
-    def finish(self, slam: Slam, cloud: PointCloud) -> None:
-        """The state after the last adjustment, and the map."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -53,18 +35,17 @@ class WindowRecord:
     energy: tuple[float, float]
 
 
-class WindowRecorder:
+class WindowRecorder(Callback):
     """Collects a `WindowRecord` of each adjustment."""
 
     def __init__(self) -> None:
         self.records: list[WindowRecord] = []
         self._last: object = None
 
-    def warm_up(self, problem: Problem, state: State) -> None:
-        """Compile for windows of the shape of `problem`."""
+    def on_warm_up(self, problem: Problem, state: State) -> None:
         jax.block_until_ready(_sizes_jit(problem, state).rms)
 
-    def see(self, slam: Slam, frame: Frame) -> None:
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
         if slam.solved is None or slam.solved is self._last:
             return
         self._last = slam.solved
@@ -84,6 +65,3 @@ class WindowRecorder:
                 (float(energies[0]), float(energies[-1])),
             )
         )
-
-    def finish(self, slam: Slam, cloud: PointCloud) -> None:
-        """Nothing: the last adjustment of the whole map is no window."""

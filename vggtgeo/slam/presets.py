@@ -1,4 +1,4 @@
-"""`--preset`: which implementation plays each perception role. The one place where networks become role objects.
+"""Presets: which implementation plays each perception role. The one place where networks become role objects.
 
 | role | classical | light | paper |
 |---|---|---|---|
@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.cli.network_errors import as_input_errors
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.io.network_files import networks_folder
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
@@ -78,21 +78,35 @@ class Perception:
 
 
 def perception(
-    preset: str,
-    classical: Roles,
+    preset: str = "classical",
+    classical: Roles | None = None,
     folder: Path | None = None,
     cache: Path | None = None,
     provider: Provider = "auto",
     memory_limit_gb: float | None = None,
 ) -> Perception:
-    """The role objects of a preset; those it has no network for are taken from `classical`.
+    """The role objects of a preset, for `vggtgeo.reconstruct`; every file is opened, checked and warmed up here.
 
-    folder: of the networks' files, see `networks_folder`. cache: folder for what they answer, or None. provider,
-    memory_limit_gb: of each network, see `open_session`. Every file is opened, checked and warmed up here. Raises
-    `InputError` for an unknown preset, a missing file, or a wrong one.
+    Args:
+        preset: classical, light or paper.
+        classical: the roles that the preset has no network for; by default those with the sensor's depth.
+        folder: of the networks' files; by default that of VGGTGEO_MODELS, else one in the user's data.
+        cache: folder for what the networks answer; by default nothing is kept beyond the run.
+        provider: where networks run: auto, cuda or cpu.
+        memory_limit_gb: most GPU memory of each network.
+
+    Raises:
+        InputError: an unknown preset, a missing file, or a wrong one.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.perception("classical").roles.metric
+        True
+
     """
+    classical = classical or Roles()
     if preset not in NEEDED:
-        raise InputError(f"`--preset` is {preset!r}; it must be one of {', '.join(NEEDED)}")
+        raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(NEEDED)}")
     if not NEEDED[preset]:
         return Perception(classical, {})
     place = networks_folder(folder)
@@ -148,7 +162,7 @@ def _check_present(preset: str, place: Path) -> None:
     missing = [NETWORKS[name].file for name in NEEDED[preset] if not (place / NETWORKS[name].file).is_file()]
     if missing:
         raise InputError(
-            f"`--preset {preset}` needs {', '.join(missing)} in `{place}`, found no such "
+            f"`preset` {preset!r} needs {', '.join(missing)} in `{place}`, found no such "
             f"{'files' if len(missing) > 1 else 'file'}; `vggtgeo models list` tells how to get each"
         )
 

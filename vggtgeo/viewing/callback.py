@@ -11,17 +11,18 @@ from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.watching import WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecorder
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import flush
 
 _covariances_jit = eqx.filter_jit(covariances)
 
 
-class RerunWatcher:
-    """A `Watcher` that logs to `stream`. Timelines: `frame`, `time` (seconds of the sequence) and `iteration` (tried
+class RerunCallback(Callback):
+    """Logs to `stream`. Timelines: `frame`, `time` (seconds of the sequence) and `iteration` (tried
     steps of the window's solver, counted through the run).
     """
 
@@ -33,12 +34,12 @@ class RerunWatcher:
         self._keyframes = self._notes = self._iterations = 0
         stream.log("world", rr.ViewCoordinates.RDF, static=True)
 
-    def warm_up(self, problem: Problem, state: State) -> None:
+    def on_warm_up(self, problem: Problem, state: State) -> None:
         """Compile for windows of the shape of `problem`."""
-        self._recorder.warm_up(problem, state)
+        self._recorder.on_warm_up(problem, state)
         _covariances_jit(problem, state).poses.block_until_ready()
 
-    def see(self, slam: Slam, frame: Frame) -> None:
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
         self.stream.set_time("frame", sequence=frame.index)
         self.stream.set_time("time", duration=frame.timestamp)
         entities.log_camera(self.stream, slam.last_pose, slam.intrinsics, frame.image)
@@ -46,12 +47,12 @@ class RerunWatcher:
         for note in slam.notes[self._notes :]:
             entities.log_note(self.stream, note)
         self._notes = len(slam.notes)
-        self._recorder.see(slam, frame)
+        self._recorder.on_frame(slam, frame)
         if len(slam.keyframes) > self._keyframes:
             self._keyframes = len(slam.keyframes)
-            self._see_keyframe(slam)
+            self._log_new_keyframe(slam)
 
-    def finish(self, slam: Slam, cloud: PointCloud) -> None:
+    def on_finish(self, slam: Slam, cloud: PointCloud) -> None:
         """The path after the last adjustment, and the map."""
         entities.log_path(self.stream, frame_trajectory(slam), keyframe_trajectory(slam))
         entities.log_map(self.stream, cloud)
@@ -59,7 +60,7 @@ class RerunWatcher:
         entities.log_note(self.stream, f"finished: {counts}", level="INFO")
         flush(self.stream)
 
-    def _see_keyframe(self, slam: Slam) -> None:
+    def _log_new_keyframe(self, slam: Slam) -> None:
         members = [slam.keyframes[number] for number in slam.window]
         newest = members[-1].number
         joined = [pair for pair in slam.pairs if pair.second == newest]

@@ -1,0 +1,80 @@
+"""The ideal pinhole in numpy: where pixels become rays and points pixels, outside the bundle adjustment.
+
+Intrinsics are `(fx, fy, cx, cy)` in pixels, pixel (0, 0) is the centre of the top-left pixel, camera axes are x right,
+y down, z forward (Hartley and Zisserman 2004, section 6.1). Results keep the floating type of points and depths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+Intrinsics = Sequence[float] | np.ndarray
+
+
+def matrix(intrinsics: Intrinsics) -> np.ndarray:
+    """The calibration matrix K, float64 [3, 3]."""
+    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def rays(pixels: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
+    """Viewing rays with z = 1, float [..., 3], of pixels [..., 2]."""
+    focal, centre = _split(intrinsics, pixels.dtype)
+    flat = (pixels - centre) / focal
+    return np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
+
+
+def grid_rays(shape: tuple[int, int], intrinsics: Intrinsics, dtype: type[np.floating] = np.float64) -> np.ndarray:
+    """Viewing rays with z = 1 of all pixels of an image of `shape` (height, width), [h, w, 3]."""
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return rays(np.stack([columns, rows], axis=-1).astype(dtype), intrinsics)
+
+
+def project(points: np.ndarray, intrinsics: Intrinsics, nearest: float = 1e-3) -> np.ndarray:
+    """Pixels [..., 2] of points [..., 3] in the camera's frame; NaN where they are nearer than `nearest` metres."""
+    focal, centre = _split(intrinsics, points.dtype)
+    z = np.where(points[..., 2:] > nearest, points[..., 2:], np.nan)
+    return points[..., :2] / z * focal + centre
+
+
+def visible(
+    points: np.ndarray, intrinsics: Intrinsics, shape: tuple[int, int], nearest: float = 0.1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which points of the camera's frame [n, 3] an image of `shape` (height, width) sees, and in which pixels.
+
+    Returns bool [n], then int row and column of those that are seen. Nothing is nearer than `nearest` metres: the
+    sensors of depth begin there.
+    """
+    with np.errstate(invalid="ignore"):
+        places = np.rint(project(points, intrinsics, nearest))
+        inside = ((places >= 0) & (places < np.array(shape[::-1]))).all(axis=-1)
+    columns, rows = places[inside].astype(int).T
+    return inside, rows, columns
+
+
+def coarser(intrinsics: Intrinsics, factor: int) -> np.ndarray:
+    """Intrinsics, float64 [4], of an image whose pixels are blocks of `factor` x `factor` pixels."""
+    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    middle = 0.5 * (factor - 1)  # the centre of the first block, in pixels of the fine image
+    return np.array([fx, fy, cx - middle, cy - middle]) / factor
+
+
+def projection_rows(points: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of the pixel's x and y by the left tangent of the pose, [6, n] each, translation first.
+
+    points: [n, 3] in the camera's frame, in front of it.
+    """
+    (fx, fy), _ = _split(intrinsics, points.dtype)
+    x, y, z = points.T
+    zero, u, v = np.zeros_like(x), x / z, y / z
+    row_x = fx * np.stack([1 / z, zero, -u / z, -u * v, 1 + u * u, -v])
+    row_y = fy * np.stack([zero, 1 / z, -v / z, -1 - v * v, u * v, u])
+    return row_x, row_y
+
+
+def _split(intrinsics: Intrinsics, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+    """Focal lengths and principal point [2] each, in `dtype` (float64 for pixels that are integers)."""
+    values = np.asarray(intrinsics, dtype if np.issubdtype(dtype, np.floating) else np.float64)
+    return values[:2], values[2:]

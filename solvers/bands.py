@@ -1,0 +1,53 @@
+"""The damped Schur complement of a sequence as a banded matrix: what its Cholesky factor and its inverse begin with."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from vggtgeo.solvers.arrow import ArrowSystem, carry_to_nodes, dense_gradient, inverse_landmark_hessian
+from vggtgeo.solvers.block_band import (
+    BandFactor,
+    BandLayout,
+    BandMatrix,
+    add_to_diagonal,
+    assemble_bands,
+    factorise,
+)
+from vggtgeo.solvers.flat_directions import MIN_DIAGONAL, flat_stiffness, pins
+
+
+class Bands(eqx.Module):
+    """What the band solvers prepare once a linearisation."""
+
+    layout: BandLayout
+    hessian: BandMatrix
+    schur: BandMatrix
+    gradient: Float[Array, " c"]
+    schur_gradient: Float[Array, " c"]
+    diagonal: Float[Array, " c"]
+    stiffness: Float[Array, " g"]
+
+
+def prepare_bands(system: ArrowSystem, layout: BandLayout) -> Bands:
+    """Both matrices as far as the edges go that the layout holds, and the right-hand side."""
+    hessian, schur = assemble_bands(system, layout)
+    gradient, diagonal = dense_gradient(system)
+    schur_gradient = carry_to_nodes(system, inverse_landmark_hessian(system) * system.landmark_gradient)
+    diagonal = jnp.maximum(diagonal, MIN_DIAGONAL)
+    return Bands(layout, hessian, schur, gradient, schur_gradient, diagonal, flat_stiffness(system))
+
+
+def damped_band(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandMatrix:
+    """The damped Schur complement, flat directions pinned."""
+    shrink, shared = 1 / (1 + damping), len(bands.hessian.corner)
+    matrix: BandMatrix = jax.tree.map(lambda whole, taken: whole - shrink * taken, bands.hessian, bands.schur)
+    added = damping * bands.diagonal + pins(system, bands.stiffness, bands.diagonal).sum(1)
+    return add_to_diagonal(matrix, bands.layout.columns(added[:, None], shared))
+
+
+def factorise_bands(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandFactor:
+    """Factor of `damped_band` over the free coordinates."""
+    moves = bands.layout.columns(system.free[:, None], len(bands.hessian.corner))
+    return factorise(damped_band(system, bands, damping), moves)

@@ -1,0 +1,63 @@
+"""An exact Hessian, definite or not, ready to be solved: what a Newton step and a derivative of the optimum need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    ArrowVector,
+    carry_to_nodes,
+    couple,
+    dense_gradient,
+    inverse_landmark_hessian,
+)
+from vggtgeo.solvers.flat_directions import MIN_DIAGONAL
+from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, DenseCholesky
+
+
+class ExactModel(eqx.Module):
+    """A Hessian, definite or not, and its Schur complement `S` over the free coordinates, ready to be solved."""
+
+    system: ArrowSystem
+    factor: AbstractFactor
+    diagonal: Float[Array, " c"]
+
+    def solve(self, vector: ArrowVector) -> ArrowVector:
+        """`H^-1 vector` over the free coordinates; zero where held, undetermined or lost.
+
+        `S x = v_c - W V^-1 v_d`, `z = V^-1 (v_d - W' x)`, with a stiffness added along flat gauge directions.
+        """
+        inverse = inverse_landmark_hessian(self.system)
+        rest = vector.dense - carry_to_nodes(self.system, inverse * vector.landmarks)
+        dense = self.factor.solve(self.system, rest)
+        dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
+        return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0)))
+
+    def largest(self, gradient: ArrowVector) -> Float[Array, ""]:
+        """Largest entry of a gradient, in units of the root of its own curvature."""
+        landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
+        dense = jnp.max(gradient.dense**2 / self.diagonal, initial=0.0)
+        return jnp.sqrt(jnp.maximum(dense, jnp.max(landmarks, initial=0.0)))
+
+    def size(self, gradient: ArrowVector) -> Float[Array, ""]:
+        """Squared norm of a gradient, each entry in units of its own curvature."""
+        landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
+        return jnp.sum(gradient.dense**2 / self.diagonal) + jnp.sum(landmarks)
+
+
+def exact_model(
+    system: ArrowSystem,
+    solver: AbstractReducedSolver | None = None,
+    definite: Callable[[], ArrowSystem] | None = None,
+) -> ExactModel:
+    """The model of an exact Hessian, with the linear algebra of `solver`; None = dense.
+
+    definite: makes a system with a positive Hessian nearby; None = this one has.
+    """
+    solver = DenseCholesky() if solver is None else solver
+    factor = solver.factor(system, (lambda: system) if definite is None else definite)
+    return ExactModel(system, factor, jnp.maximum(dense_gradient(system)[1], MIN_DIAGONAL))

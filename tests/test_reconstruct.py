@@ -1,0 +1,151 @@
+"""`vg.reconstruct`: one call for a whole run, the same that the command line makes."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded_run import SETTINGS
+from typer.testing import CliRunner
+
+import vggtgeo as vg
+from vggtgeo.cli.main import make_app
+from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.slam.settings_table import changed
+
+FRAMES = 5
+TABLES = changed(SETTINGS)
+DATA = ("keyframes.txt", "map.ply", "trajectory.txt")
+
+
+class _Log(vg.Callback):
+    """The names of the hooks, in the order of their calls; Ctrl-C is pressed at the call `stop_at`."""
+
+    def __init__(self, stop_at: str = "") -> None:
+        self.calls: list[str] = []
+        self._stop_at = stop_at
+
+    def _note(self, call: str) -> None:
+        self.calls.append(call)
+        if call == self._stop_at:
+            raise KeyboardInterrupt
+
+    def on_begin(self, name: str, total: int | None) -> None:
+        self._note(f"begin {name} {total}")
+
+    def on_frame(self, slam: object, frame: vg.Frame) -> None:
+        self._note(f"frame {frame.index}")
+
+    def on_adjust(self, slam: object) -> None:
+        self._note("adjust")
+
+    def on_message(self, message: str) -> None:
+        self._note(message)
+
+    def on_finish(self, slam: object, cloud: object) -> None:
+        self._note("finish")
+
+
+@pytest.fixture(autouse=True)
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What these few frames do not need is not compiled beforehand."""
+    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
+    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
+    monkeypatch.setattr(vg.Callback, "on_warm_up", lambda self: None)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated TUM folder."""
+    place = tmp_path_factory.mktemp("data") / "room"
+    for _ in write_tum_folder(vg.simulate("room", FRAMES, 0, (160, 120), rate=10.0), place):
+        pass
+    return place
+
+
+def test_the_notebook_and_the_command_line_write_the_same_folder(folder: Path, tmp_path: Path) -> None:
+    """The same names, the same bytes of the data files, the same summary but for times and flags; oracle: the folder of
+    `vggtgeo run` on the same frames with the same settings.
+    """
+    program, notebook = tmp_path / "program", tmp_path / "notebook"
+    assignments = [
+        f"--set={group}.{name}={json.dumps(value)}"
+        for group, values in TABLES.items()
+        for name, value in values.items()
+    ]
+    arguments = ["run", str(folder), "-o", str(program), "--save-depth", "--quiet", *assignments]
+    done = CliRunner().invoke(make_app(), arguments)
+    assert done.exit_code == 0, done.output
+    result = vg.reconstruct(folder, settings=SETTINGS)
+    assert len(result.keyframes) > 1
+    result.save(notebook, depth=True)
+    names = [sorted(str(file.relative_to(place)) for file in place.rglob("*")) for place in (program, notebook)]
+    assert names[0] == names[1]
+    assert {"report.html", "settings.toml", "summary.json", "trajectory.png", *DATA} < set(names[0])
+    for name in (*DATA, *(name for name in names[0] if name.endswith(".png") and name.startswith("depth/"))):
+        assert (program / name).read_bytes() == (notebook / name).read_bytes(), name
+    for place in (program, notebook):
+        written = tomllib.loads((place / "settings.toml").read_text())
+        assert {group: written[group] for group in TABLES} == TABLES
+    first, second = (json.loads((place / "summary.json").read_text()) for place in (program, notebook))
+    assert first.keys() == second.keys()
+    for changing in ("settings", "seconds_by_stage", "frames_per_second", "peak_memory_gb"):
+        del first[changing], second[changing]
+    assert first == second
+
+
+def test_a_saved_result_is_read_again(folder: Path, tmp_path: Path) -> None:
+    """Load and save bring back poses, map, verdict and summary; oracle: the result in memory."""
+    result = vg.reconstruct(folder, end=2)
+    result.save(tmp_path / "one")
+    again = vg.read(tmp_path / "one")
+    assert isinstance(again, vg.Result)
+    assert again.record is None
+    np.testing.assert_allclose(again.trajectory.poses, result.trajectory.poses, atol=1e-8)
+    assert again.summary == json.loads(json.dumps(result.summary))
+    assert again.verdict == result.verdict
+    again.save(tmp_path / "two")
+    assert (tmp_path / "two/map.ply").read_bytes() == (tmp_path / "one/map.ply").read_bytes()
+    assert vg.read(tmp_path / "two").summary == again.summary
+    assert not (tmp_path / "two/report.html").exists()
+    with pytest.raises(vg.InputError, match="`depth` needs a result that is still in memory"):
+        again.save(tmp_path / "two", depth=True)
+
+
+def test_any_iterable_of_frames_will_do() -> None:
+    """A list of (image, depth) with its camera gives the poses of the sequence; oracle: the run over the sequence."""
+    sequence = vg.simulate("room", 3, 0, (160, 120))
+    pairs = [(frame.image, frame.depth) for frame in sequence.frames()]
+    log = _Log()
+    found = vg.reconstruct(iter(pairs), camera=sequence.camera, callbacks=[log], title="a list")
+    expected = vg.reconstruct(sequence)
+    np.testing.assert_array_equal(found.trajectory.poses, expected.trajectory.poses)
+    assert log.calls == ["begin frames None", "frame 0", "frame 1", "frame 2", "adjust", "finish"]
+    assert found.record.title == "a list"
+    assert found.record.truth is None
+    assert expected.record.truth is not None
+    with pytest.raises(vg.InputError, match="`frames` is empty"):
+        vg.reconstruct([])
+
+
+@pytest.mark.parametrize("stop_at", ["frame 1", "finish of the map"])
+def test_the_stop_button_keeps_what_there_is(monkeypatch: pytest.MonkeyPatch, stop_at: str) -> None:
+    """Ctrl-C at a frame ends the run with the frames so far, Ctrl-C in the last adjustment with all of them, and both
+    say so; oracle: a count, and the whole run.
+    """
+
+    def stopped(*_: object) -> Iterator[object]:
+        raise KeyboardInterrupt
+
+    if stop_at.startswith("finish"):
+        monkeypatch.setattr("vggtgeo.results.reconstruction.finish", stopped)
+    log = _Log(stop_at)
+    result = vg.reconstruct(vg.simulate("room", 4, 0, (160, 120)), callbacks=[log])
+    assert result.summary["interrupted"] is True
+    assert result.summary["frames"] == len(result.trajectory) == (2 if stop_at == "frame 1" else 4)
+    assert any(call.startswith("interrupted: keeping what there is") for call in log.calls)
+    assert log.calls[-1] == "finish"

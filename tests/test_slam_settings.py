@@ -1,0 +1,175 @@
+"""The pipeline's settings: checked by group when they are made, and within reach of files and flags."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jaxtyping
+import pytest
+import tomli_w
+from typer.testing import CliRunner
+
+import vggtgeo as vg
+from vggtgeo.cli.main import COMMANDS, load_command, make_app
+from vggtgeo.cli.pipeline_settings import pipeline_settings
+from vggtgeo.slam.settings_table import GROUPS, changed, names, parsed, tables_of, updated
+
+WRONG = {
+    "tracking.least_inliers": (0, 2.5, True, "many"),
+    "keyframes.keyframe_distance": (0.0, -1.0, float("nan"), float("inf"), "far"),
+    "keyframes.keyframe_angle": (0.0, 4.0),
+    "matching.least_covisible": (0,),
+    "matching.least_matches": (-1,),
+    "matching.least_line_matches": (1.0,),
+    "matching.match_gate": (0.0,),
+    "matching.epipolar_gate": (-4.0,),
+    "matching.least_overlap": (-0.1, 1.1),
+    "line.use_lines": (1, "yes"),
+    "line.line_gate": (0,),
+    "line.line_spacing": (0.0,),
+    "line.line_weight": (-0.1,),
+    "line.two_ends_lines": (None,),
+    "line.segment_samples": (1,),
+    "line.manhattan": (0,),
+    "depth.depth_weight": (-2.0,),
+    "depth.depth_trust": ("omega", 1),
+    "depth.surface_points": (-1.0,),
+    "weights.use_confidence": ("on",),
+    "weights.confidence_gain": (-1.0,),
+    "weights.confidence_floor": (float("nan"),),
+    "camera.known_intrinsics_sigma": (0.0,),
+    "camera.guessed_intrinsics_sigma": (-0.3,),
+    "window.size": (2, 10.0),
+    "window.point_slots": (0,),
+    "window.line_slots": (0,),
+    "window.kernel": (2.0, "cauchy 0", "cauchy 1 2 3", "welsch", ""),
+    "window.window_iterations": (0,),
+    "window.record_iterations": (1,),
+    "refinement.global_adjustment": ("no",),
+    "refinement.global_iterations": (0,),
+    "refinement.global_rounds": (0,),
+    "refinement.global_neighbours": (0,),
+    "refinement.loop_candidates": (-1, 1.5),
+}
+OTHER = {bool: lambda value: not value, int: lambda value: 2 * value + 2, float: lambda value: 0.5 * value}
+WORDS = {"depth.depth_trust": "saliency", "window.kernel": "huber 1.25"}
+
+
+def _other(name: str) -> Any:
+    """A value that is possible and is not the default."""
+    group, field = name.split(".")
+    default = tables_of(vg.SlamSettings())[group][field]
+    return WORDS[name] if name in WORDS else OTHER[type(default)](default)
+
+
+@pytest.fixture(autouse=True)
+def as_a_user() -> Iterator[None]:
+    """Without the tests' own checks of types, which would refuse a wrong value before the settings see it."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_every_setting_is_tested() -> None:
+    """The table above has a line for each setting; oracle: the declaration."""
+    assert set(WRONG) == set(names())
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_wrong_value_is_refused_with_its_name(name: str) -> None:
+    """The error names group and field, what was found, and what it must be."""
+    group, field = name.split(".")
+    for value in WRONG[name]:
+        with pytest.raises(vg.InputError) as raised:
+            updated(vg.SlamSettings(), {group: {field: value}})
+        assert str(raised.value).startswith(f"`{name}` is {value!r}; it must be "), raised.value
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_group_in_its_place(group: str) -> None:
+    """A group is named as its attribute is, and nothing else takes its place; oracle: the declaration."""
+    assert getattr(vg.SlamSettings(), group).group == group
+    with pytest.raises(vg.InputError, match=rf"`{group}` is 8; it must be a `vggtgeo\.\w+Settings`"):
+        vg.SlamSettings(**{group: 8})
+
+
+def test_settings_that_do_not_fit_each_other_are_refused() -> None:
+    """Slots that are no multiple of a segment's samples are refused where segments have two unknowns only."""
+    assert vg.SlamSettings(window=vg.WindowSettings(line_slots=100)).padded_samples is None
+    with pytest.raises(vg.InputError, match=r"`window.line_slots` is 100; with `line.two_ends_lines` it must be a mul"):
+        updated(vg.SlamSettings(), {"window": {"line_slots": 100}, "line": {"two_ends_lines": True}})
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_file_and_a_flag_reach_every_setting(name: str) -> None:
+    """What TOML and `--set` say arrives, and comes out as it went in; oracle: the value itself."""
+    group, field = name.split(".")
+    value = _other(name)
+    table = tomllib.loads(tomli_w.dumps({group: {field: value}}))
+    text = value if isinstance(value, str) else json.dumps(value)
+    for tables in (table, parsed(f"{name}={text}"), parsed(f" {name} = {text} ")):
+        settings = updated(vg.SlamSettings(), tables)
+        assert changed(settings) == {group: {field: value}}
+        assert changed(updated(vg.SlamSettings(), changed(settings))) == changed(settings)
+
+
+def test_no_group_has_the_name_of_a_flag() -> None:
+    """A table of a settings file and a flag can stand side by side; oracle: the parameters of the commands."""
+    for entry in COMMANDS:
+        if entry.name in ("run", "demo"):
+            flags = {option.lstrip("-") for p in load_command(entry).params for option in (*p.opts, *p.secondary_opts)}
+            assert flags & set(GROUPS) == set()
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("tracking.min_inliers=20", "`tracking.min_inliers` is no setting; the nearest is `tracking.least_inliers`"),
+        ("least_inliers=20", "`least_inliers` is no setting; the nearest is `tracking.least_inliers`"),
+        ("window.window=4", "`window.window` is no setting; the nearest is `window.window_iterations`"),
+        ("window.size", "`window.size` sets nothing; write `group.field=value`"),
+        ("window.size=four", "`window.size` is 'four'; it must be a whole number, 3 or more"),
+        ("line.use_lines=1", "`line.use_lines` is 1; it must be true or false"),
+        ("window.kernel=tukey 3", "`window.kernel` is 'tukey 3'; it must be one of barron, cauchy"),
+    ],
+)
+def test_a_wrong_assignment_ends_the_program_before_it_runs(tmp_path: Path, assignment: str, message: str) -> None:
+    """`--set` with what is not possible is one line and exit code 2, and no folder is made."""
+    out = tmp_path / "out"
+    done = CliRunner().invoke(make_app(), ["demo", "--frames", "3", "-o", str(out), "--quiet", "--set", assignment])
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert not out.exists()
+
+
+def test_a_table_of_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
+    """A table with a name that is no group's ends the program; oracle: the list of groups."""
+    (tmp_path / "s.toml").write_text("frames = 3\n[track]\nleast_inliers = 3\n")
+    done = CliRunner().invoke(make_app(), ["demo", "--settings", str(tmp_path / "s.toml"), "-o", str(tmp_path / "out")])
+    assert done.exit_code == 2
+    assert f"`track` is no group of settings; it must be one of {', '.join(GROUPS)}" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("table", "given", "assignments", "expected"),
+    [
+        ({}, False, (), False),  # a switch of the file or by default
+        ({"line": {"use_lines": True}}, False, (), True),  # a table says more than a switch of the same file
+        ({"line": {"use_lines": True}}, True, (), False),  # a switch that is given wins over the file
+        ({"line": {"use_lines": True}}, True, ("line.use_lines=true",), True),  # `--set` wins over all
+        ({}, False, ("line.use_lines=false", "line.use_lines=true"), True),  # the last wins
+    ],
+)
+def test_who_wins(table: dict, given: bool, assignments: tuple[str, ...], expected: bool) -> None:
+    """The order: switch of a file, table of a file, switch of the command line, `--set`."""
+    in_use = SimpleNamespace(tables=table, on_command_line=lambda name: given)
+    settings = pipeline_settings(in_use, assignments, {"lines": {"line": {"use_lines": False}}})
+    assert settings == dataclasses.replace(
+        vg.SlamSettings(), window=settings.window, line=vg.LineSettings(use_lines=expected)
+    )

@@ -1,0 +1,84 @@
+"""A run on the terminal: a bar while it goes on, and a report at its end."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from vggtgeo.datasets import Frame
+from vggtgeo.results import Result
+from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.state import Slam
+
+
+class ProgressBar(Callback):
+    """Frames done, their rate, and the state's notes as they come; a context, which takes the bar away."""
+
+    def __init__(self, console: Console) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self._progress = Progress(*columns, TextColumn("{task.fields[state]}"), console=console)
+        self._notes = 0
+        self._began = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._progress.stop()
+
+    def on_begin(self, name: str, total: int | None) -> None:
+        self._task = self._progress.add_task(name, total=total, state="")
+        self._began = time.perf_counter()
+        self._progress.start()
+
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
+        rate = len(slam.frames) / (time.perf_counter() - self._began)
+        state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {_state(slam)}"
+        self._progress.update(self._task, advance=1, state=state)
+        for note in slam.notes[self._notes :]:
+            self._print(f"warning: {note}")
+        self._notes = len(slam.notes)
+
+    def on_adjust(self, slam: Slam) -> None:
+        self._progress.stop()
+
+    def on_message(self, message: str) -> None:
+        self._print(message)
+
+    def _print(self, line: str) -> None:
+        self._progress.console.print(line, markup=False, highlight=False)
+
+
+def _state(slam: Slam) -> str:
+    if slam.lost:
+        return "lost"
+    return "waiting for parallax" if slam.waiting else "tracking"
+
+
+def print_result(console: Console, result: Result, folder: Path) -> None:
+    """The report of a run; its last line is the verdict."""
+    summary, verdict = result.summary, result.verdict
+    fx, fy, cx, cy = result.intrinsics
+    rate, tracked = summary["frames_per_second"], summary["frames_tracked"]
+    lines = [
+        f"{summary['frames']} frames ({tracked} tracked), {summary['keyframes']} keyframes, {rate:.1f} frames/s",
+        f"intrinsics fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}",
+    ]
+    if summary["scale"].startswith("free"):
+        lines.append("scale: free, there is no metric depth; lengths have no unit")
+    elif not verdict.metric:
+        lines.append("scale: doubtful, lengths may be no metres")
+    if "truth" in summary:
+        se3, sim3 = (summary["truth"][name]["rmse"] for name in ("ate_se3_m", "ate_sim3_m"))
+        lines.append(f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment")
+    points = f"({len(result.cloud)} points)"
+    lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply {points} report.html")
+    lines += [f"- {reason}" for reason in verdict.reasons]
+    lines.append(f"verdict: {verdict.level}")
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)

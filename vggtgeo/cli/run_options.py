@@ -1,0 +1,55 @@
+"""The options of `vggtgeo run`, each with its help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+Provider = Literal["auto", "cuda", "cpu"]
+SequenceArgument = Annotated[Path, typer.Argument(help="Folder of a sequence, or a video file.", show_default=False)]
+OutputOption = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
+KindOption = Annotated[str | None, typer.Option(help="Reader: 7scenes, tum, images or video; found by looking.")]
+StartOption = Annotated[int, typer.Option(help="First frame.")]
+EndOption = Annotated[int | None, typer.Option(help="Frame to stop before.")]
+StrideOption = Annotated[int, typer.Option(help="Take every n-th frame.")]
+IntrinsicsOption = Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels, in place of the folder's.")]
+RgbOnlyOption = Annotated[
+    bool, typer.Option("--rgb-only/--no-rgb-only", help="Ignore depth images: the scale stays free.")
+]
+LinesOption = Annotated[bool, typer.Option("--lines/--no-lines", help="Residuals of lines; without them: an ablation.")]
+DepthPriorOption = Annotated[
+    bool,
+    typer.Option(
+        "--depth-prior/--no-depth-prior",
+        help="Depth holds the estimate; without it, it starts it only: an ablation.",
+    ),
+]
+ConfidenceOption = Annotated[
+    bool,
+    typer.Option("--confidence/--no-confidence", help="Weights by confidence; without it, all are one: an ablation."),
+]
+GlobalOption = Annotated[
+    bool,
+    typer.Option(
+        "--global/--no-global",
+        help="One adjustment of the whole map at the end; without it, the sliding window alone: an ablation.",
+    ),
+]
+InitOption = Annotated[Literal["pnp", "constant-velocity"], typer.Option(help="How a new frame's pose starts.")]
+FeaturesOption = Annotated[Literal["sift", "orb"], typer.Option(help="Key points.")]
+PresetOption = Annotated[
+    Literal["classical", "light", "paper"],
+    typer.Option(help="Who perceives: classical code, or networks (see `vggtgeo models list`)."),
+]
+ModelsOption = Annotated[Path | None, typer.Option("--models", help="Folder of the networks' files.")]
+CacheOption = Annotated[Path | None, typer.Option("--cache", help="Folder to keep what the networks answer.")]
+ProviderOption = Annotated[Provider, typer.Option(help="Where networks run.")]
+MemoryOption = Annotated[
+    float | None, typer.Option(help="Most GPU memory of each network, GB; has no effect on the CPU.")
+]
+SaveDepthOption = Annotated[
+    bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
+]
+SeedOption = Annotated[int, typer.Option(help="Seed of every random choice.")]

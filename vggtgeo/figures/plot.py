@@ -1,0 +1,77 @@
+"""`plot`: one function that draws any value of the library."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vggtgeo.bundle.analysis.covariances import Covariances
+from vggtgeo.bundle.analysis.observability_report import Observability
+from vggtgeo.bundle.problem import State
+from vggtgeo.bundle.solution import Solution
+from vggtgeo.evaluation import TrajectoryReport
+from vggtgeo.figures.plots import NotebookFigure, energy_figure, errors_figure, trajectory_figure
+from vggtgeo.figures.uncertainty import covariance_figure, observability_figure
+from vggtgeo.geometry.trajectory import Trajectory
+
+
+@singledispatch
+def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
+    """A figure of a value, which a notebook shows as it is; `savefig` writes it. Outside `jit`, for one problem.
+
+    Args:
+        value: one of
+
+            - `Trajectory`: from above and from the side. Options: `truth` (a trajectory), drawn beside it after SE(3)
+              alignment, or Sim(3) `with_scale=True`.
+            - `Result` of a run: the same, and the map from inside and from above. Options: `truth`.
+            - what `evaluate` returns: a histogram of the errors after either alignment.
+            - `Solution`: the energy by iteration.
+            - `Covariances`: the camera centres from above with an ellipse each. Takes the `state` that they belong to.
+              Options: `truth`, camera centres [n, 3] in the world; `sigmas`, by default as many as can be seen well.
+            - `Observability`: the eigenvalues, and what would be lost without each kind of observation.
+            - `BenchReport`: the error of every run, by scene and variant.
+        args: of the value's kind.
+        options: of the value's kind.
+
+    Raises:
+        TypeError: there is no picture of such a value.
+
+    Example (of `solve`'s):
+        >>> vg.plot(solution).axes[0].get_ylabel()
+        'energy'
+
+    """
+    known = sorted(kind.__name__ for kind in plot.registry if kind is not object)
+    raise TypeError(f"`plot` has no picture of a `{type(value).__name__}`; it draws {', '.join(known)}")
+
+
+@plot.register(Trajectory)
+def _trajectory(value: Trajectory, truth: Trajectory | None = None, *, with_scale: bool = False) -> NotebookFigure:
+    return trajectory_figure(value, truth, with_scale=with_scale)
+
+
+@plot.register(TrajectoryReport)
+def _errors(value: TrajectoryReport) -> NotebookFigure:
+    return errors_figure(value)
+
+
+@plot.register(Solution)
+def _energy(value: Solution) -> NotebookFigure:
+    history = np.asarray(value.history)
+    return energy_figure(history[np.isfinite(history)], value.result)
+
+
+@plot.register(Covariances)
+def _covariances(
+    value: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, *, sigmas: float | None = None
+) -> NotebookFigure:
+    return covariance_figure(value, state, truth, sigmas)
+
+
+@plot.register(Observability)
+def _observability(value: Observability) -> NotebookFigure:
+    return observability_figure(value)

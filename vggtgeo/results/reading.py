@@ -1,0 +1,79 @@
+"""What lies on the disk, read back; and errors of an estimate against a truth, wherever the two come from."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.datasets import Sequence, open_sequence
+from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.results.result import Result
+
+
+def read(path: str | os.PathLike[str]) -> Result | Sequence:
+    """What lies at `path`: the `Result` in a run's folder, else a sequence of frames (folder or video).
+
+    Raises:
+        InputError: nothing that can be read is there.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.read("no/such/place")
+        Traceback (most recent call last):
+            ...
+        vggtgeo.io.errors.InputError: `no/such/place` does not exist; give a folder of images or a video file
+
+    """
+    if (Path(path) / "summary.json").is_file():
+        return Result.load(path)
+    return open_sequence(path)
+
+
+def evaluate(
+    estimate: Trajectory | Result | str | os.PathLike[str],
+    truth: Trajectory | Sequence | str | os.PathLike[str],
+    **options: Any,
+) -> TrajectoryReport:
+    """ATE after SE(3) and Sim(3) alignment, and RPE, of an estimate against the truth.
+
+    Args:
+        estimate: a trajectory, a result, or where one lies: a file in the TUM format or a run's folder.
+        truth: a trajectory, a sequence with truth, or where one lies.
+        options: `max_dt`, `delta`, `all_pairs` of `vggtgeo.evaluate_trajectory`.
+
+    Raises:
+        InputError: there is no trajectory, or fewer than three poses match in time.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> truth = vg.simulate("room", 30).ground_truth()
+        >>> print(vg.evaluate(truth, truth))
+        30 poses: ATE 0.000 m after SE(3), 0.000 m after Sim(3) (scale 1.0000); RPE over 1: 0.000 m, 0.000 deg
+
+    """
+    return evaluate_trajectory(_estimate(estimate), _truth(truth), **options)
+
+
+def _estimate(given: Any) -> Trajectory:
+    if isinstance(given, Trajectory):
+        return given
+    if isinstance(given, Result):
+        return given.trajectory
+    place = Path(given)
+    return Trajectory.load_tum(place / "trajectory.txt" if place.is_dir() else place)
+
+
+def _truth(given: Any) -> Trajectory:
+    if isinstance(given, Trajectory):
+        return given
+    if isinstance(given, str | os.PathLike):
+        if Path(given).is_file():
+            return Trajectory.load_tum(given)
+        given = open_sequence(given)
+    found: Trajectory | None = given.ground_truth()
+    if found is None:
+        raise InputError(f"`truth` is `{given.name}`, which has no truth; give a trajectory in the TUM format")
+    return found

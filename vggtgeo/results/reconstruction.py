@@ -1,0 +1,263 @@
+"""A whole run in one call: frames in, a `Result` out. The command line calls the same function."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from vggtgeo.datasets import Frame, Sequence, SequenceView, open_sequence
+from vggtgeo.datasets.in_memory import FrameStream, frame_stream
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.warned import collected_warnings
+from vggtgeo.results.result import Result, RunRecord
+from vggtgeo.results.summary import compare, summarise
+from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.dense import map_points
+from vggtgeo.slam.keyframe_depth import fused_depths
+from vggtgeo.slam.presets import Perception
+from vggtgeo.slam.run import default_roles, finish, run_frames
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings_table import changed
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.evidence import EvidenceRecorder
+from vggtgeo.slam.trust.input import check_input
+from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.window import warm_up
+from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
+
+
+def reconstruct(
+    frames: str | os.PathLike[str] | Sequence | Iterable[Any],
+    roles: Roles | Perception | None = None,
+    settings: SlamSettings | None = None,
+    *,
+    camera: Camera | None = None,
+    start: int = 0,
+    end: int | None = None,
+    stride: int = 1,
+    seed: int = 0,
+    title: str | None = None,
+    callbacks: Iterable[Callback] = (),
+    facts: Mapping[str, Any] | None = None,
+    warned: Iterable[Warning | str] = (),
+) -> Result:
+    """Track and map every frame, adjust the whole map, judge the result.
+
+    Ctrl-C (in a notebook: the stop button) ends the run early with the result of the frames so far, whose `summary`
+    says `interrupted`.
+
+    Args:
+        frames: a folder or a video file, a sequence (`vggtgeo.read`, `vggtgeo.simulate`), or any iterable of `Frame`,
+            of images uint8 [H, W, 3] RGB, or of pairs of an image and depth (float [H, W], metres, NaN = none).
+        roles: perception objects, or those of `vggtgeo.perception`; by default the classical ones, without depth where
+            the frames have none.
+        settings: of the pipeline.
+        camera: of the frames, in place of what their folder says; by default a guess for an iterable.
+        start: first frame.
+        end: frame to stop before.
+        stride: take every n-th frame.
+        seed: of OpenCV's random choices, a global setting of that package.
+        title: of the report; by default the name of the sequence.
+        callbacks: called with every frame.
+        facts: what the summary shall say besides.
+        warned: warnings about the input that came before, for the verdict and the report.
+
+    Raises:
+        InputError: the frames cannot be read, or none of them can be used.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> settings = vg.SlamSettings(window=vg.WindowSettings(size=3, point_slots=16, line_slots=12))
+        >>> vg.reconstruct(vg.simulate("room", 2, size=(160, 120)), settings=settings).summary["frames"]
+        2
+
+    """
+    clock, began = Clock(), time.perf_counter()
+    cv2.setRNGSeed(seed)
+    settings = settings or SlamSettings()
+    with collected_warnings() as collected:
+        source = _opened(frames, camera)
+        perception = _perception(roles, source.has_depth)
+        windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
+        hooks = _Callbacks((windows, evidence, *callbacks), clock)
+        with clock.measure("compile"):
+            hooks.warm_up(settings, perception.roles)
+        tracked = _track(source, (start, end, stride), perception.roles, settings, hooks)
+    slam, interrupted = _adjust(tracked, perception.roles, settings, hooks)
+    known = {
+        **perception.facts(),
+        **(facts or {}),
+        "frames_per_second": round(tracked.frames_per_second, 2),
+        "interrupted": interrupted,
+    }
+    ending = _Ending(slam, source.truth, (*warned, *collected), title or source.name, known, clock, began)
+    return _concluded(ending, settings, hooks, windows.records, evidence)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ending:
+    """A run after its last adjustment: what it is judged and described by."""
+
+    slam: Slam
+    truth: Trajectory | None
+    warned: tuple[Warning | str, ...]
+    title: str
+    facts: Mapping[str, Any]
+    clock: Clock
+    began: float
+
+
+def _concluded(
+    run: _Ending, settings: SlamSettings, hooks: _Callbacks, windows: Iterable[WindowRecord], evidence: EvidenceRecorder
+) -> Result:
+    """The map, the verdict, the summary."""
+    slam, clock = run.slam, run.clock
+    with clock.measure("dense map"):
+        depths = tuple(fused_depths(slam.keyframes, slam.intrinsics))
+        cloud = map_points(slam.keyframes, slam.intrinsics, depths)
+    hooks.each("on_finish", slam, cloud)
+    with clock.measure("verdict"):
+        verdict = judge(slam, evidence.frames, check_input(run.warned, len(slam.frames)))
+    summary = summarise(
+        slam,
+        verdict,
+        settings=changed(settings),
+        seconds={**clock.seconds, "all": time.perf_counter() - run.began},
+        report=compare(slam, run.truth),
+        map_points=len(cloud),
+        **run.facts,
+    )
+    notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
+    return Result.assemble(
+        RunRecord(slam, depths, tuple(windows), run.truth, notices, run.title), cloud, verdict, summary
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """What an estimator may see, and the truth, set apart for the comparison."""
+
+    name: str
+    frames: Sequence | FrameStream
+    truth: Trajectory | None
+
+    @property
+    def camera(self) -> Camera:
+        return self.frames.camera
+
+    @property
+    def has_depth(self) -> bool:
+        return self.frames.has_depth
+
+    def count(self, start: int, end: int | None, stride: int) -> int | None:
+        """Frames of a selection; None where only their end will tell."""
+        if isinstance(self.frames, FrameStream):
+            return None
+        length = len(self.frames)
+        return len(range(start, length if end is None else min(length, end), stride))
+
+
+def _opened(frames: str | os.PathLike[str] | Sequence | Iterable[Any], camera: Camera | None) -> _Source:
+    if isinstance(frames, str | os.PathLike):
+        frames = open_sequence(Path(frames))
+    if not isinstance(frames, Sequence):
+        return _Source("frames", frame_stream(frames, camera), None)
+    view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
+    return _Source(frames.name, view, _truth(frames))
+
+
+def _truth(sequence: Sequence) -> Trajectory | None:
+    """The truth for the comparison; one that cannot be read costs that only."""
+    try:
+        return sequence.ground_truth()
+    except InputError as error:
+        warnings.warn(f"the truth cannot be used and is left out: {error}", InputWarning, stacklevel=4)
+        return None
+
+
+def _perception(roles: Roles | Perception | None, has_depth: bool) -> Perception:
+    if isinstance(roles, Perception):
+        return roles
+    return Perception(roles or default_roles(has_depth), {})
+
+
+@dataclass(frozen=True, eq=False)
+class _Callbacks:
+    """All callbacks of a run, their time measured apart from that of the run."""
+
+    members: tuple[Callback, ...]
+    clock: Clock
+
+    def warm_up(self, settings: SlamSettings, roles: Roles) -> None:
+        """Compile what every window needs, and what the callbacks make of windows."""
+        compiled = warm_up(settings, roles.metric)
+        for member in self.members:
+            member.on_warm_up(*compiled)
+
+    def each(self, hook: str, *arguments: Any) -> None:
+        """Call one hook of every member."""
+        with self.clock.measure("record and draw"):
+            for member in self.members:
+                getattr(member, hook)(*arguments)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracked:
+    """The state after the last frame that was tracked."""
+
+    slam: Slam
+    interrupted: bool
+    frames_per_second: float
+
+
+def _track(
+    source: _Source, selection: tuple[int, int | None, int], roles: Roles, settings: SlamSettings, hooks: _Callbacks
+) -> _Tracked:
+    """The loop over frames; Ctrl-C ends it early, an input error of the sequence ends it without a result."""
+    slam: Slam | None = None
+    interrupted = False
+    given: dict[int, Frame] = {}
+    hooks.each("on_begin", source.name, source.count(*selection))
+    frames = _remembered(source.frames.frames(*selection), given)
+    began = time.perf_counter()
+    try:
+        for slam in run_frames(frames, source.camera, roles, settings, hooks.clock):
+            hooks.each("on_frame", slam, given.pop(slam.frames[-1].frame))
+    except KeyboardInterrupt:
+        interrupted = True
+    if slam is None or not slam.frames:
+        if interrupted:
+            raise KeyboardInterrupt
+        raise InputError(f"`{source.name}` gave no frame that could be used; nothing was written")
+    if interrupted:
+        hooks.each("on_message", "interrupted: keeping what there is")
+    return _Tracked(slam, interrupted, len(slam.frames) / (time.perf_counter() - began))
+
+
+def _adjust(tracked: _Tracked, roles: Roles, settings: SlamSettings, hooks: _Callbacks) -> tuple[Slam, bool]:
+    """The state after the last adjustment, and whether Ctrl-C ended the run; after Ctrl-C there is none."""
+    hooks.each("on_adjust", tracked.slam)
+    if tracked.interrupted:
+        return tracked.slam, True
+    try:
+        return finish(tracked.slam, roles, settings, hooks.clock), False
+    except KeyboardInterrupt:
+        hooks.each("on_message", "interrupted: keeping what there is, without the last adjustment")
+        return tracked.slam, True
+
+
+def _remembered(frames: Iterable[Frame], given: dict[int, Frame]) -> Iterator[Frame]:
+    """The same frames, each kept in `given` by its index until somebody takes it."""
+    for frame in frames:
+        given[frame.index] = frame
+        yield frame

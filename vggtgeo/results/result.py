@@ -1,0 +1,209 @@
+"""The result of a run: trajectory, map, verdict; from its last state, or from the folder it was saved in."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from vggtgeo.figures.plot import plot
+from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
+from vggtgeo.figures.result_figure import result_figure
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_json
+from vggtgeo.report import write_page
+from vggtgeo.results.files import write_depth, write_settings
+from vggtgeo.results.summary import compare, summarise
+from vggtgeo.slam.dense import map_points
+from vggtgeo.slam.keyframe_depth import fused_depths
+from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.evidence import Evidence
+from vggtgeo.slam.trust.finding import Verdict
+from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.window_recorder import WindowRecord
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """What a result is made of, as long as it is in memory; the page and the depth images are drawn from it.
+
+    slam: the last state. depths: the keyframes' dense depth after adjustment, metres, NaN or None where there is none.
+    windows: one an adjustment of the window. truth: camera -> world, where it is known. warnings: about the input, and
+    about the weights of networks. title: of the run.
+    """
+
+    slam: Slam
+    depths: tuple[np.ndarray | None, ...]
+    windows: tuple[WindowRecord, ...] = ()
+    truth: Trajectory | None = None
+    warnings: tuple[str, ...] = ()
+    title: str = "run"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The result of a run.
+
+    Fields:
+        trajectory: camera -> world of every frame that has a pose.
+        keyframes: those of the keyframes.
+        cloud: the map, world frame.
+        intrinsics: fx, fy, cx, cy, pixels, as adjusted.
+        metric: whether lengths are metres; without metric depth they have no unit.
+        verdict: how far all this can be trusted, by segment of time.
+        summary: counts, times and settings, as `summary.json` has them.
+        record: what it was made of; None for a result that was read from a folder.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> update = next(vg.run(vg.simulate("room", 3, size=(160, 120))))
+        >>> vg.Result.of(update).to_dict()["keyframes"]
+        1
+
+    """
+
+    trajectory: Trajectory
+    keyframes: Trajectory
+    cloud: PointCloud
+    intrinsics: tuple[float, float, float, float]
+    metric: bool
+    verdict: Verdict
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    record: RunRecord | None = None
+
+    @classmethod
+    def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None) -> Self:
+        """The result of a state: the last one that `vggtgeo.run` gave, or what `vggtgeo.finish` made of it.
+
+        evidence: what an `EvidenceRecorder` noted of all frames; without it the verdict rests on the run's own record.
+        truth: camera -> world, where it is known.
+        """
+        verdict, depths = judge(slam, evidence), tuple(fused_depths(slam.keyframes, slam.intrinsics))
+        cloud = map_points(slam.keyframes, slam.intrinsics, depths)
+        summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=len(cloud))
+        return cls.assemble(RunRecord(slam, depths, truth=truth), cloud, verdict, summary)
+
+    @classmethod
+    def assemble(cls, record: RunRecord, cloud: PointCloud, verdict: Verdict, summary: Mapping[str, Any]) -> Self:
+        """The result of parts that are there already."""
+        slam = record.slam
+        fx, fy, cx, cy = (float(value) for value in slam.intrinsics)
+        poses = frame_trajectory(slam), keyframe_trajectory(slam)
+        return cls(*poses, cloud, (fx, fy, cx, cy), verdict.metric, verdict, summary, record)
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike[str]) -> Self:
+        """Reads the folder that `Result.save` or `vggtgeo run` wrote; InputError where a file of it is missing."""
+        place = Path(folder)
+        try:
+            summary = json.loads((place / "summary.json").read_text(encoding="utf-8"))
+            fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
+            metric = summary["scale"] == "metric"
+            verdict = Verdict.from_dict(summary["verdict"], metric)
+        except (OSError, json.JSONDecodeError, KeyError) as error:
+            message = f"`{place}` has no usable `summary.json` ({error}); give a folder that `vggtgeo run` wrote"
+            raise InputError(message) from None
+        return cls(
+            Trajectory.load_tum(place / "trajectory.txt"),
+            Trajectory.load_tum(place / "keyframes.txt"),
+            PointCloud.load_ply(place / "map.ply"),
+            (fx, fy, cx, cy),
+            metric,
+            verdict,
+            summary,
+        )
+
+    def save(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        depth: bool = False,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `trajectory.png`, `report.html`,
+        `summary.json` and `settings.toml`, each atomically; `vggtgeo.read` reads it.
+
+        A result that was read from a folder has neither images nor windows, so it is saved without page and depth.
+
+        Args:
+            folder: made where it does not exist.
+            depth: write each keyframe's dense depth and confidence as well.
+            settings: flags of the command line that tell how the run was made, beside the pipeline's own settings.
+
+        Raises:
+            InputError: `depth` is asked of a result that was read from a folder.
+
+        """
+        place = Path(folder)
+        if depth and self.record is None:
+            raise InputError("`depth` needs a result that is still in memory; this one was read from a folder")
+        place.mkdir(parents=True, exist_ok=True)
+        used = {**(settings or {}), **self.summary.get("settings", {})}
+        flags = {name.replace("_", "-"): value for name, value in used.items()}
+        plain = {**self.summary, "settings": {name.replace("-", "_"): value for name, value in used.items()}}
+        write_settings(place / "settings.toml", flags)
+        self.trajectory.save_tum(place / "trajectory.txt")
+        self.keyframes.save_tum(place / "keyframes.txt")
+        self.cloud.save_ply(place / "map.ply")
+        write_json(place / "summary.json", plain)
+        self._draw(place, {**plain, "settings": flags})
+        if depth and self.record is not None:
+            write_depth(place, self.record.slam.keyframes, self.record.depths)
+
+    def _draw(self, place: Path, summary: Mapping[str, Any]) -> None:
+        record = self.record
+        if len(self.trajectory):
+            plot_trajectory(
+                place / "trajectory.png",
+                self.trajectory,
+                record.truth if record else None,
+                self.keyframes,
+                with_scale=not (record.slam.metric if record else self.metric),
+                title=record.title if record else place.resolve().name,
+            )
+        if record is not None:
+            write_page(
+                place / "report.html",
+                record.slam,
+                title=record.title,
+                truth=record.truth,
+                cloud=self.cloud,
+                records=record.windows,
+                summary=summary,
+                verdict=self.verdict,
+                warnings=record.warnings,
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers: counts, length, intrinsics, and the summary."""
+        return {
+            "frames": len(self.trajectory),
+            "keyframes": len(self.keyframes),
+            "map_points": len(self.cloud),
+            "metric": self.metric,
+            "verdict": self.verdict.to_dict(),
+            "path_length": self.trajectory.length,
+            "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), self.intrinsics, strict=True)),
+            "summary": dict(self.summary),
+        }
+
+    def __repr__(self) -> str:
+        frames, keyframes = len(self.trajectory), len(self.keyframes)
+        unit = " m" if self.metric else " (no unit)"
+        return (
+            f"Result({frames} frame{'s' * (frames != 1)}, {keyframes} keyframe{'s' * (keyframes != 1)}, "
+            f"path {self.trajectory.length:.2f}{unit}, {len(self.cloud)} points)"
+        )
+
+
+@plot.register(Result)
+def _plot(value: Result, truth: Trajectory | None = None) -> NotebookFigure:
+    return result_figure(value.trajectory, value.keyframes, value.cloud, value.metric, truth)

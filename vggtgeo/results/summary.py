@@ -1,0 +1,75 @@
+"""The numbers of a run, as `summary.json` holds them."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import resource
+from collections.abc import Mapping
+from typing import Any
+
+from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.slam.run import frame_trajectory
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.finding import Verdict
+
+
+def compare(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:
+    """Errors against the truth; None where there is none, or too few poses match it in time."""
+    if truth is None:
+        return None
+    try:
+        return evaluate_trajectory(frame_trajectory(slam), truth)
+    except InputError:
+        return None
+
+
+def summarise(
+    slam: Slam,
+    verdict: Verdict,
+    *,
+    settings: Mapping[str, Any],
+    seconds: Mapping[str, float],
+    report: TrajectoryReport | None = None,
+    **counts: Any,
+) -> dict[str, Any]:
+    """Verdict, settings, versions, counts, time by stage, final intrinsics, errors where the truth is known."""
+    tracked = sum(record.tracked for record in slam.frames)
+    values = {
+        "verdict": verdict.to_dict(),
+        "settings": dict(settings),
+        "versions": versions(),
+        "frames": len(slam.frames),
+        "frames_tracked": tracked,
+        "keyframes": len(slam.keyframes),
+        "pairs": len(slam.pairs),
+        "origins": len(slam.origins),
+        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
+        "scale": scale_name(slam, verdict),
+        "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
+        "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
+        "notes": list(slam.notes),
+        **counts,
+    }
+    return values if report is None else {**values, "truth": report.as_dict()}
+
+
+def scale_name(slam: Slam, verdict: Verdict) -> str:
+    """What lengths are: "metric" only where nothing speaks against it."""
+    if not slam.metric:
+        return "free (no metric depth): lengths have no unit"
+    return "metric" if verdict.metric else "doubtful (see the verdict): lengths may be no metres"
+
+
+def versions() -> dict[str, str]:
+    """The versions that a result depends on."""
+    names = ("vggtgeo", "jax", "optimistix", "lineax", "equinox", "jaxlie", "numpy", "opencv-python-headless")
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed (source tree)"
+    return found
