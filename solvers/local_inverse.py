@@ -28,7 +28,7 @@ class LocalInverse(eqx.Module):
     """Number of dense coordinates that are determined, flat gauge directions not counted."""
 
 
-def local_nodes(system: ArrowSystem, hosts: Int[Array, " h"]) -> Int[Array, "h p"]:
+def local_nodes(system: ArrowSystem, hosts: Int[Array, " h"]) -> Int[Array, "h m"]:
     """Neighbours of each host, then itself; any node where a host has fewer neighbours."""
     nodes = len(system.graph.of_host)
     neighbours = jnp.minimum(system.graph.neighbours()[hosts], nodes - 1)

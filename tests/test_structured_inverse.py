@@ -64,7 +64,7 @@ def worst(found: Tree, expected: Tree) -> float:
         known = np.isfinite(other)
         np.testing.assert_array_equal(np.isfinite(one), known)
         if known.any():
-            errors.append(np.abs(one - other)[known].max() / max(np.abs(other[known]).max(), 1e-300))
+            errors.append(np.abs(one[known] - other[known]).max() / max(np.abs(other[known]).max(), 1e-300))
     return float(max(errors))
 
 
