@@ -147,7 +147,8 @@ def _restored(
             raise InputError(f"it has the version {whole['version']}; this program reads {VERSION}")
         problem, state = (restore(whole[name], arrays, terms, dtype) for name in ("problem", "state"))
         host, slot, edge = (arrays[f"index/{name}"] for name in ("host", "slot", "edge"))
-        index = SlotIndex(host, slot, edge, tuple(map(int, whole["index"])))
+        keyframes, edges, slots = map(int, whole["index"])
+        index = SlotIndex(host, slot, edge, (keyframes, edges, slots))
         check_problem(problem, state, index)
     except InputError as error:
         raise InputError(f"`{path}` cannot be read as a problem: {error}") from error

@@ -46,7 +46,7 @@ def residuals_svg(records: Sequence[WindowRecord]) -> str:
     FigureCanvasAgg(figure)
     units = {name: unit for record in records for name, unit in record.units.items()}
     kinds = list(dict.fromkeys(units.values())) or ["px"]
-    rows = dict(zip(kinds, np.atleast_1d(figure.subplots(len(kinds), 1, sharex=True)), strict=True))
+    rows = dict(zip(kinds, figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0], strict=True))
     time = np.array([record.timestamp for record in records]) - records[0].timestamp
     for number, (name, unit) in enumerate(units.items()):
         values = np.array([record.rms.get(name, np.nan) for record in records])
