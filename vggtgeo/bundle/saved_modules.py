@@ -130,7 +130,7 @@ def _label(item: Any, number: int) -> str:
     return item.name if isinstance(item, AbstractTerm) else str(number)
 
 
-def check_problem(problem: Problem, state: State, index: Any) -> None:
+def check_problem(problem: Any, state: Any, index: Any) -> None:
     """Arrays that belong together: what was read may have been written by anybody.
 
     Raises:

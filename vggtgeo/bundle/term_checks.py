@@ -10,7 +10,7 @@ import numpy as np
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.packing_checks import as_numbers, check_matches, check_weight
-from vggtgeo.bundle.padding import COUNTED, GivenTerm
+from vggtgeo.bundle.padding import COUNTED
 from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
@@ -25,7 +25,7 @@ _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsP
 """Names of the terms that `pack` makes of its other arguments."""
 
 
-def check_terms(terms: Sequence[GivenTerm], observations: Observations, keyframes: int) -> None:
+def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int) -> None:
     """Terms of different names, with weights that are weights and indices that exist."""
     names = list(_OWN)
     for term in terms:
