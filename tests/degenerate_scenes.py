@@ -14,7 +14,8 @@ from scenes import SIGMA, Scene, make_scene
 from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.kernels import Huber
 
-from vggtgeo.bundle.packing import Observations, PaddedSize
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 
 KEYFRAMES, POINTS, LINES, SAMPLES = 3, 8, 4, 2

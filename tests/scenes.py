@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.bundle.packing import Observations, SlotIndex, pack
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 
 INTRINSICS = np.array([300.0, 310.0, 160.0, 120.0])

@@ -13,7 +13,7 @@ from scenes import Scene, make_scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 from vggtgeo.bundle.batches import Window, pack_batch, solve_batch
-from vggtgeo.bundle.packing import Observations
+from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.io.errors import InputError

@@ -13,7 +13,7 @@ from vggtgeo.solvers.kernels import Huber
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import energy, energy_terms
-from vggtgeo.bundle.packing import PaddedSize
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import State
 
 EnergyTerms = dict[str, float]

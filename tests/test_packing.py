@@ -11,7 +11,10 @@ import pytest
 from scenes import Scene, make_scene
 from vggtgeo.solvers.kernels import Huber
 
-from vggtgeo.bundle.packing import Observations, PaddedSize, pack
+import vggtgeo as vg
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.io.errors import InputError
 from vggtgeo.simulation import simulate_window
@@ -130,6 +133,8 @@ def test_wrong_lists_are_refused_by_name() -> None:
         (bad(host=seen.host - 1), "`host` goes from -1"),
         (bad(point_edge=seen.point_edge + 9), "`point_edge` goes from 9"),
         (bad(line_landmark=seen.line_landmark + 1000), "`line_landmark`"),
+        (bad(edges=seen.edges + 0.5), "`edges` holds float64; expected whole numbers"),
+        (replace(SCENE, start_poses=np.nan * SCENE.start_poses), r"`poses\[0\]` is .*; it must be finite"),
         (
             bad(point_edge=wrong_host),
             r"`point_edge\[0\]` starts at keyframe 2, but its landmark is hosted in keyframe 0",
@@ -166,6 +171,9 @@ def test_a_size_that_is_too_small_is_refused(name: str) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"intrinsics_mean": np.ones(3)}, r"`intrinsics_mean` is \[1. 1. 1.\]; expected 4 finite numbers"),
+        ({"intrinsics_mean": np.full(4, np.nan)}, "expected 4 finite numbers"),
+        ({"intrinsics_sigma": np.nan}, "`intrinsics_sigma` is nan; it must be positive"),
         ({"fixed_intrinsics": 1}, "`fixed_intrinsics` is 1; expected True, False, or 4 of them"),
         ({"fixed_intrinsics": [True, False]}, "expected True, False, or 4 of them"),
         ({"kernel": "huber"}, "`kernel` is 'huber'; expected a kernel object"),
@@ -187,3 +195,21 @@ def test_lists_and_poses_are_taken_as_they_come() -> None:
     problem, same, _ = UNCHECKED(seen, *start, intrinsics_sigma=5.0)
     assert bool(jnp.all(problem.points.target == expected.points.target))
     assert bool(jnp.all(same.poses.wxyz_xyz == state.poses.wxyz_xyz))
+
+
+def test_a_problem_in_which_nothing_is_observed_is_refused() -> None:
+    # Proves that all weights zero are named by `pack` and by `solve` of arrays, that a prior on the camera alone or one
+    # that says nothing does not count, and that a traced solve stays where it starts. Oracle: the message; the start.
+    seen = SCENE.observations
+    zero = {name: 0 * getattr(seen, name) for name in ("point_weight", "line_weight", "depth_weight")}
+    for options in ({}, {"terms": [vg.no_prior(3)]}):
+        with pytest.raises(InputError, match="nothing is observed: all weights"):
+            bad(**zero).pack(**options)
+    problem, state, _ = SCENE.pack()
+    nothing = problem.with_terms(tuple(term.reweighted(jnp.zeros_like(term.weight)) for term in problem.terms))
+    with pytest.raises(InputError, match="nothing is observed: all weights"):
+        vg.solve(nothing, state)
+    solution = jax.jit(vg.solve)(nothing, state)
+    assert float(jnp.abs(solution.state.poses.wxyz_xyz - state.poses.wxyz_xyz).max()) == 0.0
+    fix = vg.BaselinePrior(first=[0], second=[1], length=jnp.ones(1), sigma=jnp.ones(1), weight=jnp.ones(1))
+    assert float(vg.energy(bad(**zero).pack(terms=[fix])[0], state)) > 0

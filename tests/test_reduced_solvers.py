@@ -27,7 +27,7 @@ from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.marginalisation import no_prior
 from vggtgeo.bundle.node_order import longest, narrow_order
-from vggtgeo.bundle.packing import PaddedSize
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.bundle.solver_choice import choose_reduced_solver

@@ -73,8 +73,10 @@ def test_every_adjustment_is_recorded_once(run: RecordedRun) -> None:
     records = run.recorder.records
     assert [record.frame for record in records] == [keyframe.frame for keyframe in run.slam.keyframes[1:]]
     for record in records:
-        assert 0 < record.points < 3.0
-        assert record.counts[0] > 50
+        assert 0 < record.rms["points"] < 3.0
+        assert record.counts["points"] > 50
+        assert record.units["points"] == "px"
+        assert set(record.rms) == set(record.counts) <= {"points", "lines", "depth", "relative_poses"}
         assert record.energy[1] <= record.energy[0]
         assert 1 <= record.iterations <= SETTINGS.window.window_iterations
 

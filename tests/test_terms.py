@@ -24,7 +24,7 @@ from vggtgeo.solvers.kernels import Barron, Cauchy, Square
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import (
-    camera_of,
+    cameras_of,
     edge_data,
     hosts_of,
     motions_of,
@@ -52,11 +52,11 @@ Pairs = list[tuple[Any, Any]]
 def by_hand_and_derived(problem: vg.Problem, state: vg.State, correction: jax.Array) -> dict[str, Pairs]:
     """What the hand-written methods give on every edge, beside the derived ones called on the same edge and data."""
     ready = prepared(problem)
-    camera, hosts = camera_of(ready, state), hosts_of(ready, state)
+    cameras, hosts = cameras_of(ready, state), hosts_of(ready, state)
 
-    def one(host: jax.Array, motion: Any, data: Any) -> dict[str, Pairs]:
+    def one(ends: tuple[jax.Array, jax.Array], motion: Any, data: Any) -> dict[str, Pairs]:
         found = {}
-        for term, seen in of_edge(ready, view_of(camera, hosts, host, motion), data):
+        for term, seen in of_edge(ready, view_of(cameras, hosts, ends, motion), data):
             found[term.name] = [
                 (term.energy(seen), EdgeTerm.energy(term, seen)),
                 (term.columns(seen, None), EdgeTerm.columns(term, seen, None)),
@@ -66,7 +66,7 @@ def by_hand_and_derived(problem: vg.Problem, state: vg.State, correction: jax.Ar
             ]
         return found
 
-    return jax.vmap(one)(ready.edges.source, motions_of(relative_poses(ready, state)), edge_data(ready))
+    return jax.vmap(one)(ready.edges.ends, motions_of(relative_poses(ready, state)), edge_data(ready))
 
 
 def used(model: Any) -> tuple[jax.Array, jax.Array]:
@@ -74,13 +74,18 @@ def used(model: Any) -> tuple[jax.Array, jax.Array]:
     return model.gram.at[-1, -1].set(0.0), model.coupled
 
 
-@pytest.mark.parametrize("shape", [1.0, -2.0])  # one kind of kernel, so that it is compiled once
-def test_what_is_written_by_hand_is_what_is_derived(shape: float) -> None:
+@pytest.mark.parametrize(  # one kind of kernel, so that it is compiled once
+    ("shape", "camera"), [(1.0, vg.Pinhole), (-2.0, vg.Pinhole), (1.0, vg.SquarePinhole)]
+)
+def test_what_is_written_by_hand_is_what_is_derived(shape: float, camera: type[vg.AbstractCamera]) -> None:
     # Proves energy, columns (with and without a correction), gradient and exact model of points and lines, outliers,
-    # absent matches and a landmark behind its target included. Oracle: automatic differentiation of the residual.
-    problem, state, _ = SCENE.pack(kernel=Barron(1.5, shape), size=vg.PaddedSize(3, 8, 5, 3))
+    # absent matches and a landmark behind its target included, with two focal lengths and with one. Oracle: automatic
+    # differentiation of the residual.
+    scene = replace(SCENE, start_intrinsics=SCENE.start_intrinsics[-len(camera.names) :])
+    problem, state, _ = scene.pack(kernel=Barron(1.5, shape), size=vg.PaddedSize(3, 8, 5, 3), camera=camera)
     state = eqx.tree_at(lambda s: s.inverse_depth, state, state.inverse_depth.at[0, 0].set(60.0))
-    behind = oracle.seen_from(problem, state)[:, 0, 2] < oracle.LEAST_DEPTH
+    four = eqx.tree_at(lambda s: s.intrinsics, state, jnp.asarray(SCENE.start_intrinsics))
+    behind = oracle.seen_from(problem, four)[:, 0, 2] < oracle.LEAST_DEPTH
     assert bool(jnp.any(behind & (problem.edges.source == 0) & (problem.points.weight[:, 0] > 0)))
     found = by_hand_and_derived(problem, state, jnp.asarray(0.7))
     assert set(found) == {"points", "lines"}

@@ -18,7 +18,7 @@ from vggtgeo.solvers.segments import expand, restrict
 from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import energy
-from vggtgeo.bundle.packing import PaddedSize
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.geometry.line_segments import fractions, segment_slots, straightened

@@ -15,7 +15,9 @@ from vggtgeo.solvers.arrow import ArrowVector
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.kernels import Huber
 
+import vggtgeo as vg
 from vggtgeo.bundle.analysis.covariances import Covariances, covariances
+from vggtgeo.bundle.analysis.redundancy import changing
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.linearise import scale_direction
 from vggtgeo.bundle.objective import energy
@@ -185,3 +187,44 @@ def test_errors_have_the_covariance_claimed(delta: float, low: float) -> None:
     assert all(one.inside for one in nees), "; ".join(map(str, nees))
     assert means["inverse depths"] == pytest.approx(1.0, abs=0.1)
     assert low < means["variance factor"] < 1.03
+
+
+class Aspect(vg.CameraTerm):
+    """A term of the camera that the package does not know."""
+
+    def residual(self, parameters):
+        return parameters[0] / parameters[1] - 1
+
+
+class Centre(vg.PoseTerm):
+    """A known camera centre."""
+
+    def residual(self, pose, camera):
+        return pose.inverse().translation()
+
+
+class Sight(vg.PoseTerm):
+    """A landmark at a known place, seen by the camera."""
+
+    def residual(self, pose, camera):
+        return camera.project(pose @ jnp.array([0.1, 0.2, 3.0]))
+
+
+def test_what_speaks_of_held_unknowns_alone_is_no_redundancy() -> None:
+    # Proves that rows which never change are left out by what they depend on, whatever their class. Oracle: what is
+    # held.
+    problem, state = packed(WELL, fixed_intrinsics=np.array([True, True, False, False]))
+    one = jnp.ones(3)
+    every = [0, 1, 2]
+    kept = lambda term, problem: changing(problem, term, state).weight.tolist()
+    assert kept(Aspect(weight=jnp.ones(1)), problem) == [0.0]
+    free = eqx.tree_at(lambda p: p.fixed_intrinsics, problem, problem.fixed_intrinsics.at[1].set(False))
+    assert kept(Aspect(weight=jnp.ones(1)), free) == [1.0]
+    assert kept(problem.intrinsics_prior.reweighted(jnp.ones(4)), problem) == [0.0, 0.0, 1.0, 1.0]
+    assert kept(Centre(keyframe=every, weight=one), problem) == [0.0, 1.0, 1.0]
+    assert kept(Sight(keyframe=every, weight=one), problem) == [1.0, 1.0, 1.0]  # the principal point is free
+    held = eqx.tree_at(lambda p: p.fixed_intrinsics, problem, jnp.ones(4, bool))
+    assert kept(Sight(keyframe=every, weight=one), held) == [0.0, 1.0, 1.0]
+    both = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[1].set(True))
+    pair = vg.BaselinePrior(first=[0, 0], second=[1, 2], length=one[:2], sigma=one[:2], weight=one[:2])
+    assert kept(pair, both) == [0.0, 1.0]

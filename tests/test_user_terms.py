@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -47,17 +49,16 @@ class LogCosh(vg.AbstractKernel):
     """A kernel of one's own: only `rho` is needed."""
 
     def rho(self, s):
-        root = jnp.sqrt(s + 1e-9)
-        return 2 * (jnp.logaddexp(root, -root) - jnp.log(2.0))
+        log_cosh = lambda s: jnp.logaddexp((s + 1e-9) ** 0.5, -((s + 1e-9) ** 0.5))
+        return 2 * (log_cosh(s) - log_cosh(0.0))
 
 
 SCENE = make_scene(3, 6, 1, 2, noise=0.5, depth_error=0.05, seed=6)
 SOLVER = vg.SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
 
 
-def with_own_terms() -> tuple[vg.Problem, vg.State, vg.State]:
-    """A problem with one term of each kind above; its start and the truth."""
-    problem, initial, index = SCENE.pack()
+def own_terms() -> list[vg.AbstractTerm | vg.FlatTerm]:
+    """One term of each kind above, exact at the truth."""
     _, truth, _ = SCENE.at_truth()
     centres = truth.poses.inverse().translation()
     rotation, translation = truth.poses.rotation().as_matrix(), truth.poses.translation()
@@ -71,15 +72,18 @@ def with_own_terms() -> tuple[vg.Problem, vg.State, vg.State]:
     world = np.einsum("nba,nb->na", np.asarray(rotation)[host], own - np.asarray(translation)[host])
     there = np.einsum("nab,nb->na", np.asarray(rotation)[target], world) + np.asarray(translation)[target]
     normal = np.tile([0.6, 0.0, 0.8], (len(edge), 1))
-    place = lambda values: index.along_edges(edge, landmark, values)
-    fix = PositionFix(keyframe=[1, 2], position=centres[1:], weight=jnp.full(2, 1e6), kernel=LogCosh())
-    wheels = StepOfWheels(first=[0], second=[1], measured=step[None], weight=jnp.full(1, 1e5))
-    planes = PointToPlane(
-        normal=place(normal), distance=place((there * normal).sum(1)), weight=place(np.full(len(edge), 1e4))
-    )
-    for term in (fix, wheels, planes):
-        problem = problem.with_term(term)
-    return problem, initial, truth
+    planes = {"normal": normal, "distance": (there * normal).sum(1), "weight": np.full(len(edge), 1e4)}
+    return [
+        PositionFix(keyframe=[1, 2], position=centres[1:], weight=jnp.full(2, 1e6), kernel=LogCosh()),
+        StepOfWheels(first=[0], second=[1], measured=step[None], weight=jnp.full(1, 1e5)),
+        vg.FlatTerm(PointToPlane, planes, landmark, edge),
+    ]
+
+
+def with_own_terms(**options: Any) -> tuple[vg.Problem, vg.State, vg.State]:
+    """A problem with the terms above; its start and the truth."""
+    problem, initial, _ = SCENE.pack(terms=own_terms(), **options)
+    return problem, initial, SCENE.at_truth(**options)[1]
 
 
 @pytest.fixture(scope="module")

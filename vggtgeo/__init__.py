@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from vggtgeo.bundle.marginalisation import reorder as reorder
     from vggtgeo.bundle.objective import energy as energy
     from vggtgeo.bundle.objective import energy_terms as energy_terms
-    from vggtgeo.bundle.packing import Observations as Observations
-    from vggtgeo.bundle.packing import PaddedSize as PaddedSize
+    from vggtgeo.bundle.observations import FlatTerm as FlatTerm
+    from vggtgeo.bundle.observations import Observations as Observations
     from vggtgeo.bundle.packing import pack as pack
+    from vggtgeo.bundle.padding import PaddedSize as PaddedSize
     from vggtgeo.bundle.problem import Problem as Problem
     from vggtgeo.bundle.problem import State as State
     from vggtgeo.bundle.problem_file import load_problem as load_problem
+    from vggtgeo.bundle.problem_file import save_problem as save_problem
     from vggtgeo.bundle.residuals import ResidualSizes as ResidualSizes
     from vggtgeo.bundle.residuals import residual_sizes as residual_sizes
     from vggtgeo.bundle.residuals import residuals_at as residuals_at
@@ -64,6 +66,7 @@ if TYPE_CHECKING:
     from vggtgeo.geometry.cameras import KannalaBrandt as KannalaBrandt
     from vggtgeo.geometry.cameras import Pinhole as Pinhole
     from vggtgeo.geometry.cameras import RadialTangential as RadialTangential
+    from vggtgeo.geometry.cameras import SquarePinhole as SquarePinhole
     from vggtgeo.geometry.trajectory import Trajectory as Trajectory
     from vggtgeo.io.errors import InputError as InputError
     from vggtgeo.paper_bench.runner import BenchReport as BenchReport
@@ -124,14 +127,16 @@ _HOME = {
     "bundle.terms.slot": ("SlotTerm",),
     "bundle.terms.term": ("AbstractTerm", "shared_field"),
     "bundle.terms.view": ("View",),
-    "geometry.cameras": ("AbstractCamera", "KannalaBrandt", "Pinhole", "RadialTangential"),
+    "geometry.cameras": ("AbstractCamera", "KannalaBrandt", "Pinhole", "RadialTangential", "SquarePinhole"),
     "bundle.marginalisation": ("marginalise", "no_prior", "reorder"),
     "bundle.analysis.observability": ("observability",),
     "bundle.analysis.observability_report": ("Observability",),
-    "bundle.packing": ("Observations", "PaddedSize", "pack"),
+    "bundle.observations": ("FlatTerm", "Observations"),
+    "bundle.packing": ("pack",),
+    "bundle.padding": ("PaddedSize",),
     "paper_bench.runner": ("BenchReport", "bench"),
     "bundle.problem": ("Problem", "State"),
-    "bundle.problem_file": ("load_problem",),
+    "bundle.problem_file": ("load_problem", "save_problem"),
     "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),
     "results": ("Result", "evaluate", "read"),
     "results.reconstruction": ("reconstruct",),

@@ -11,25 +11,32 @@ import numpy as np
 import optimistix as optx
 from jax.sharding import PartitionSpec
 
-from vggtgeo.bundle.packing import Observations, PaddedSize, SlotIndex, pack
+from vggtgeo.bundle.observations import FlatTerm, Observations
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-Window = tuple[Observations, np.ndarray, np.ndarray, np.ndarray]
-"""`(observations, poses [n, 7], intrinsics [4], inverse_depth [D])`, the first arguments of `pack`."""
+Window = (
+    tuple[Observations, np.ndarray, np.ndarray, np.ndarray]
+    | tuple[Observations, np.ndarray, np.ndarray, np.ndarray, Sequence[GivenTerm]]
+)
+"""`(observations, poses [n, 7], intrinsics, inverse_depth [D])`, the first arguments of `pack`; and further terms."""
 
 
 def pack_batch(
-    windows: Sequence[Window], *, size: PaddedSize | None = None, **options: Any
+    windows: Sequence[Window], *, size: PaddedSize | None = None, terms: Sequence[GivenTerm] = (), **options: Any
 ) -> tuple[Problem, State, list[SlotIndex]]:
     """Pack windows of different content to one shape and stack them: every array gets a leading batch axis.
 
     Args:
-        windows: the first four arguments of `pack` for each window; they may differ in keyframes, landmarks and edges.
+        windows: the first four arguments of `pack` for each window, and, as a fifth, its own terms; windows may differ
+            in keyframes, landmarks, edges, and in which terms they have and how many observations of them.
         size: padded shape; None takes the smallest that fits all.
-        options: the keyword arguments of `pack`, the same for all windows.
+        terms: what all windows share.
+        options: the other keyword arguments of `pack`, the same for all windows.
 
     Raises:
         InputError: no window, or what `pack` finds wrong with one; the message names it.
@@ -44,15 +51,32 @@ def pack_batch(
     """
     if not windows:
         raise InputError("`windows` is empty; give at least one")
-    size = size or PaddedSize.largest([PaddedSize.of(observations, len(poses)) for observations, poses, *_ in windows])
+    given = _same_terms([(*terms, *(term for own in window[4:] for term in own)) for window in windows])
+    if size is None:
+        sizes = [PaddedSize.of(window[0], len(window[1]), own) for window, own in zip(windows, given, strict=True)]
+        size = PaddedSize.largest(sizes)
     packed = []
-    for number, window in enumerate(windows):
+    for number, (window, own) in enumerate(zip(windows, given, strict=True)):
         try:
-            packed.append(pack(*window, size=size, **options))
+            packed.append(pack(*window[:4], size=size, terms=own, **options))
         except InputError as error:
             raise InputError(f"`windows[{number}]`: {error}") from error
     problems, states, indices = zip(*packed, strict=True)
     return stack(problems), stack(states), list(indices)
+
+
+def _same_terms(windows: Sequence[Sequence[GivenTerm]]) -> list[list[GivenTerm]]:
+    """For each window the same kinds of terms in the same order; one that it lacks has no observation there."""
+    kinds = {term.name: term for terms in reversed(windows) for term in terms}
+    own = [{term.name: term for term in terms} for terms in windows]
+    for number, (found, terms) in enumerate(zip(own, windows, strict=True)):
+        if len(found) < len(terms):
+            raise InputError(f"`windows[{number}]`: two of its terms have one name: {[term.name for term in terms]}")
+    return [[terms.get(name, _nothing_of(kind)) for name, kind in kinds.items()] for terms in own]
+
+
+def _nothing_of(term: GivenTerm) -> GivenTerm:
+    return term.emptied() if isinstance(term, FlatTerm) else term.reweighted(jnp.zeros_like(term.weight))
 
 
 def stack(trees: Sequence[Any]) -> Any:

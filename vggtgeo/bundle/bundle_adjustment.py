@@ -49,7 +49,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         poses = self.problem.num_camera - self.problem.num_parameters
         return State(
             poses=lie.move(point.poses, step.dense[:poses].reshape(-1, lie.TANGENT)),
-            intrinsics=point.intrinsics + step.dense[poses:],
+            intrinsics=point.intrinsics + step.dense[poses:].reshape(point.intrinsics.shape),
             inverse_depth=self._bounded(point.inverse_depth, moved) if self.problem.positive_depth else moved,
         )
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.objective import camera_of, edge_data, hosts_of, motions_of, of_edge, relative_poses, view_of
+from vggtgeo.bundle.objective import cameras_of, edge_data, hosts_of, motions_of, of_edge, relative_poses, view_of
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, times_depth_column
 from vggtgeo.bundle.terms.node import PairTerm, node_models
@@ -37,13 +37,14 @@ def linearise(
     camera parameters and inverse depths). With a `correction` the reweighted one is corrected for that part of the
     kernels' curvature, see `terms/term.py`.
     """
-    relative, camera, hosts = relative_poses(problem, state), camera_of(problem, state), hosts_of(problem, state)
+    relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
     ranks, size = problem.edges.of_host.shape[1], lie.TANGENT + problem.num_parameters
     wide = lie.TANGENT * ranks
 
     def body(cross: Array, edge: Any) -> tuple[Array, Array]:
-        host, rank, motion, data = edge
-        seen = of_edge(problem, view_of(camera, hosts, host, motion), data)
+        ends, rank, motion, data = edge
+        host = ends[0]
+        seen = of_edge(problem, view_of(cameras, hosts, ends, motion), data)
         gram, coupled = (_exact if exact else _reweighted)(seen, correction, state.inverse_depth.shape[1])
         zero = jnp.zeros_like(host)
         cross = jax.lax.dynamic_update_slice(cross, coupled[None, : lie.TANGENT], (host, lie.TANGENT * rank, zero))
@@ -53,7 +54,7 @@ def linearise(
 
     cross = _slot_terms(problem, state, wide, correction, exact)
     if problem.edge_terms:
-        edges = (problem.edges.source, problem.edges.rank, motions_of(relative), edge_data(problem))
+        edges = (problem.edges.ends, problem.edges.rank, motions_of(relative), edge_data(problem))
         cross, gram = jax.lax.scan(body, cross, edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
@@ -82,7 +83,7 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     What implicit differentiation differentiates once more: one order of automatic differentiation instead of two. The
     part by the relative pose of an edge goes to its two poses through `eta = x_j - Ad(M) x_i`.
     """
-    relative, camera, hosts = relative_poses(problem, state), camera_of(problem, state), hosts_of(problem, state)
+    relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
     landmarks = jnp.zeros_like(state.inverse_depth)
     for term in problem.slot_terms:
         landmarks += term.gradient(state.inverse_depth)
@@ -93,15 +94,15 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     if not problem.edge_terms:
         return ArrowVector(dense, landmarks)
 
-    def edge(host: Array, motion: Any, data: Any) -> tuple[Array, Array]:
+    def edge(ends: tuple[Array, Array], motion: Any, data: Any) -> tuple[Array, Array]:
         local, slots = jnp.zeros(lie.TANGENT + problem.num_parameters, landmarks.dtype), jnp.zeros_like(landmarks[0])
-        for term, seen in of_edge(problem, view_of(camera, hosts, host, motion), data):
+        for term, seen in of_edge(problem, view_of(cameras, hosts, ends, motion), data):
             by_shared, by_depth = term.gradient(seen)
             local += by_shared
             slots = slots.at[term.first_slot : term.first_slot + len(by_depth)].add(by_depth)
         return local, slots
 
-    local, by_depth = jax.vmap(edge)(problem.edges.source, motions_of(relative), edge_data(problem))
+    local, by_depth = jax.vmap(edge)(problem.edges.ends, motions_of(relative), edge_data(problem))
     eta = local[:, : lie.TANGENT]
     nodes = jnp.zeros((problem.num_keyframes, lie.TANGENT), local.dtype).at[problem.edges.target].add(eta)
     nodes = nodes.at[problem.edges.source].add(-jnp.einsum("eba,eb->ea", lie.adjoint(relative), eta))
@@ -111,7 +112,7 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
 
 def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
     """Which of the dense coordinates move, `bool[c]`."""
-    return jnp.concatenate([jnp.repeat(~problem.fixed_pose, lie.TANGENT), ~problem.fixed_intrinsics])
+    return jnp.concatenate([jnp.repeat(~problem.fixed_pose, lie.TANGENT), ~problem.fixed_intrinsics.reshape(-1)])
 
 
 def scale_direction(problem: Problem, state: State) -> Float[Array, "c 1"]:
@@ -202,9 +203,9 @@ def _node_factors(
 ) -> NodeFactors | None:
     """All terms on poses and pairs as blocks over `(first, second, camera)`."""
     found = []
-    camera, block, tail = camera_of(problem, state), lie.TANGENT, problem.num_parameters
+    cameras, block, tail = cameras_of(problem, state), lie.TANGENT, problem.num_parameters
     for term in problem.node_terms:
-        hessian, gradient = node_models(term, state.poses.wxyz_xyz, camera, correction, exact)
+        hessian, gradient = node_models(term, state.poses.wxyz_xyz, cameras, correction, exact)
         touched = term.touched()
         if isinstance(term, PairTerm):
             hessian = jnp.pad(hessian, ((0, 0), (0, tail), (0, tail)))
@@ -242,12 +243,12 @@ def _dense_terms(
     hessian = jnp.zeros((tail, tail), state.inverse_depth.dtype)
     gradient = jnp.zeros(problem.num_camera, state.inverse_depth.dtype)
     for term in problem.camera_terms:
-        own, force = term.model(state.intrinsics, correction, exact)
+        own, force = term.model(state.parameters, correction, exact)
         hessian, gradient = hessian + own, gradient.at[-tail:].add(force)
     if not problem.dense_terms:
         return hessian, gradient
     hessian = jnp.pad(hessian, (problem.num_camera - tail, 0))
     for dense in problem.dense_terms:
-        own, force = dense.model(state.poses, state.intrinsics, correction, exact)
+        own, force = dense.model(state.poses, state.parameters, correction, exact)
         hessian, gradient = hessian + own, gradient + force
     return hessian, gradient

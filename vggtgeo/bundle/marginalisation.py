@@ -35,7 +35,7 @@ _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
 def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: int = 4) -> MarginalPrior:
-    """A prior that says nothing, of the shape of one for `keyframes` keyframes and a camera of `parameters`.
+    """A prior that says nothing, of the shape of one for `keyframes` keyframes and cameras of so many `parameters`.
 
     Example:
         >>> import vggtgeo as vg
@@ -76,11 +76,11 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> Marg
     quadratic, gradient = _quadratic(problem, point, leaving)
     leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
     leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
-    held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics])
+    held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics.reshape(-1)])
     quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
     root, offset = square_root(quadratic, gradient)
     return MarginalPrior(
-        root=root, offset=offset, poses=point.poses, intrinsics=point.intrinsics, weight=jnp.ones_like(offset, shape=())
+        root=root, offset=offset, poses=point.poses, intrinsics=point.parameters, weight=jnp.ones_like(offset, shape=())
     )
 
 
@@ -114,7 +114,7 @@ def _linearisation_point(prior: MarginalPrior, state: State) -> State:
     intrinsics_known = weight[-tail:] > 0
     return State(
         jaxlie.SE3(jnp.where(pose_known[:, None], prior.poses.wxyz_xyz, state.poses.wxyz_xyz)),
-        jnp.where(intrinsics_known, prior.intrinsics, state.intrinsics),
+        jnp.where(intrinsics_known, prior.intrinsics, state.parameters).reshape(state.intrinsics.shape),
         state.inverse_depth,
     )
 

@@ -14,11 +14,11 @@ from jaxtyping import Array, Float
 
 from vggtgeo.bundle.fast import pinhole
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, uses_projection
+from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
 from vggtgeo.bundle.terms.node import node_residuals
 from vggtgeo.bundle.terms.term import robust_energy
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import AbstractCamera
+from vggtgeo.geometry.cameras import Cameras
 
 EdgeData = tuple[dict[str, Any], ...]
 """Data and weights of each edge term, of one edge or with a leading axis of edges."""
@@ -59,35 +59,35 @@ def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
     if not problem.edge_terms:
         return total
 
-    camera, hosts = camera_of(problem, state), hosts_of(problem, state)
+    cameras, hosts = cameras_of(problem, state), hosts_of(problem, state)
 
     def body(sum_: Array, edge: Any) -> tuple[Array, None]:
-        host, motion, data = edge
-        view = view_of(camera, hosts, host, motion)
+        ends, motion, data = edge
+        view = view_of(cameras, hosts, ends, motion)
         return sum_ + sum(term.energy(seen) for term, seen in of_edge(problem, view, data)), None
 
-    edges = (problem.edges.source, motions_of(relative_poses(problem, state)), edge_data(problem))
+    edges = (problem.edges.ends, motions_of(relative_poses(problem, state)), edge_data(problem))
     total, _ = jax.lax.scan(body, total, edges)
     return total
 
 
 def _without_edges(problem: Problem, state: State) -> Float[Array, ""]:
-    camera, poses = camera_of(problem, state), state.poses.wxyz_xyz
+    cameras, poses = cameras_of(problem, state), state.poses.wxyz_xyz
     total = jnp.zeros((), state.inverse_depth.dtype)
     for slot in problem.slot_terms:
         total += robust_energy(slot.kernel, slot.weights, slot.residuals(state.inverse_depth))
     for node in problem.node_terms:
-        total += robust_energy(node.kernel, node.weights, node_residuals(node, poses, camera))
+        total += robust_energy(node.kernel, node.weights, node_residuals(node, poses, cameras))
     for own in problem.camera_terms:
-        total += robust_energy(own.kernel, own.weights, own.residuals(state.intrinsics))
+        total += robust_energy(own.kernel, own.weights, own.residuals(state.parameters))
     for dense in problem.dense_terms:
-        total += robust_energy(dense.kernel, dense.weights, dense.residual(state.poses, state.intrinsics))
+        total += robust_energy(dense.kernel, dense.weights, dense.residual(state.poses, state.parameters))
     return total
 
 
-def camera_of(problem: Problem, state: State) -> AbstractCamera:
-    """The camera with its estimated parameters."""
-    return problem.camera(state.intrinsics)
+def cameras_of(problem: Problem, state: State) -> Cameras:
+    """The cameras with their estimated parameters."""
+    return Cameras(state.intrinsics, problem.camera, problem.camera_of)
 
 
 def relative_poses(problem: Problem, state: State) -> jaxlie.SE3:
@@ -115,8 +115,9 @@ class Motions(NamedTuple):
 def hosts_of(problem: Problem, state: State) -> Hosts:
     """The slots of all hosts; with viewing rays where the hand-written derivatives know the camera."""
     pixels, rays = jnp.swapaxes(problem.pixels, 1, 2), None
-    if uses_projection(problem.camera):
-        fx, fy, cx, cy = state.intrinsics
+    known = pinhole_parameters(cameras_of(problem, state))
+    if known is not None:
+        fx, fy, cx, cy = known
         rays = ((problem.pixels[..., 0] - cx) / fx, (problem.pixels[..., 1] - cy) / fy)
     return Hosts(pixels, rays, state.inverse_depth)
 
@@ -126,14 +127,15 @@ def motions_of(relative: jaxlie.SE3) -> Motions:
     return Motions(relative, relative.rotation().as_matrix(), relative.translation())
 
 
-def view_of(camera: AbstractCamera, hosts: Hosts, host: Array, motion: Motions) -> EdgeView:
-    """All slots of keyframe `host`, along an edge with that relative pose."""
-    own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, host, keepdims=False), hosts)
+def view_of(cameras: Cameras, hosts: Hosts, ends: tuple[Array, Array], motion: Motions) -> EdgeView:
+    """All slots of keyframe i, along the edge `ends = (i, j)` with that relative pose."""
+    own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, ends[0], keepdims=False), hosts)
     fast, projection = None, None
-    if own.rays is not None:
-        fast = pinhole.OneEdge(camera.parameters, motion.rotation, motion.translation)
+    known = pinhole_parameters(cameras)
+    if own.rays is not None and known is not None:
+        fast = pinhole.OneEdge(known, motion.rotation, motion.translation)
         projection = pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, fast)
-    return EdgeView(motion.relative, camera, own.pixels, own.inverse_depth, fast, projection)
+    return EdgeView(motion.relative, cameras, ends, own.pixels, own.inverse_depth, fast, projection)
 
 
 def edge_data(problem: Problem) -> EdgeData:

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 import jaxlie
 import numpy as np
 
+from vggtgeo.geometry.cameras import AbstractCamera
 from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.kernels import AbstractKernel
 
 if TYPE_CHECKING:
-    from vggtgeo.bundle.packing import Observations, PaddedSize
+    from vggtgeo.bundle.observations import Observations
+    from vggtgeo.bundle.padding import PaddedSize
 
 UNIT = 1e-3
 """How far a quaternion's length and a line's normal may be from 1: what single precision and text files leave."""
@@ -51,12 +53,12 @@ def check_kernel(kernel: Any) -> None:
         raise InputError(f"`kernel` has the width {width}; it must be positive")
 
 
-def check_fixed(name: str, given: Any, count: int) -> np.ndarray:
-    """`bool [count]` from one bool or so many."""
+def check_fixed(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Bools of a shape from one, from those of its last axis, or from so many."""
     found = np.asarray(given)
-    if found.dtype != bool or found.shape not in ((), (count,)):
-        raise InputError(f"`{name}` is {given!r:.60}; expected True, False, or {count} of them")
-    return np.broadcast_to(found, count)
+    if found.dtype != bool or found.shape not in ((), shape[-1:], shape):
+        raise InputError(f"`{name}` is {given!r:.60}; expected True, False, or {' x '.join(map(str, shape))} of them")
+    return np.broadcast_to(found, shape)
 
 
 def check_values(observations: Observations) -> None:
@@ -64,7 +66,7 @@ def check_values(observations: Observations) -> None:
     for name in ("point_weight", "line_weight", "depth_weight"):
         weight = getattr(observations, name)
         if weight is not None:
-            _refuse(name, weight, ~(np.isfinite(weight) & (np.asarray(weight) >= 0)), "finite and not negative")
+            check_weight(name, weight)
     if not (np.isfinite(observations.alpha) and observations.alpha >= 0):
         raise InputError(f"`alpha` is {observations.alpha}; it must be finite and not negative")
     used = lambda weight: np.asarray(weight) > 0
@@ -82,6 +84,12 @@ def check_values(observations: Observations) -> None:
         mean = np.asarray(observations.depth_mean, float)
         there = np.ones(len(mean), bool) if observations.depth_weight is None else used(observations.depth_weight)
         _refuse("depth_mean", mean, there & ~(np.isfinite(mean) & (mean > 0)), "positive and finite")
+
+
+def check_weight(name: str, weight: Any) -> None:
+    """Finite and not negative."""
+    given = np.atleast_1d(weight)
+    _refuse(name, given, ~(np.isfinite(given) & (given >= 0)), "finite and not negative")
 
 
 def check_edges(edges: np.ndarray) -> None:
@@ -118,29 +126,36 @@ def check_indices(observations: Observations, keyframes: int) -> None:
     ]
     for name, given, limit, what in limits:
         values = np.asarray(given)
+        if values.size and not np.issubdtype(values.dtype, np.integer):
+            raise InputError(f"`{name}` holds {values.dtype}; expected whole numbers")
         if values.size and (values.min() < 0 or values.max() >= limit):
             raise InputError(
                 f"`{name}` goes from {values.min()} to {values.max()}; there are {limit} {what}: use 0 to {limit - 1}"
             )
     for kind in ("point", "line"):
         edge, landmark = getattr(observations, f"{kind}_edge"), getattr(observations, f"{kind}_landmark")
-        wrong = observations.edges[edge, 0] != observations.host[landmark]
-        if np.any(wrong):
-            first = int(np.nonzero(wrong)[0][0])
-            raise InputError(
-                f"`{kind}_edge[{first}]` starts at keyframe {observations.edges[edge[first], 0]}, but its landmark is "
-                f"hosted in keyframe {observations.host[landmark[first]]}: an edge observes landmarks of its own host"
-            )
-        _, first_seen = np.unique(edge * landmarks + landmark, return_index=True)
-        if len(first_seen) < len(edge):
-            twice = np.delete(np.arange(len(edge)), first_seen)[0]
-            raise InputError(
-                f"`{kind}_edge` and `{kind}_landmark` name landmark {landmark[twice]} on edge {edge[twice]} more than "
-                "once; a landmark has one match an edge"
-            )
+        check_matches((f"{kind}_edge", f"{kind}_landmark"), edge, landmark, observations)
 
 
-def check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.ndarray) -> None:
+def check_matches(names: tuple[str, str], edge: np.ndarray, landmark: np.ndarray, observations: Observations) -> None:
+    """Landmarks hosted where their edges start, each seen once along an edge."""
+    wrong = observations.edges[edge, 0] != observations.host[landmark]
+    if np.any(wrong):
+        first = int(np.nonzero(wrong)[0][0])
+        raise InputError(
+            f"`{names[0]}[{first}]` starts at keyframe {observations.edges[edge[first], 0]}, but its landmark is "
+            f"hosted in keyframe {observations.host[landmark[first]]}: an edge observes landmarks of its own host"
+        )
+    _, first_seen = np.unique(edge * len(observations.host) + landmark, return_index=True)
+    if len(first_seen) < len(edge):
+        twice = np.delete(np.arange(len(edge)), first_seen)[0]
+        raise InputError(
+            f"`{names[0]}` and `{names[1]}` name landmark {landmark[twice]} on edge {edge[twice]} more than "
+            "once; a landmark has one match an edge"
+        )
+
+
+def check_shapes(observations: Observations, poses: np.ndarray) -> None:
     """Arrays of the lengths that belong together."""
     edges, landmarks = len(observations.edges), len(observations.host)
     points, lines = len(observations.point_edge), len(observations.line_edge)
@@ -157,20 +172,51 @@ def check_shapes(observations: Observations, poses: np.ndarray, intrinsics: np.n
     optional = ("depth_mean", "depth_sigma", "depth_weight", "segment")
     given = {name: getattr(observations, name) for name in (*expected, *optional)}
     expected |= {name: (landmarks,) for name in optional if given[name] is not None}
-    given |= {"poses": poses, "intrinsics": intrinsics}
-    for name, shape in {**expected, "poses": (len(poses), 7), "intrinsics": (4,)}.items():
+    given["poses"] = poses
+    for name, shape in {**expected, "poses": (len(poses), 7)}.items():
         if np.shape(given[name]) != shape:
             raise InputError(f"`{name}` has shape {np.shape(given[name])}; expected {shape}")
 
 
-def check_camera(poses: np.ndarray, intrinsics: np.ndarray, sigma: np.ndarray | float | None) -> None:
-    """Focal lengths, their standard deviations and unit quaternions."""
-    if np.any(np.asarray(intrinsics)[:2] <= 0):
-        raise InputError(f"`intrinsics` is {np.asarray(intrinsics)}; both focal lengths must be positive")
-    if sigma is not None and not np.all(np.asarray(sigma) > 0):
+def check_intrinsics(camera: Any, intrinsics: np.ndarray, camera_of: np.ndarray | None, keyframes: int) -> None:
+    """As many parameters as the model has, positive focal lengths, a camera for each keyframe."""
+    if not (isinstance(camera, type) and issubclass(camera, AbstractCamera)):
+        raise InputError(f"`camera` is {camera!r:.60}; expected a camera's class, as `vggtgeo.RadialTangential`")
+    names, cameras = ", ".join(camera.names), "" if camera_of is None else "g, "
+    if intrinsics.ndim != 1 + (camera_of is not None) or intrinsics.shape[-1] != len(camera.names):
+        raise InputError(
+            f"`intrinsics` has shape {intrinsics.shape}; expected ({cameras}{len(camera.names)}): {names} of a "
+            f"{camera.__name__}{', a row a camera' if cameras else ''}"
+        )
+    focal = [name in ("f", "fx", "fy") for name in camera.names]
+    if not np.all(np.isfinite(intrinsics)) or np.any(intrinsics[..., focal] <= 0):
+        raise InputError(f"`intrinsics` is {intrinsics}; all must be finite, and focal lengths must be positive")
+    if camera_of is not None:
+        if camera_of.shape != (keyframes,) or not np.issubdtype(camera_of.dtype, np.integer):
+            raise InputError(f"`camera_of` is {camera_of!r:.60}; expected {keyframes} whole numbers, one a keyframe")
+        if camera_of.size and (camera_of.min() < 0 or camera_of.max() >= len(intrinsics)):
+            raise InputError(
+                f"`camera_of` goes from {camera_of.min()} to {camera_of.max()}; `intrinsics` has {len(intrinsics)} rows"
+            )
+
+
+def check_intrinsics_prior(mean: np.ndarray, sigma: Any, shape: tuple[int, ...]) -> None:
+    """A mean for each parameter; one standard deviation, or one each."""
+    if mean.shape != shape or not np.all(np.isfinite(mean)):
+        raise InputError(f"`intrinsics_mean` is {mean}; expected {' x '.join(map(str, shape))} finite numbers")
+    if sigma is None:
+        return
+    if not np.all(np.asarray(sigma) > 0):
         raise InputError(f"`intrinsics_sigma` is {sigma}; it must be positive (None = no prior)")
+    if np.shape(sigma) not in ((), shape[-1:], shape):
+        raise InputError(f"`intrinsics_sigma` has shape {np.shape(sigma)}; expected one number, or {shape}")
+
+
+def check_poses(poses: np.ndarray) -> None:
+    """Finite, with quaternions of unit length."""
+    _refuse("poses", poses, ~np.isfinite(poses).all(1), "finite")
     lengths = np.linalg.norm(poses[:, :4], axis=1)
-    wrong = np.nonzero(np.abs(lengths - 1) > 1e-3)[0]
+    wrong = np.nonzero(~(np.abs(lengths - 1) <= UNIT))[0]
     if len(wrong):
         raise InputError(f"`poses[{wrong[0]}]` has a quaternion of length {lengths[wrong[0]]:.3g}; expected 1")
 

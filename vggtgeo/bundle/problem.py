@@ -1,7 +1,7 @@
 """The bundle-adjustment problem: a state, a graph, and a sum of terms. All shapes are static, absence is weight 0.
 
 Sizes: `n` keyframes, `s` inverse depths ("slots") a keyframe, `e` directed edges `(i, j)`: slots of keyframe i observed
-in keyframe j, `q` parameters of the camera that all keyframes share.
+in keyframe j, `q` parameters of the camera that all keyframes share, or of all `g` cameras, `k` each.
 """
 
 from __future__ import annotations
@@ -37,22 +37,28 @@ class State(eqx.Module):
 
     poses: jaxlie.SE3
     """World -> camera of each keyframe, batch `[n]`."""
-    intrinsics: Float[Array, " q"]
-    """Parameters of the camera: `fx, fy, cx, cy` in pixels, then those of its distortion."""
+    intrinsics: Float[Array, "*g k"]
+    """Parameters of the camera, `fx, fy, cx, cy` in pixels, then those of its distortion: `[k]`, or `[g, k]` of `g`
+    cameras."""
     inverse_depth: Float[Array, "n s"]
     """1/m, along the optical axis of the host keyframe, one a slot."""
+
+    @property
+    def parameters(self) -> Float[Array, " q"]:
+        """The intrinsics of all cameras, one camera after the other."""
+        return self.intrinsics.reshape(-1)
 
     def moved(self, step: Float[Array, " t"]) -> State:
         """The state that a step leads to, in the coordinates of every Hessian and covariance of this package.
 
-        step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), the camera's parameters (pixels), then the
+        step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), the cameras' parameters (pixels), then the
         inverse depths (1/m), keyframe by keyframe. Pure; the derivative at a zero step is the tangent map.
         """
         poses = lie.TANGENT * len(self.inverse_depth)
-        dense = poses + len(self.intrinsics)
+        dense = poses + self.intrinsics.size
         return State(
             lie.move(self.poses, step[:poses].reshape(-1, lie.TANGENT)),
-            self.intrinsics + step[poses:dense],
+            self.intrinsics + step[poses:dense].reshape(self.intrinsics.shape),
             self.inverse_depth + step[dense:].reshape(self.inverse_depth.shape),
         )
 
@@ -68,6 +74,11 @@ class Edges(eqx.Module):
     """Position of the edge among the edges of its host, from 0."""
     of_host: Int[Array, "n k"]
     """Index of the edge of each rank of each host, or `e` where a host has fewer than `k`: the inverse of `rank`."""
+
+    @property
+    def ends(self) -> tuple[Int[Array, " e"], Int[Array, " e"]]:
+        """Keyframes `(i, j)` of each edge."""
+        return self.source, self.target
 
 
 class Problem(eqx.Module):
@@ -96,13 +107,15 @@ class Problem(eqx.Module):
     """What is minimised: the sum of their energies."""
     fixed_pose: Bool[Array, " n"]
     """Keyframes whose pose is held (the gauge)."""
-    fixed_intrinsics: Bool[Array, " q"]
-    """Parameters of the camera that are held."""
+    fixed_intrinsics: Bool[Array, "*g k"]
+    """Parameters of the cameras that are held."""
     fraction: Float[Array, "n g m"] | None = None
     """Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a segment is an
     affine function of this position along it (0 and 1 at its ends). None: each sample has its own inverse depth."""
+    camera_of: Int[Array, " n"] | None = None
+    """Which camera took each keyframe, a row of the state's intrinsics; None: one took all."""
     camera: type[AbstractCamera] = eqx.field(static=True, default=Pinhole)
-    """Model of the camera whose parameters the state holds."""
+    """Model of the cameras whose parameters the state holds."""
     positive_depth: bool = eqx.field(static=True, default=True)
     """Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver without bounds."""
 
@@ -160,12 +173,20 @@ class Problem(eqx.Module):
 
     @property
     def num_parameters(self) -> int:
-        """Parameters of the camera."""
-        return self.fixed_intrinsics.shape[0]
+        """Parameters of all cameras."""
+        return self.fixed_intrinsics.size
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Of the parameters, in the order of the dense state: `fx`, or `fx of camera 1` of several."""
+        if self.camera_of is None:
+            return self.camera.names
+        groups = self.num_parameters // len(self.camera.names)
+        return tuple(f"{name} of camera {group}" for group in range(groups) for name in self.camera.names)
 
     @property
     def num_camera(self) -> int:
-        """Size of the dense part of the state: six a keyframe, and the camera's parameters."""
+        """Size of the dense part of the state: six a keyframe, and the cameras' parameters."""
         return lie.TANGENT * self.num_keyframes + self.num_parameters
 
     @property

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from vggtgeo.bundle.packing import Observations, SlotIndex, pack
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.saved_modules import check_problem, describe, restore
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.solvers.kernels import Huber
+
+DESCRIPTION = "description"
+"""Array of a saved problem that says, in JSON, which class each part is and where its arrays are."""
+VERSION = 1
 
 LAYOUT: dict[str, tuple[str | int, ...]] = {
     "edges": ("E", 2),
@@ -29,13 +38,20 @@ LAYOUT: dict[str, tuple[str | int, ...]] = {
 """Arrays of a problem and their shapes; the first array with a letter decides its size."""
 
 
-def load_problem(path: Path, dtype: DTypeLike | None = None) -> tuple[Problem, State, SlotIndex]:
-    """Read a problem: poses world -> camera `(qw, qx, qy, qz, tx, ty, tz)`, pixels, inverse depths in 1/m.
+def load_problem(
+    path: Path, dtype: DTypeLike | None = None, *, terms: Sequence[type] = ()
+) -> tuple[Problem, State, SlotIndex]:
+    """Read a problem: flat lists as other programs write them, or what `save_problem` wrote.
 
-    dtype: float type of all arrays, as `vggtgeo.pack` takes it.
+    Args:
+        path: `.npz`; docs/problem-file.md has both layouts.
+        dtype: float type of all arrays, as `vggtgeo.pack` takes it.
+        terms: classes of your own that a saved problem holds: terms, kernels, a camera. A file only names them; no code
+            in it is run.
 
     Raises:
-        InputError: the file is missing, is no `.npz`, lacks an array or holds one that does not fit.
+        InputError: the file is missing, is no `.npz`, lacks an array, holds one that does not fit, or names a class
+            that is neither the package's nor given.
 
     Example:
         >>> import vggtgeo as vg
@@ -47,6 +63,9 @@ def load_problem(path: Path, dtype: DTypeLike | None = None) -> tuple[Problem, S
 
     """
     arrays = _read(Path(path))
+    if DESCRIPTION in arrays:
+        return _restored(Path(path), arrays, terms, dtype)
+    _check_flat(Path(path), arrays)
     observations = Observations(
         edges=arrays["edges"].astype(int),
         host=arrays["var_kf"].astype(int),
@@ -78,6 +97,25 @@ def load_problem(path: Path, dtype: DTypeLike | None = None) -> tuple[Problem, S
     )
 
 
+def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -> None:
+    """Write a problem with all its terms, kernels and its camera, a state and where the landmarks went, as `.npz`.
+
+    `load_problem` gives the same leaves back, bit by bit. The file is written atomically and holds no pickles.
+
+    Raises:
+        InputError: a term holds something that is no array, number or text.
+
+    """
+    arrays: dict[str, np.ndarray] = {}
+    parts = {"problem": problem, "state": state}
+    description = {name: describe(part, name, arrays) for name, part in parts.items()}
+    whole = {"version": VERSION, "index": list(index.shape), **description}
+    for name in ("host", "slot", "edge"):
+        arrays[f"index/{name}"] = getattr(index, name)
+    with atomic_open(path, "wb") as file:
+        np.savez_compressed(file, **{DESCRIPTION: np.array(json.dumps(whole))}, **arrays)
+
+
 def save_solution(path: Path, state: State, index: SlotIndex) -> None:
     """Write a solution as `.npz`, atomically: `T [N, 7]`, `k [4]`, `d [D]` in the conventions of the problem's file."""
     with atomic_open(path, "wb") as file:
@@ -97,14 +135,32 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             arrays = {name: file[name] for name in file.files}
     except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(f"`{path}` cannot be read as .npz: {error}") from error
-    missing = [name for name in LAYOUT if name not in arrays]
-    if missing:
-        raise InputError(f"`{path}` lacks the arrays {', '.join(missing)}; the layout is in docs/problem-file.md")
-    _check_shapes(path, arrays)
     return arrays
 
 
-def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def _restored(
+    path: Path, arrays: dict[str, np.ndarray], terms: Sequence[type], dtype: DTypeLike | None
+) -> tuple[Problem, State, SlotIndex]:
+    try:
+        whole = json.loads(str(arrays[DESCRIPTION]))
+        if whole["version"] != VERSION:
+            raise InputError(f"it has the version {whole['version']}; this program reads {VERSION}")
+        problem, state = (restore(whole[name], arrays, terms, dtype) for name in ("problem", "state"))
+        host, slot, edge = (arrays[f"index/{name}"] for name in ("host", "slot", "edge"))
+        keyframes, edges, slots = map(int, whole["index"])
+        index = SlotIndex(host, slot, edge, (keyframes, edges, slots))
+        check_problem(problem, state, index)
+    except InputError as error:
+        raise InputError(f"`{path}` cannot be read as a problem: {error}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(f"`{path}` is no problem that `save_problem` wrote, or was changed since: {error}") from error
+    return problem, state, index
+
+
+def _check_flat(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    missing = [name for name in LAYOUT if name not in arrays]
+    if missing:
+        raise InputError(f"`{path}` lacks the arrays {', '.join(missing)}; the layout is in docs/problem-file.md")
     sizes: dict[str | int, int] = {}
     for name, layout in LAYOUT.items():
         found = arrays[name]

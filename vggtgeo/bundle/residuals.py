@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.bundle.objective import (
     EdgeData,
     Motions,
-    camera_of,
+    cameras_of,
     edge_data,
     hosts_of,
     motions_of,
@@ -108,26 +108,26 @@ def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."
 
 def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[Array, "m *observations"]:
     """Residuals of one term of a prepared problem, the residual's own axis first."""
-    camera = camera_of(problem, state)
+    cameras = cameras_of(problem, state)
     if isinstance(term, SlotTerm):
         return term.residuals(state.inverse_depth)
     if isinstance(term, PoseTerm | PairTerm):
-        return node_residuals(term, state.poses.wxyz_xyz, camera)
+        return node_residuals(term, state.poses.wxyz_xyz, cameras)
     if isinstance(term, CameraTerm):
-        return term.residuals(state.intrinsics)
+        return term.residuals(state.parameters)
     if isinstance(term, DenseTerm):
-        return term.residual(state.poses, state.intrinsics)
+        return term.residual(state.poses, state.parameters)
     alone, hosts = problem.with_terms((term,)), hosts_of(problem, state)
     if not alone.edge_terms:
         return jnp.zeros((1, *term.weight.shape), state.inverse_depth.dtype)
 
-    def edge(host: Array, motion: Motions, data: EdgeData) -> Array:
-        ((one, view),) = of_edge(alone, view_of(camera, hosts, host, motion), data)
+    def edge(ends: tuple[Array, Array], motion: Motions, data: EdgeData) -> Array:
+        ((one, view),) = of_edge(alone, view_of(cameras, hosts, ends, motion), data)
         assert isinstance(one, EdgeTerm)
         return one.residuals(view)
 
     each = jax.vmap(edge, out_axes=1)
-    return each(problem.edges.source, motions_of(relative_poses(problem, state)), edge_data(alone))
+    return each(problem.edges.ends, motions_of(relative_poses(problem, state)), edge_data(alone))
 
 
 def count_rows(problem: Problem, term: AbstractTerm, state: State) -> Int[Array, ""]:

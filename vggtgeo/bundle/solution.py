@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.linearise import MIN_INVERSE_DEPTH
+from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.adjoint import ArrowAdjoint
@@ -117,6 +118,10 @@ def solve(
         graduation: wider kernels to go through first, for a redescending kernel and a start that outliers dominate;
             `history` and `iterations` are those of the last kernel, the one of `problem`.
 
+    Raises:
+        InputError: nothing is observed (outside `jit`, where weights can be looked at; inside, such a problem converges
+            where it starts).
+
     Example:
         >>> import jax, vggtgeo as vg
         >>> problem, initial, index = vg.simulate_window().pack()
@@ -125,6 +130,7 @@ def solve(
         (True, True)
 
     """
+    check_observed(problem)
     solver = SchurLevenbergMarquardt() if solver is None else solver
     adjoint = ArrowAdjoint() if adjoint is None else adjoint
     initial = BundleAdjustment(problem).straightened(initial)

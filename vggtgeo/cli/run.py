@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vggtgeo.cli import run_options as options
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption

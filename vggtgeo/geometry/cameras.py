@@ -14,7 +14,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 MIN_RELATIVE_DEPTH = 1e-2
 """Lower bound of `z` in `project`, in units of the point's depth in its own camera: a point nearer than this to the
@@ -26,7 +26,7 @@ _NEWTON_STEPS = 8
 
 
 class AbstractCamera(eqx.Module):
-    """A camera model: `fx, fy, cx, cy` first, then what the model adds.
+    """A camera model: focal lengths and principal point first, then what the model adds.
 
     Example:
         >>> vg.KannalaBrandt.names[:4]
@@ -65,6 +65,25 @@ class Pinhole(AbstractCamera):
 
     def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
         return _ray((pixel - self.parameters[2:]) / self.parameters[:2])
+
+
+class SquarePinhole(AbstractCamera):
+    """The pinhole with square pixels: one focal length, exactly `fx = fy = f`.
+
+    Example:
+        >>> import jax.numpy as jnp, vggtgeo as vg
+        >>> vg.SquarePinhole(jnp.array([500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.2, 1.0])).tolist()
+        [370.0, 340.0]
+
+    """
+
+    names = ("f", "cx", "cy")
+
+    def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
+        return self.parameters[0] * _flat(point) + self.parameters[1:]
+
+    def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+        return _ray((pixel - self.parameters[1:]) / self.parameters[0])
 
 
 class RadialTangential(AbstractCamera):
@@ -140,6 +159,38 @@ class KannalaBrandt(AbstractCamera):
         k1, k2, k3, k4 = self.parameters[4:]
         t2 = angle * angle
         return 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+
+
+class Cameras(eqx.Module):
+    """The cameras of all keyframes: one for all, or one for each group of keyframes (a rig of several cameras).
+
+    Example: keyframes 0 and 2 were taken by the first of two cameras.
+        >>> import jax.numpy as jnp
+        >>> from vggtgeo.geometry.cameras import Cameras, SquarePinhole
+        >>> both = jnp.array([[500.0, 320.0, 240.0], [300.0, 160.0, 120.0]])
+        >>> float(Cameras(both, SquarePinhole, jnp.array([0, 1, 0])).of(1).parameters[0])
+        300.0
+
+    """
+
+    parameters: Float[Array, "*g k"]
+    """`[k]` of the one camera, or `[g, k]` of each."""
+    kind: type[AbstractCamera] = eqx.field(static=True)
+    group: Int[Array, " n"] | None = None
+    """Which camera took each keyframe; None where there is one."""
+
+    @property
+    def size(self) -> int:
+        """Number of parameters, of all cameras together."""
+        return self.parameters.size
+
+    def of(self, keyframe: Int[Array, ""] | int) -> AbstractCamera:
+        """The camera that took a keyframe."""
+        return self.kind(self.parameters if self.group is None else self.parameters[self.group[keyframe]])
+
+    def moved(self, step: Float[Array, " q"]) -> Cameras:
+        """After a step of all parameters, camera after camera."""
+        return Cameras(self.parameters + step.reshape(self.parameters.shape), self.kind, self.group)
 
 
 def _flat(point: Float[Array, "3"]) -> Float[Array, "2"]:

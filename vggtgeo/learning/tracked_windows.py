@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vggtgeo.bundle.packing import Observations
+from vggtgeo.bundle.observations import Observations
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import StructureTensor
 from vggtgeo.simulation import SimulatedOracle, SyntheticSequence

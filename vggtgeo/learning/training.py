@@ -16,7 +16,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.packing import PaddedSize, pack
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.learning.network import LEAST, ConfidenceNetwork

@@ -29,6 +29,8 @@ COLOURS = {
     "#e3e3e3": "var(--grid)",
 }
 """Colours of the drawings, and the variables of the page that stand in for them."""
+_TERMS = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8e5fb0", "#b0413e")
+"""Of the terms of a window, in their order, then from the first again."""
 _WIDTH = 4.6
 """Inches: read at about its own size, on a desk as on a phone."""
 
@@ -39,30 +41,24 @@ def trajectory_svg(estimate: Trajectory, truth: Trajectory | None, keyframes: Tr
 
 
 def residuals_svg(records: Sequence[WindowRecord]) -> str:
-    """RMS residual of points and lines (pixels), and of depth (standard deviations), over the frames' times."""
+    """RMS residual of each term over the frames' times, the terms of one unit together."""
     figure = Figure(figsize=(_WIDTH, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
-    pixels, sigmas = figure.subplots(2, 1, sharex=True)
+    units = {name: unit for record in records for name, unit in record.units.items()}
+    kinds = list(dict.fromkeys(units.values())) or ["px"]
+    rows = dict(zip(kinds, figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0], strict=True))
     time = np.array([record.timestamp for record in records]) - records[0].timestamp
-    rows = (
-        (pixels, "points", "#1f5fbf"),
-        (pixels, "lines", "#e07b1a"),
-        (sigmas, "depth", "#3a8f5c"),
-    )
-    for axes, name, colour in rows:
-        values = np.array([getattr(record, name) for record in records])
-        if np.isfinite(values).any():
-            axes.plot(time, values, color=colour, lw=1.4, marker=".", ms=3, label=name)
-    pixels.set_ylabel("pixels")
-    sigmas.set_ylabel("sigma")
-    sigmas.set_xlabel("seconds of the sequence")
-    for axes in (pixels, sigmas):
+    for number, (name, unit) in enumerate(units.items()):
+        values = np.array([record.rms.get(name, np.nan) for record in records])
+        colour = _TERMS[number % len(_TERMS)]
+        rows[unit].plot(time, values, color=colour, lw=1.4, marker=".", ms=3, label=name)
+    for unit, axes in rows.items():
+        axes.set_ylabel("pixels" if unit == "px" else unit)
         axes.set_ylim(bottom=0)
         _calm(axes)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize=9, labelcolor="#333333", ncols=2)
-        else:
-            axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", color="#333333", fontsize=9)
+    rows[kinds[-1]].set_xlabel("seconds of the sequence")
     return _svg(figure)
 
 

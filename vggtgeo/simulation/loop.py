@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.bundle.packing import Observations
+from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment, quadratic
 from vggtgeo.simulation.small_window import SIZE, SimulatedWindow, project_between
 

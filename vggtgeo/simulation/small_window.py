@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.bundle.packing import Observations, SlotIndex, pack
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.io.errors import InputError
 

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior
-from vggtgeo.bundle.packing import Observations, PaddedSize, pack
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.geometry import rigid

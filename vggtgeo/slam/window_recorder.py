@@ -10,11 +10,11 @@ import numpy as np
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import residual_sizes
+from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 
-_SHOWN = ("points", "lines", "depth")
 _sizes_jit = eqx.filter_jit(residual_sizes)
 
 
@@ -22,16 +22,15 @@ _sizes_jit = eqx.filter_jit(residual_sizes)
 class WindowRecord:
     """What one adjustment of the window left: number and time of the frame, residuals, effort.
 
-    points, lines: RMS residual, pixels; depth: in standard deviations; NaN where the window has none. counts: of the
-    three kinds. iterations: tried steps. energy: `1/2 sum rho` before and after.
+    rms, counts: RMS residual and number of observations of each term on landmarks and poses, by its name, where it has
+    any; units: of the residuals (`px`, `sigma`). iterations: tried steps. energy: `1/2 sum rho` before and after.
     """
 
     frame: int
     timestamp: float
-    points: float
-    lines: float
-    depth: float
-    counts: tuple[int, ...]
+    rms: dict[str, float]
+    counts: dict[str, int]
+    units: dict[str, str]
     iterations: int
     energy: tuple[float, float]
 
@@ -52,16 +51,16 @@ class WindowRecorder(Callback):
         self._last = slam.solved
         adjustment, state = slam.solved
         sizes = _sizes_jit(adjustment.problem, state)
-        points, lines, depth = (float(sizes.rms.get(name, np.nan)) for name in _SHOWN)
+        shown = [term for term in adjustment.problem.terms if not isinstance(term, CameraTerm | DenseTerm)]
+        counts = {term.name: int(sizes.count[term.name]) for term in shown}
         energies = slam.energies if slam.energies is not None else np.full(2, np.nan)
         self.records.append(
             WindowRecord(
                 frame.index,
                 frame.timestamp,
-                points,
-                lines,
-                depth,
-                tuple(int(sizes.count.get(name, 0)) for name in _SHOWN),
+                {name: float(sizes.rms[name]) for name, count in counts.items() if count},
+                {name: count for name, count in counts.items() if count},
+                {term.name: term.unit for term in shown if counts[term.name]},
                 len(energies) - 1,
                 (float(energies[0]), float(energies[-1])),
             )

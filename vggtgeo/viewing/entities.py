@@ -167,11 +167,10 @@ def log_map(stream: Any, cloud: PointCloud) -> None:
 
 
 def log_residuals(stream: Any, record: WindowRecord) -> None:
-    """RMS residual of each kind after an adjustment."""
+    """RMS residual of each term after an adjustment."""
     import rerun as rr
 
-    for name in ("points", "lines", "depth"):
-        value = getattr(record, name)
+    for name, value in record.rms.items():
         if np.isfinite(value):
             stream.log(f"plots/residuals/{name}", rr.Scalars(value))
 

@@ -12,17 +12,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from vggtgeo.bundle.analysis.redundancy import changing
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
-from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
+from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
@@ -51,8 +52,8 @@ class Covariances(Readable):
 
     poses: Float[Array, "h 6 6"]
     """Of the left tangent `log(T T_true^-1)`, translation first: m^2, m rad, rad^2, in the camera's own frame."""
-    intrinsics: Float[Array, "4 4"]
-    """Of `fx, fy, cx, cy`: pixels^2."""
+    intrinsics: Float[Array, "q q"]
+    """Of the parameters of all cameras, `Problem.parameter_names`: pixels^2 (distortion: no unit)."""
     inverse_depth: Float[Array, "h s"]
     """Variances, 1/m^2; infinite for slots that hold nothing."""
     neighbours: Float[Array, "h k 6 6"]
@@ -60,6 +61,8 @@ class Covariances(Readable):
     variance_factor: Float[Array, ""]
     """Estimated variance of a residual of weight 1: `2 energy / (rows - unknowns)`, 1 without redundancy. About 1 if
     the weights are right; 4 to 7 % low under Huber with delta 1.5, which caps large residuals."""
+    parameters: tuple[str, ...] = eqx.field(static=True, default=Pinhole.names)
+    """Names of the rows of `intrinsics`."""
 
     def scaled(self) -> Covariances:
         """The covariances if only the ratios of the weights are trusted: times the variance factor."""
@@ -70,6 +73,7 @@ class Covariances(Readable):
             times(self.inverse_depth),
             times(self.neighbours),
             jnp.ones_like(self.variance_factor),
+            self.parameters,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -82,7 +86,7 @@ class Covariances(Readable):
         return {
             "translation_sigma_m": [plain(row[:3]) for row in poses],
             "rotation_sigma_rad": [plain(row[3:]) for row in poses],
-            "intrinsics_sigma_px": dict(zip(("fx", "fy", "cx", "cy"), plain(intrinsics), strict=True)),
+            "intrinsics_sigma_px": dict(zip(self.parameters, plain(intrinsics), strict=True)),
             "inverse_depths_determined": int(np.isfinite(np.asarray(self.inverse_depth)).sum()),
             "variance_factor": float(self.variance_factor),
         }
@@ -139,6 +143,7 @@ def covariances(
         inverse_depth=found.landmarks,
         neighbours=found.neighbours,
         variance_factor=_variance_factor(ready, state, found),
+        parameters=problem.parameter_names,
     )
 
 
@@ -158,15 +163,8 @@ def _check_size(solver: AbstractReducedSolver, keyframes: int, asked: int) -> No
 
 def _variance_factor(problem: Problem, state: State, found: ArrowCovariance) -> Float[Array, ""]:
     """`2 E / (m - u)`: `m` rows that may change, `u` unknowns that they determine."""
-    terms = tuple(_moving(term, problem) for term in problem.terms)
+    terms = tuple(changing(problem, term, state) for term in problem.terms)
     rows = jnp.asarray(sum(count_rows(problem, term, state) for term in terms))
     redundancy = rows - found.rank
     factor = 2 * prepared_energy(problem.with_terms(terms), state) / jnp.maximum(redundancy, 1)
     return jnp.where(redundancy > 0, factor, jnp.ones_like(factor))
-
-
-def _moving(term: AbstractTerm, problem: Problem) -> AbstractTerm:
-    """A term without what speaks of held parameters alone: such rows never change."""
-    if isinstance(term, IntrinsicsPrior):
-        return term.reweighted(jnp.where(problem.fixed_intrinsics[term.index], 0.0, term.weight))
-    return term

@@ -15,17 +15,23 @@ from jaxtyping import Array, Float
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie
+from vggtgeo.geometry.cameras import Pinhole
 
 MOTIONS = ("translation along x", "translation along y", "translation along z", "pitch", "yaw", "roll")
 """The names of a tangent's coordinates."""
-INTRINSICS = ("focal length", "aspect ratio", "principal point u", "principal point v")
+_INTRINSICS = {
+    **{"f": "focal length", "fx": "focal length", "fy": "aspect ratio"},
+    **{"cx": "principal point u", "cy": "principal point v"},
+}
+"""What moving a parameter of a camera is called, by the parameter's name; the others are its distortion."""
 
 
-def direction_names(keyframes: int, parameters: int = 4) -> tuple[str, ...]:
-    """Names of the rows of `named_directions`, for a camera of so many parameters: the global ones first."""
-    distortion = tuple(f"distortion {number}" for number in range(1, parameters - len(INTRINSICS) + 1))
+def direction_names(keyframes: int, parameters: tuple[str, ...] = Pinhole.names) -> tuple[str, ...]:
+    """Names of the rows of `named_directions`, for cameras with these parameters: the global ones first."""
+    words = [name.partition(" ") for name in parameters]
+    camera = tuple(f"{_INTRINSICS.get(name, f'distortion {name}')}{gap}{which}" for name, gap, which in words)
     each = tuple(f"keyframe {i}: {motion}" for i in range(keyframes) for motion in MOTIONS)
-    return ("scale", *MOTIONS, *INTRINSICS, *distortion, *each)
+    return ("scale", *MOTIONS, *camera, *each)
 
 
 def named_directions(problem: Problem, state: State) -> Float[Array, "m c"]:
@@ -36,12 +42,24 @@ def named_directions(problem: Problem, state: State) -> Float[Array, "m c"]:
     keyframes, tail = problem.num_keyframes, problem.num_parameters
     common = jnp.concatenate([_scale(problem, state)[None], _common(problem, state)])
     common = jnp.concatenate([common, jnp.zeros((len(common), tail), common.dtype)], 1)
-    fx, fy = state.intrinsics[0], state.intrinsics[1]
-    shared = jnp.eye(tail, dtype=common.dtype).at[0, :2].set(jnp.stack([fx, fy]))
-    shared = shared.at[1, :2].set(jnp.stack([fx, -fy]))
+    shared = _of_cameras(problem.parameter_names, state.parameters.astype(common.dtype))
     shared = jnp.concatenate([jnp.zeros((tail, lie.TANGENT * keyframes), common.dtype), shared], 1)
     single = jnp.eye(lie.TANGENT * keyframes, problem.num_camera, dtype=common.dtype)
     return jnp.concatenate([common, shared, single])
+
+
+def _of_cameras(names: tuple[str, ...], values: Float[Array, " q"]) -> Float[Array, "q q"]:
+    """Each parameter alone, except the focal lengths: both together, and one against the other."""
+    rows = jnp.eye(len(names), dtype=values.dtype)
+    for i, name in enumerate(names):
+        kind = name.partition(" ")[0]
+        if kind == "f":
+            rows = rows.at[i, i].set(values[i])
+        elif kind == "fx":
+            rows = rows.at[i, i : i + 2].set(values[i : i + 2])
+        elif kind == "fy":
+            rows = rows.at[i, i - 1 : i + 1].set(jnp.stack([values[i - 1], -values[i]]))
+    return rows
 
 
 def _anchor(problem: Problem, state: State) -> jaxlie.SE3:

@@ -88,6 +88,7 @@ def observability(problem: Problem, state: State) -> Observability:
         landmark_used=_used(problem),
         terms=tuple(term.name for term in problem.terms),
         keyframes=problem.num_keyframes,
+        parameters=problem.parameter_names,
     )
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.analysis.directions import direction_names
-from vggtgeo.geometry import lie
 from vggtgeo.solvers.local_inverse import rank_tolerance
 
 WEAK = 1e-6
@@ -65,10 +64,12 @@ class Observability(eqx.Module):
     terms: tuple[str, ...] = eqx.field(static=True)
     """Names of the terms, in the order of the rows of `alone` and `without`."""
     keyframes: int = eqx.field(static=True)
+    parameters: tuple[str, ...] = eqx.field(static=True)
+    """Names of the cameras' parameters."""
 
     def direction_names(self) -> tuple[str, ...]:
         """Names of the rows of `named`."""
-        return direction_names(self.keyframes, len(self.free) - lie.TANGENT * self.keyframes)
+        return direction_names(self.keyframes, self.parameters)
 
     def report(self) -> str:
         """The findings in words (outside `jit`, for one problem)."""

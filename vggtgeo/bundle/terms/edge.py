@@ -1,7 +1,7 @@
 """Terms on a landmark seen along an edge: what makes the arrow's cross terms.
 
-Local coordinates of one edge: the left tangent `eta` of the relative pose (6), the camera's parameters (q), and the
-inverse depth of each landmark. Slots come last in every array, so that each quantity is contiguous: columns are
+Local coordinates of one edge: the left tangent `eta` of the relative pose (6), the parameters of all cameras (q), and
+the inverse depth of each landmark. Slots come last in every array, so that each quantity is contiguous: columns are
 `[6 + q + 2, m p]`, in the order eta, camera, residual, inverse depth, for `m` residual rows after one another.
 """
 
@@ -14,14 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.fast import pinhole
 from vggtgeo.bundle.fast.pinhole import Projection
 from vggtgeo.bundle.terms.term import AbstractTerm, reweighted_rows, reweighting, robust_energy, squared_norm
 from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
+from vggtgeo.geometry.cameras import Cameras, Pinhole, SquarePinhole
 
 Rows = tuple[Float[Array, " p"], ...]
 """Entries of a residual, one array each: a stacked one keeps XLA from vectorising the loop around it."""
@@ -31,7 +31,9 @@ class EdgeView(eqx.Module):
     """All slots of one edge's host, as the edge sees them; `projection` only for the pinhole's fast path."""
 
     relative: jaxlie.SE3
-    camera: AbstractCamera
+    cameras: Cameras
+    ends: tuple[Int[Array, ""], Int[Array, ""]]
+    """Keyframes `(i, j)`."""
     pixels: Float[Array, "2 p"]
     inverse_depth: Float[Array, " p"]
     fast: pinhole.OneEdge | None
@@ -39,14 +41,24 @@ class EdgeView(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Coordinates that all slots of the edge share: relative pose and camera."""
-        return lie.TANGENT + len(self.camera.parameters)
+        """Coordinates that all slots of the edge share: relative pose and the parameters of all cameras."""
+        return lie.TANGENT + self.cameras.size
+
+    def tied(self, rows: list[Array]) -> list[Array]:
+        """Derivatives by relative pose and the pinhole's four parameters as those by the camera's own: with one focal
+        length, those by both are added.
+        """
+        if self.cameras.kind is Pinhole:
+            return rows
+        focal = lie.TANGENT
+        return [*rows[:focal], rows[focal] + rows[focal + 1], *rows[focal + 2 :]]
 
     def slots(self, first: int, count: int) -> EdgeView:
         """The same for some of the slots."""
         part = lambda leaf: leaf[..., first : first + count]
         projection = jax.tree.map(part, self.projection)
-        return EdgeView(self.relative, self.camera, part(self.pixels), part(self.inverse_depth), self.fast, projection)
+        own = part(self.pixels), part(self.inverse_depth)
+        return EdgeView(self.relative, self.cameras, self.ends, *own, self.fast, projection)
 
 
 class LocalModel(NamedTuple):
@@ -129,11 +141,11 @@ class EdgeTerm(AbstractTerm):
     def _moved(self, view: EdgeView, shared: Float[Array, " d"], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
         """Residuals after a step of the shared coordinates, at the given depths."""
         relative = lie.move(view.relative, shared[: lie.TANGENT])
-        parameters = view.camera.parameters + shared[lie.TANGENT :]
-        camera = eqx.tree_at(lambda camera: camera.parameters, view.camera, parameters)
+        cameras = view.cameras.moved(shared[lie.TANGENT :])
+        host, camera = (cameras.of(keyframe) for keyframe in view.ends)
 
         def one(data: dict, pixel: Array, inverse_depth: Array) -> Array:
-            return jnp.atleast_1d(self.holding(data).residual(View(relative, camera, pixel, inverse_depth)))
+            return jnp.atleast_1d(self.holding(data).residual(View(relative, camera, pixel, inverse_depth, host)))
 
         return jax.vmap(one, in_axes=-1, out_axes=-1)(self.data(), view.pixels, depth)
 
@@ -145,8 +157,8 @@ _WITH_ENTRIES = 3
 class ImageTerm(EdgeTerm):
     """A residual that is an affine function of the landmark's pixel in the target: a match, a line.
 
-    With the pinhole, its derivatives come from `fast/pinhole.py`, written by hand; with other cameras from automatic
-    differentiation. The tests hold the two equal.
+    With one pinhole for all keyframes, its derivatives come from `fast/pinhole.py`, written by hand; with other cameras
+    from automatic differentiation. The tests hold the two equal.
 
     Example: only the column of a match is known.
         >>> class Column(vg.ImageTerm):
@@ -189,14 +201,14 @@ class ImageTerm(EdgeTerm):
         for i, r in enumerate(residual):
             a, b = (scale.root * (of[i] - pulled * r) for of, pulled in zip(normal, along, strict=True))
             row = pinhole.row(view.fast, view.projection, a, b)
-            parts.append(jnp.stack([*row[:-1], scale.root * r / scale.soft, row[-1]]))
+            parts.append(jnp.stack([*view.tied(row[:-1]), scale.root * r / scale.soft, row[-1]]))
         return jnp.concatenate(parts, 1)
 
     def gradient(self, view: EdgeView) -> tuple[Float[Array, " d"], Float[Array, " p"]]:
         if view.fast is None or view.projection is None:
             return super().gradient(view)
         row = pinhole.row(view.fast, view.projection, *self._force(view, view.projection))
-        return jnp.stack([jnp.sum(column) for column in row[:-1]]), row[-1]
+        return jnp.stack([jnp.sum(column) for column in view.tied(row[:-1])]), row[-1]
 
     def model(self, view: EdgeView) -> LocalModel:
         if view.fast is None or view.projection is None:
@@ -212,7 +224,7 @@ class ImageTerm(EdgeTerm):
         added, mixed = pinhole.second_order(edge, at, (force[0], force[1]), third)
         # The residual times its derivative: `D / (w rho')`.
         along = [sum(r * row[k] for r, row in zip(residual, rows, strict=True)) for k in range(len(third))]
-        shared = range(view.size)
+        shared = range(len(third) - 1)
         # Half of what these rows make with the plain ones is `sum w rho' J'J + 2 w^2 rho'' (J'r)(J'r)' - P D'`.
         bent = [bend * along[k] - 2 * pull * third[k] for k in shared]
         left = [
@@ -231,11 +243,12 @@ class ImageTerm(EdgeTerm):
             for k, extra in enumerate(mixed)
         ]
         own = sum(d * r for d, r in zip(depth, residual, strict=True))
-        return LocalModel(gram, jnp.stack([*coupled[:-1], own, coupled[-1]]))
+        return _tied_model(view, LocalModel(gram, jnp.stack([*coupled[:-1], own, coupled[-1]])))
 
     def _image(self, view: EdgeView, at: Projection) -> tuple[Rows, tuple[Rows, Rows]]:
         """Residuals, and their derivatives by the projected pixel's coordinates, row by row."""
-        fx, fy, cx, cy = view.camera.parameters
+        assert view.fast is not None
+        fx, fy, cx, cy = view.fast.intrinsics
         pixel = (fx * at.x + cx, fy * at.y + cy)
 
         def each(u: Array, v: Array) -> Rows:
@@ -255,6 +268,14 @@ class ImageTerm(EdgeTerm):
         return pull * along[0], pull * along[1]
 
 
+def _tied_model(view: EdgeView, model: LocalModel) -> LocalModel:
+    """A model by the pinhole's four parameters as one by the camera's own."""
+    if view.cameras.kind is Pinhole:
+        return model
+    once = jnp.stack(view.tied(list(model.gram)))
+    return LocalModel(jnp.stack(view.tied(list(once.T))), jnp.stack(view.tied(list(model.coupled))))
+
+
 def times_depth_column(columns: Float[Array, "c mp"], slots: int) -> Float[Array, "c p"]:
     """Each column times the depth column, the rows of an observation added; gradient and curvature come last."""
     depth = columns[-1]
@@ -264,6 +285,9 @@ def times_depth_column(columns: Float[Array, "c mp"], slots: int) -> Float[Array
     return sum(parts[1:], parts[0])
 
 
-def uses_projection(camera: type[AbstractCamera]) -> bool:
-    """Whether the hand-written derivatives know this camera."""
-    return camera is Pinhole
+def pinhole_parameters(cameras: Cameras) -> Float[Array, "4"] | None:
+    """`fx, fy, cx, cy` where the hand-written derivatives know the camera: one pinhole that took all keyframes."""
+    if cameras.group is not None or cameras.kind not in (Pinhole, SquarePinhole):
+        return None
+    own = cameras.parameters
+    return own if cameras.kind is Pinhole else jnp.concatenate([own[:1], own])

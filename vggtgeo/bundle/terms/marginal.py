@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Self
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -10,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.bundle.terms.node import DenseTerm
 from vggtgeo.bundle.terms.term import local_model
 from vggtgeo.geometry import lie
+from vggtgeo.io.errors import InputError
 
 
 class MarginalPrior(DenseTerm):
@@ -38,6 +42,21 @@ class MarginalPrior(DenseTerm):
 
     def rows(self) -> Int[Array, ""]:
         return jnp.sum(jnp.any(self.root != 0, 1))
+
+    def padded(self, keyframes: int) -> Self:
+        known = len(self.poses.wxyz_xyz)
+        more = keyframes - known
+        if more < 0:
+            raise InputError(f"the term `{self.name}` is about {known} keyframes; this problem has {keyframes}")
+        if more == 0:
+            return self
+        new, split = lie.TANGENT * more, lie.TANGENT * known
+        root = jnp.insert(self.root, jnp.full(new, split), 0.0, axis=1)
+        nothing = jaxlie.SE3.identity((more,)).wxyz_xyz.astype(root.dtype)
+        poses = jaxlie.SE3(jnp.concatenate([self.poses.wxyz_xyz, nothing]))
+        return dataclasses.replace(
+            self, root=jnp.pad(root, ((0, new), (0, 0))), offset=jnp.pad(self.offset, (0, new)), poses=poses
+        )
 
     def model(
         self, poses: jaxlie.SE3, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool

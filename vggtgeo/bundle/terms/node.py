@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from typing import Self
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.terms.term import AbstractTerm, Local, local_model
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import AbstractCamera
+from vggtgeo.geometry.cameras import AbstractCamera, Cameras
 
 _Index = Int[Array, " m"]
 _indices: Callable[[object], Array] = lambda given: jnp.asarray(given, jnp.int32)
@@ -40,14 +41,15 @@ class PoseTerm(AbstractTerm):
 
     @abc.abstractmethod
     def residual(self, pose: jaxlie.SE3, camera: AbstractCamera) -> Float[Array, "*m"]:
-        """Of one observation; `pose` is world -> camera."""
+        """Of one observation; `pose` is world -> camera, `camera` the one that took the keyframe."""
 
-    def local(self, data: dict, poses: tuple[Array, ...], camera: AbstractCamera) -> Local:
-        """The residual of one observation as a function of `(xi, camera parameters)`."""
+    def local(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Local:
+        """The residual of one observation as a function of `(xi, parameters of all cameras)`."""
 
         def function(step: Array) -> Array:
-            pose = lie.move(jaxlie.SE3(poses[0]), step[: lie.TANGENT])
-            return jnp.atleast_1d(self.holding(data).residual(pose, _moved(camera, step[lie.TANGENT :])))
+            pose = lie.move(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
+            camera = cameras.moved(step[lie.TANGENT :]).of(touched[0])
+            return jnp.atleast_1d(self.holding(data).residual(pose, camera))
 
         return function
 
@@ -55,9 +57,9 @@ class PoseTerm(AbstractTerm):
         """Keyframes of each observation."""
         return (self.keyframe,)
 
-    def local_size(self, camera: AbstractCamera) -> int:
+    def local_size(self, cameras: Cameras) -> int:
         """Number of local coordinates."""
-        return lie.TANGENT + len(camera.parameters)
+        return lie.TANGENT + cameras.size
 
 
 class PairTerm(AbstractTerm):
@@ -85,12 +87,12 @@ class PairTerm(AbstractTerm):
     def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, "*m"]:
         """Of one observation; poses are world -> camera, so `second @ first.inverse()` maps camera i to camera j."""
 
-    def local(self, data: dict, poses: tuple[Array, ...], camera: AbstractCamera) -> Local:
+    def local(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Local:
         """The residual of one observation as a function of `(xi_i, xi_j)`."""
 
         def function(step: Array) -> Array:
-            first = lie.move(jaxlie.SE3(poses[0]), step[: lie.TANGENT])
-            second = lie.move(jaxlie.SE3(poses[1]), step[lie.TANGENT :])
+            first = lie.move(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
+            second = lie.move(jaxlie.SE3(poses[touched[1]]), step[lie.TANGENT :])
             return jnp.atleast_1d(self.holding(data).residual(first, second))
 
         return function
@@ -99,7 +101,7 @@ class PairTerm(AbstractTerm):
         """Keyframes of each observation."""
         return self.first, self.second
 
-    def local_size(self, camera: AbstractCamera) -> int:
+    def local_size(self, cameras: Cameras) -> int:
         """Number of local coordinates."""
         return 2 * lie.TANGENT
 
@@ -109,6 +111,8 @@ NodeTerm = PoseTerm | PairTerm
 
 class CameraTerm(AbstractTerm):
     """Observations of the camera's parameters: `weight` and data have the axis `[m]`.
+
+    Several cameras: their parameters one camera after the other, `q = g k` of them.
 
     Example: pixels are square.
         >>> class SquarePixels(vg.CameraTerm):
@@ -159,6 +163,10 @@ class DenseTerm(AbstractTerm):
     def rows(self) -> Int[Array, ""]:
         """Entries of the residual that say anything."""
 
+    @abc.abstractmethod
+    def padded(self, keyframes: int) -> Self:
+        """The same term in a problem of so many keyframes, of which it says nothing about the last ones."""
+
     def model(
         self, poses: jaxlie.SE3, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
     ) -> tuple[Float[Array, "c c"], Float[Array, " c"]]:
@@ -172,31 +180,36 @@ class DenseTerm(AbstractTerm):
         return local_model(self, self.weights, residual, split + len(parameters), correction, exact)
 
 
-def node_residuals(term: NodeTerm, poses: Float[Array, "n 7"], camera: AbstractCamera) -> Float[Array, "k m"]:
+def node_residuals(term: NodeTerm, poses: Float[Array, "n 7"], cameras: Cameras) -> Float[Array, "k m"]:
     """Residuals of all observations of a pose or pair term, the residual's own axis first."""
 
     def one(data: dict, touched: tuple[Array, ...]) -> Array:
-        size = term.local_size(camera)
-        return term.local(data, tuple(poses[i] for i in touched), camera)(jnp.zeros(size, poses.dtype))
+        return term.local(data, touched, poses, cameras)(jnp.zeros(term.local_size(cameras), poses.dtype))
 
     return jax.vmap(one, out_axes=-1)(term.data(), term.touched())
+
+
+def node_jacobians(term: NodeTerm, poses: Float[Array, "n 7"], cameras: Cameras) -> Float[Array, "m k d"]:
+    """Derivatives of all residuals of a pose or pair term by the local coordinates of each."""
+
+    def one(data: dict, touched: tuple[Array, ...]) -> Array:
+        zero = jnp.zeros(term.local_size(cameras), poses.dtype)
+        return jax.jacfwd(term.local(data, touched, poses, cameras))(zero)
+
+    return jax.vmap(one)(term.data(), term.touched())
 
 
 def node_models(
     term: NodeTerm,
     poses: Float[Array, "n 7"],
-    camera: AbstractCamera,
+    cameras: Cameras,
     correction: Float[Array, ""] | None,
     exact: bool,
 ) -> tuple[Float[Array, "m d d"], Float[Array, "m d"]]:
     """Hessian and gradient of each observation of a pose or pair term by its local coordinates."""
 
     def one(data: dict, weight: Array, touched: tuple[Array, ...]) -> tuple[Array, Array]:
-        residual = term.local(data, tuple(poses[i] for i in touched), camera)
-        return local_model(term, weight, residual, term.local_size(camera), correction, exact)
+        residual = term.local(data, touched, poses, cameras)
+        return local_model(term, weight, residual, term.local_size(cameras), correction, exact)
 
     return jax.vmap(one)(term.data(), term.weights, term.touched())
-
-
-def _moved(camera: AbstractCamera, step: Array) -> AbstractCamera:
-    return eqx.tree_at(lambda camera: camera.parameters, camera, camera.parameters + step)

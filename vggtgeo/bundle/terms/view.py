@@ -25,16 +25,18 @@ class View(eqx.Module):
     relative: jaxlie.SE3
     """`M = T_j T_i^-1`: host to target camera."""
     camera: AbstractCamera
-    """Shared by both."""
+    """That sees it: of keyframe j."""
     pixel: Float[Array, "2"]
     """In the host."""
     inverse_depth: Float[Array, ""]
     """1/m, in the host."""
+    host: AbstractCamera | None = None
+    """The camera of keyframe i where it is another one."""
 
     @property
     def ray(self) -> Float[Array, "3"]:
         """Viewing ray in the host, `z = 1`."""
-        return self.camera.unproject(self.pixel)
+        return (self.camera if self.host is None else self.host).unproject(self.pixel)
 
     @property
     def scaled_point(self) -> Float[Array, "3"]:

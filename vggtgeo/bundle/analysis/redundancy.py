@@ -1,0 +1,39 @@
+"""Which observations can change: what speaks of held poses and parameters alone is no redundancy of an adjustment.
+
+Decided by derivatives, not by classes: an observation whose derivative by all free coordinates is zero has no part in
+the optimum, whatever its term is called.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from vggtgeo.bundle.objective import cameras_of
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm, node_jacobians
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry import lie
+
+
+def changing(problem: Problem, term: AbstractTerm, state: State) -> AbstractTerm:
+    """A prepared term without the observations of what is held.
+
+    Landmarks always move, so terms on them stay as they are; a dense term couples everything.
+    """
+    free_camera = ~problem.fixed_intrinsics.reshape(-1)
+    free: Bool[Array, "m d"]
+    if isinstance(term, CameraTerm):
+        slopes = jnp.moveaxis(jax.jacfwd(term.residuals)(state.parameters), 1, 0)
+        free = jnp.broadcast_to(free_camera, (len(slopes), len(free_camera)))
+    elif isinstance(term, PoseTerm | PairTerm):
+        slopes = node_jacobians(term, state.poses.wxyz_xyz, cameras_of(problem, state))
+        parts = [jnp.repeat(~problem.fixed_pose[index][:, None], lie.TANGENT, 1) for index in term.touched()]
+        if isinstance(term, PoseTerm):
+            parts.append(jnp.broadcast_to(free_camera, (len(slopes), len(free_camera))))
+        free = jnp.concatenate(parts, 1)
+    else:
+        return term
+    moves = jnp.any((slopes != 0) & free[:, None, :], (1, 2))
+    return term.reweighted(jnp.where(moves, term.weight, 0.0))

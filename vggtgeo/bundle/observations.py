@@ -1,0 +1,126 @@
+"""What bundle adjustment sees, as flat numpy lists of unequal lengths: what `pack` turns into padded arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+
+from vggtgeo.bundle.terms.term import AbstractTerm
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What bundle adjustment sees, as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples.
+
+    Example:
+        >>> import numpy as np, vggtgeo as vg
+        >>> vg.Observations(
+        ...     edges=np.array([[0, 1]]),
+        ...     host=np.array([0, 0]),
+        ...     pixel=np.array([[10.0, 20.0], [30.0, 40.0]]),
+        ...     point_edge=np.array([0, 0]),
+        ...     point_landmark=np.array([0, 1]),
+        ...     point_target=np.array([[12.0, 20.0], [33.0, 40.0]]),
+        ...     point_weight=np.ones(2),
+        ... )
+        Observations(2 landmarks, 1 edge, 2 points, 0 line samples, no depth prior)
+
+    """
+
+    edges: np.ndarray
+    """int `[E, 2]`: (host keyframe, target keyframe)."""
+    host: np.ndarray
+    """int `[D]`: keyframe that hosts each landmark (one inverse depth each)."""
+    pixel: np.ndarray
+    """`[D, 2]`: its pixel in the host."""
+    point_edge: np.ndarray
+    """int `[A]`."""
+    point_landmark: np.ndarray
+    """int `[A]`."""
+    point_target: np.ndarray
+    """`[A, 2]` pixels."""
+    point_weight: np.ndarray
+    """`[A]`."""
+    line_edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    line_landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    line_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """`[B, 3]`: a, b, c with a^2 + b^2 = 1."""
+    line_weight: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    depth_mean: np.ndarray | None = None
+    """`[D]`: prior inverse depth, 1/m; None = no depth prior at all."""
+    depth_sigma: np.ndarray | None = None
+    """`[D]`: its standard deviation, 1/m."""
+    depth_weight: np.ndarray | None = None
+    """`[D]`: its confidence; 0 = none."""
+    alpha: float = 2.0
+    segment: np.ndarray | None = None
+    """int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples then lie on a
+    straight line (two unknowns a segment); None: each sample has its own."""
+
+    def __repr__(self) -> str:
+        rows = {"landmark": self.host, "edge": self.edges, "point": self.point_edge, "line sample": self.line_edge}
+        named = ", ".join(f"{len(given)} {name}{'s' * (len(given) != 1)}" for name, given in rows.items())
+        return f"Observations({named}, {'no ' * (self.depth_mean is None)}depth prior)"
+
+
+@dataclass(frozen=True)
+class FlatTerm:
+    """A term on landmarks before packing: one row an observation, in any order.
+
+    `pack(..., terms=[...])` puts each row where its landmark is, and pads.
+
+    Example: each landmark that keyframe 0 hosts lies on a plane that is known in keyframe 1.
+        >>> import numpy as np, vggtgeo as vg
+        >>> class PointToPlane(vg.EdgeTerm):
+        ...     normal: jax.Array
+        ...     distance: jax.Array
+        ...     def residual(self, view):
+        ...         return self.normal @ view.point - self.distance
+        >>> window = vg.simulate_window(keyframes=3, points=10, lines=1)
+        >>> fields = dict(normal=np.tile([0.0, 0.0, 1.0], (10, 1)), distance=np.full(10, 3.0))
+        >>> planes = vg.FlatTerm(PointToPlane, fields, landmark=np.arange(10), edge=np.zeros(10, int))
+        >>> window.pack(terms=[planes])[0].point_to_plane.normal.shape  # edges, slots, entries
+        (6, 14, 3)
+
+    """
+
+    kind: type[AbstractTerm]
+    """A class of terms on edges or on slots."""
+    fields: Mapping[str, Any]
+    """What its constructor takes: data of the observations `[k, ...]`, `weight [k]` (1 without one), `kernel`, and what
+    all observations share."""
+    landmark: np.ndarray
+    """int `[k]`, as `Observations.host` lists them."""
+    edge: np.ndarray | None = None
+    """int `[k]`, as `Observations.edges` lists them: where the landmark was seen (terms on edges only)."""
+
+    @property
+    def name(self) -> str:
+        return self.kind.name
+
+    @property
+    def weight(self) -> np.ndarray:
+        """`[k]`."""
+        return np.asarray(self.fields.get("weight", np.ones(len(self.landmark))))
+
+    def rows(self) -> dict[str, Any]:
+        """The fields that have one row an observation, `weight` among them."""
+        shared = {f.name for f in dataclasses.fields(self.kind) if f.metadata.get("shared")} | self.kind.structure
+        given = {name: value for name, value in self.fields.items() if name not in shared}
+        return {**jax.tree.map(np.asarray, given), "weight": self.weight}
+
+    def shared(self) -> dict[str, Any]:
+        """The fields that all observations share."""
+        rows = self.rows()
+        return {name: value for name, value in self.fields.items() if name not in rows}
+
+    def emptied(self) -> FlatTerm:
+        """The same term without an observation."""
+        none = jax.tree.map(lambda values: values[:0], self.rows())
+        edge = None if self.edge is None else np.zeros(0, int)
+        return FlatTerm(self.kind, {**self.shared(), **none}, np.zeros(0, int), edge)

@@ -1,0 +1,169 @@
+"""Static shapes: which slot a landmark takes, which row an edge, and how far each is padded.
+
+Slots of a host: landmarks of points first, then line samples (segment after segment where lines have two ends).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vggtgeo.bundle.observations import FlatTerm, Observations
+from vggtgeo.bundle.problem import Edges
+from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry.line_segments import segment_slots
+from vggtgeo.io.errors import InputError
+
+GivenTerm = AbstractTerm | FlatTerm
+"""A term as `pack` takes it."""
+
+
+@dataclass(frozen=True)
+class PaddedSize:
+    """Static shape of a problem: every problem packed to one size shares one compiled solver.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> size = vg.PaddedSize(keyframes=10, points=320, lines=192, ranks=9)
+        >>> small, _, _ = vg.simulate_window(3).pack(size=size)
+        >>> small.pixels.shape
+        (10, 512, 2)
+
+    """
+
+    keyframes: int
+    points: int
+    lines: int
+    ranks: int
+    """Largest number of edges of one host."""
+    edges: int | None = None
+    """Number of edges stored; None = `keyframes * ranks`, every host padded to `ranks` edges."""
+    samples: int | None = None
+    """Samples of a segment, where observations have a `segment`; `lines` is a multiple of it."""
+    terms: tuple[tuple[str, int], ...] = ()
+    """Names of terms on poses, pairs and the camera, and how many observations of each there is room for; one that is
+    not named here is not padded."""
+
+    @staticmethod
+    def of(observations: Observations, keyframes: int, terms: Sequence[GivenTerm] = ()) -> PaddedSize:
+        """The smallest that fits, every host padded to the same number of edges."""
+        slots = assign_slots(observations, keyframes)
+        _, _, ranks = sort_edges(observations.edges, keyframes)
+        counts = tuple((term.name, np.size(term.weight)) for term in terms if isinstance(term, COUNTED))
+        return PaddedSize(keyframes, slots.points, slots.lines, ranks, samples=slots.samples, terms=counts)
+
+    @staticmethod
+    def largest(sizes: Sequence[PaddedSize]) -> PaddedSize:
+        """The smallest that fits all of `sizes`, every host padded to the same number of edges."""
+        most = lambda name: max(getattr(size, name) for size in sizes)
+        counts: dict[str, int] = {}
+        for name, count in (named for size in sizes for named in size.terms):
+            counts[name] = max(count, counts.get(name, 0))
+        lines, samples = most("lines"), None
+        if sizes[0].samples is not None:
+            samples = most("samples")
+            lines = samples * max(size.lines // max(size.samples or 1, 1) for size in sizes)
+        shape = (most("keyframes"), most("points"), lines, most("ranks"))
+        return PaddedSize(*shape, samples=samples, terms=tuple(counts.items()))
+
+
+COUNTED = (PoseTerm, PairTerm, CameraTerm)
+"""Kinds of terms whose observations are one list."""
+
+
+@dataclass(frozen=True)
+class SlotIndex:
+    """Where each landmark went: `inverse_depth[host[i], slot[i]]`; and each edge: row `edge[e]`."""
+
+    host: np.ndarray
+    slot: np.ndarray
+    edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    shape: tuple[int, int, int] = (0, 0, 0)
+    """Keyframes, edges and slots of the problem."""
+
+    def __repr__(self) -> str:
+        return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
+
+    def gather(self, per_slot: np.ndarray | Array) -> np.ndarray:
+        """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`."""
+        return np.asarray(per_slot)[self.host, self.slot]
+
+    def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> np.ndarray:
+        """Values of the point matches, `[A, ...]`, as `observations` lists them, from an array `[e, p, ...]`."""
+        return np.asarray(per_match)[self.edge[observations.point_edge], self.slot[observations.point_landmark]]
+
+
+class Slots(NamedTuple):
+    """Slot of each landmark (lines after `points` of them), and the largest numbers of slots a host."""
+
+    where: SlotIndex
+    points: int
+    lines: int
+    samples: int | None
+
+
+def assign_slots(observations: Observations, keyframes: int, samples: int | None = None) -> Slots:
+    """Number the landmarks of each host: those with points first; segments take at least `samples` slots."""
+    is_line = np.zeros(len(observations.host), bool)
+    is_line[observations.line_landmark] = True
+    both = np.intersect1d(observations.point_landmark, np.nonzero(is_line)[0])
+    if len(both):
+        raise InputError(
+            f"`point_landmark` and `line_landmark` both name landmark {both[0]} (and {len(both) - 1} others): a "
+            "landmark is a point or a line sample; give the sample a landmark of its own"
+        )
+    host = np.asarray(observations.host)
+    slot = np.zeros(len(host), int)
+    slot[~is_line], points = _numbered(host[~is_line], keyframes)
+    if observations.segment is None:
+        within, lines = _numbered(host[is_line], keyframes)
+        slot[is_line] = points + within
+        return Slots(SlotIndex(host, slot), points, lines, None)
+    found = segment_slots(host[is_line], np.asarray(observations.segment)[is_line])
+    samples = max(samples or 0, found.samples, 1)
+    slot[is_line] = points + samples * found.rank + found.position
+    return Slots(SlotIndex(host, slot), points, samples * found.segments, samples)
+
+
+def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, int]:
+    """Position of each landmark among those of its host, and the largest count."""
+    order = np.argsort(host, kind="stable")
+    starts = np.searchsorted(host[order], np.arange(keyframes))
+    within = np.empty(len(host), int)
+    within[order] = np.arange(len(host)) - starts[host[order]]
+    return within, int(np.bincount(host, minlength=keyframes).max(initial=0))
+
+
+def sort_edges(edges: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Edges sorted by host, the new position of each given edge, and the largest out-degree."""
+    order = np.argsort(edges[:, 0], kind="stable")
+    position = np.empty(len(edges), int)
+    position[order] = np.arange(len(edges))
+    degrees = np.bincount(edges[:, 0], minlength=keyframes)
+    return edges[order], position, int(degrees.max(initial=0))
+
+
+def pad_edges(edges: np.ndarray, size: PaddedSize) -> tuple[Edges, np.ndarray]:
+    """The graph as arrays, and the stored position of each sorted edge."""
+    hosts, first = edges[:, 0], np.searchsorted(edges[:, 0], np.arange(size.keyframes))
+    rank = np.arange(len(edges)) - first[hosts]
+    if size.edges == len(edges):
+        position, source, target, ranks = np.arange(len(edges)), hosts, edges[:, 1], rank
+    else:
+        position = hosts * size.ranks + rank
+        source, ranks = (
+            np.repeat(np.arange(size.keyframes), size.ranks),
+            np.tile(np.arange(size.ranks), size.keyframes),
+        )
+        target = source.copy()
+        target[position] = edges[:, 1]
+    of_host = np.full((size.keyframes, size.ranks), len(source))
+    of_host[source, ranks] = np.arange(len(source))
+    arrays = (jnp.asarray(array, jnp.int32) for array in (source, target, ranks, of_host))
+    return Edges(*arrays), position

@@ -1,0 +1,89 @@
+"""What `pack` asks of the terms that it is given; see `packing_checks.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from vggtgeo.bundle.observations import FlatTerm, Observations
+from vggtgeo.bundle.packing_checks import as_numbers, check_matches, check_weight
+from vggtgeo.bundle.padding import COUNTED
+from vggtgeo.bundle.terms.depth import DepthPrior
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.line import LineTerm
+from vggtgeo.bundle.terms.node import PairTerm, PoseTerm
+from vggtgeo.bundle.terms.point import PointTerm
+from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.io.errors import InputError
+
+_OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsPrior))
+"""Names of the terms that `pack` makes of its other arguments."""
+
+
+def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int) -> None:
+    """Terms of different names, with weights that are weights and indices that exist."""
+    names = list(_OWN)
+    for term in terms:
+        if not isinstance(term, AbstractTerm | FlatTerm):
+            raise InputError(f"`terms` holds {term!r:.60}; expected terms, as `vggtgeo.RelativePose`, or `FlatTerm`")
+        if term.name in names:
+            raise InputError(f"`terms` holds a second term `{term.name}`; give its class another `name`")
+        names.append(term.name)
+        if not isinstance(term.weight, jax.core.Tracer):
+            check_weight(f"{term.name}.weight", term.weight)
+        if isinstance(term, COUNTED) and np.ndim(term.weight) != 1:
+            raise InputError(f"`{term.name}.weight` has shape {np.shape(term.weight)}; give one weight an observation")
+        if isinstance(term, FlatTerm):
+            _check_flat(term, observations)
+        elif isinstance(term, PoseTerm | PairTerm):
+            _check_touched(term, keyframes)
+
+
+def _check_flat(term: FlatTerm, observations: Observations) -> None:
+    if not issubclass(term.kind, EdgeTerm | SlotTerm):
+        raise InputError(f"`FlatTerm` of `{term.kind.__name__}`: give a term that is on no landmark as it is")
+    if (term.edge is not None) != issubclass(term.kind, EdgeTerm):
+        what = "an `edge` for each landmark" if term.edge is None else "no `edge`"
+        raise InputError(f"`FlatTerm` of `{term.kind.__name__}` needs {what}")
+    count = len(term.landmark)
+    for name, values in term.rows().items():
+        for leaf in jax.tree.leaves(values):
+            if np.shape(leaf)[:1] != (count,):
+                raise InputError(
+                    f"`{term.name}.{name}` has shape {np.shape(leaf)}; expected ({count}, ...), one row a landmark"
+                )
+    landmark = _check_range(f"{term.name}.landmark", term.landmark, len(observations.host), "landmarks")
+    if term.edge is not None:
+        edge = _check_range(f"{term.name}.edge", term.edge, len(observations.edges), "edges")
+        if len(edge) != count:
+            raise InputError(f"`{term.name}.edge` has {len(edge)} entries; expected {count}, one a landmark")
+        check_matches((f"{term.name}.edge", f"{term.name}.landmark"), edge, landmark, observations)
+    elif len(np.unique(landmark)) < count:
+        raise InputError(f"`{term.name}.landmark` names a landmark more than once; give each one observation")
+
+
+def _check_touched(term: PoseTerm | PairTerm, keyframes: int) -> None:
+    for name in sorted(term.structure - {"weight", "kernel"}):
+        index = getattr(term, name)
+        if isinstance(index, jax.core.Tracer) or isinstance(term.weight, jax.core.Tracer):
+            continue
+        if np.shape(term.weight) != np.shape(index):
+            raise InputError(f"`{term.name}.weight` has shape {np.shape(term.weight)}; expected {np.shape(index)}")
+        # Room for observations to come has weight 0, and may name keyframes to come.
+        _check_range(f"{term.name}.{name}", np.asarray(index)[np.asarray(term.weight) > 0], keyframes, "keyframes")
+
+
+def _check_range(name: str, given: Any, limit: int, what: str) -> np.ndarray:
+    values = as_numbers(name, given)
+    if not np.issubdtype(values.dtype, np.integer):
+        raise InputError(f"`{name}` holds {values.dtype}; expected whole numbers")
+    if values.size and (values.min() < 0 or values.max() >= limit):
+        raise InputError(
+            f"`{name}` goes from {values.min()} to {values.max()}; there are {limit} {what}: use 0 to {limit - 1}"
+        )
+    return values

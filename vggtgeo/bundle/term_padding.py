@@ -1,0 +1,89 @@
+"""A term brought to the padded shape of a problem, by its kind: the one place that knows where a kind has its axes.
+
+Padding is an observation of weight 0. Its data are ones, which `AbstractTerm.prepared` puts there anyhow.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array
+
+from vggtgeo.bundle.observations import FlatTerm
+from vggtgeo.bundle.padding import COUNTED, GivenTerm, PaddedSize, SlotIndex
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.node import DenseTerm
+from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.io.errors import InputError
+
+
+def padded(term: GivenTerm, index: SlotIndex, size: PaddedSize, dtype: DTypeLike) -> AbstractTerm:
+    """The term in the shape of a problem of `size` whose landmarks and edges lie as `index` says.
+
+    Raises:
+        InputError: a term that is in another shape already, or has more observations than there is room for.
+
+    """
+    if isinstance(term, FlatTerm):
+        return placed(term, index, (0, index.shape[2]), dtype)
+    if isinstance(term, DenseTerm):
+        return term.padded(size.keyframes)
+    if isinstance(term, COUNTED):
+        return _lengthened(term, dict(size.terms).get(term.name, len(term.weight)))
+    keyframes, edges, slots = index.shape
+    expected = (keyframes, slots) if isinstance(term, SlotTerm) else (edges, slots)
+    if term.weight.shape != expected:
+        raise InputError(
+            f"the term `{term.name}` has weights of shape {term.weight.shape}; this problem is padded to {expected}: "
+            "give it as a `vggtgeo.FlatTerm`, which `pack` pads"
+        )
+    return term
+
+
+def placed(term: FlatTerm, index: SlotIndex, slots: tuple[int, int], dtype: DTypeLike) -> AbstractTerm:
+    """A flat term with each row at its landmark's slot, over the slots `[first, end)` of every host."""
+    first, end = slots
+    keyframes, edges, _ = index.shape
+    on_edges = issubclass(term.kind, EdgeTerm)
+    outer, where = (edges, index.edge[term.edge]) if on_edges else (keyframes, index.host[term.landmark])
+    at = (where, index.slot[term.landmark] - first)
+
+    def scatter(values: np.ndarray, empty: float = 1.0) -> Array:
+        real = np.issubdtype(values.dtype, np.floating)
+        whole = np.full((outer, end - first, *values.shape[1:]), empty if real else 0, dtype if real else values.dtype)
+        whole[at] = values
+        return jnp.asarray(whole)
+
+    rows = term.rows()
+    weight = scatter(np.asarray(rows.pop("weight"), float), 0.0)
+    data: dict[str, Any] = {name: jax.tree.map(scatter, values) for name, values in rows.items()}
+    if on_edges:
+        data["first_slot"] = first
+    return term.kind(**data, **term.shared(), weight=weight)
+
+
+def _lengthened(term: AbstractTerm, count: int) -> AbstractTerm:
+    """A term whose observations are one list, with room for `count` of them."""
+    own = len(term.weight)
+    more = count - own
+    if more < 0:
+        raise InputError(f"the term `{term.name}` has {own} observations; `size.terms` has room for {count}")
+    if more == 0:
+        return term
+
+    def longer(leaf: Any) -> Any:
+        if not eqx.is_array(leaf):
+            return leaf
+        # An index of 0 exists in every problem, and what is absent touches nothing.
+        filling = jnp.ones if eqx.is_inexact_array(leaf) else jnp.zeros
+        return jnp.concatenate([leaf, filling((more, *leaf.shape[1:]), leaf.dtype)])
+
+    touched = {name: getattr(term, name) for name in term.structure - {"weight", "kernel"}}
+    changed = term.holding(jax.tree.map(longer, {**term.data(), **touched}))
+    return changed.reweighted(jnp.concatenate([term.weight, jnp.zeros(more, term.weight.dtype)]))
