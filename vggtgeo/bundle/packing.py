@@ -135,8 +135,8 @@ def pack(
         present = _per_slot(index, np.ones(len(observations.host)), 0.0, dtype)
         problem, depths = _with_segments(problem, depths, present, size)
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
-    poses = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
-    return problem, State(poses, jnp.asarray(intrinsics, dtype), depths), index
+    start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
+    return problem, State(start, jnp.asarray(intrinsics, dtype), depths), index
 
 
 def _as_arrays(observations: Observations) -> Observations:

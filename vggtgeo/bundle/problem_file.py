@@ -113,7 +113,8 @@ def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -
     for name in ("host", "slot", "edge"):
         arrays[f"index/{name}"] = getattr(index, name)
     with atomic_open(path, "wb") as file:
-        np.savez_compressed(file, **{DESCRIPTION: np.array(json.dumps(whole))}, **arrays)
+        named: dict[str, Any] = {DESCRIPTION: np.array(json.dumps(whole)), **arrays}
+        np.savez_compressed(file, **named)
 
 
 def save_solution(path: Path, state: State, index: SlotIndex) -> None:

@@ -119,7 +119,7 @@ def _filled(kind: type, values: Mapping[str, Any]) -> Any:
             f"`{path_of(kind)}` has the fields {sorted(names)}; the file gives {sorted(values)}: it was written by "
             "another version of the class"
         )
-    made = object.__new__(kind)
+    made: Any = object.__new__(kind)
     for name, value in values.items():
         object.__setattr__(made, name, value)
     return made

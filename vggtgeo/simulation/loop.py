@@ -138,8 +138,8 @@ def _surfaces(poses: Float[np.ndarray, "n 7"], reach: int, rng: np.random.Genera
     residual = rng.normal(size=rows.shape[:2])
     hessian, gradient = np.einsum("mpa,mpb->mab", rows, rows), np.einsum("mpa,mp->ma", rows, residual)
     best, root = quadratic(jnp.asarray(measured), jnp.asarray(hessian), jnp.asarray(gradient))
-    pair = {"first": jnp.asarray(first), "second": jnp.asarray(second)}
-    return SurfaceAlignment(**pair, measured=best, root=root, weight=jnp.ones(len(first)))
+    ends = jnp.asarray(first), jnp.asarray(second)
+    return SurfaceAlignment(first=ends[0], second=ends[1], measured=best, root=root, weight=jnp.ones(len(first)))
 
 
 def _as_poses(turns: Rotation, shifts: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 7"]:
