@@ -32,16 +32,30 @@ class Scene:
     def pack(self, **options: Any) -> tuple[Problem, State, SlotIndex]:
         """The problem, and the guess."""
         start = (self.start_poses, self.start_intrinsics, self.start_inverse_depth)
-        return pack(self.observations, *start, **{"intrinsics_sigma": 5.0, **options})
+        return _pack(self.observations, *start, **{"intrinsics_sigma": 5.0, **options})
 
     def at_truth(self, **options: Any) -> tuple[Problem, State, SlotIndex]:
         """The problem with the truth as its start (and as the mean of the intrinsics' prior)."""
         start = (self.poses, self.intrinsics, self.inverse_depth)
-        return pack(self.observations, *start, **{"intrinsics_sigma": 5.0, **options})
+        return _pack(self.observations, *start, **{"intrinsics_sigma": 5.0, **options})
 
     def with_observations(self, **changes: Any) -> "Scene":
         """The same scene with fields of its observations replaced."""
         return replace(self, observations=replace(self.observations, **changes))
+
+
+def _pack(observations: Observations, *start: np.ndarray, **options: Any) -> tuple[Problem, State, SlotIndex]:
+    """`pack`, which refuses a problem that observes nothing: such a one is packed with weights, which are then taken
+    away, as a traced computation may do.
+    """
+    weights = {name: getattr(observations, name) for name in ("point_weight", "line_weight", "depth_weight")}
+    if any(np.any(weight != 0) for weight in weights.values()):
+        return pack(observations, *start, **options)
+    ones = {name: np.ones_like(weight) for name, weight in weights.items()}
+    problem, state, index = pack(replace(observations, **ones), *start, **options)
+    seen = ("points", "lines", "depth")
+    terms = (term.reweighted(0 * term.weight) if term.name in seen else term for term in problem.terms)
+    return problem.with_terms(tuple(terms)), state, index
 
 
 def matrix(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

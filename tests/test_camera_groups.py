@@ -184,6 +184,7 @@ class Seen(vg.PoseTerm):
         return camera.project(pose @ self.place) - self.pixel
 
 
+@pytest.mark.slow
 def test_second_derivatives_with_several_cameras() -> None:
     # Proves gradient and exact Hessian with two distorting cameras and a term on a pose and its camera. Oracle:
     # automatic differentiation of the energy after a step.
@@ -213,7 +214,9 @@ def test_second_derivatives_with_several_cameras() -> None:
     assert error < 1e-10, error
 
 
-@pytest.mark.parametrize(("model", "truth"), [(vg.RadialTangential, BENT), (vg.KannalaBrandt, FISHEYE)])
+@pytest.mark.parametrize(
+    ("model", "truth"), [(vg.RadialTangential, BENT), pytest.param(vg.KannalaBrandt, FISHEYE, marks=pytest.mark.slow)]
+)
 def test_a_distortion_is_found(model: type[vg.AbstractCamera], truth: np.ndarray) -> None:
     # Proves `pack(camera=...)`: from no distortion and a focal length 1 % off, exact matches give the camera that drew
     # them. Oracle: OpenCV drew them.

@@ -8,7 +8,7 @@ import pytest
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.adjustment import _prior_trust
 from vggtgeo.slam.line_support import sample_shares, spread_samples, supported
-from vggtgeo.slam.setting_groups import DepthSettings
+from vggtgeo.slam.setting_groups import DepthSettings, WeightSettings
 from vggtgeo.slam.settings import SlamSettings
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
@@ -54,9 +54,9 @@ def test_the_depth_prior_follows_the_chosen_confidence() -> None:
     for name, values in expected.items():
         settings = SlamSettings(depth=DepthSettings(depth_trust=name))
         np.testing.assert_array_equal(_prior_trust(own, saliency, settings), values)
-        without = replace(settings, use_confidence=False)
+        without = replace(settings, weights=WeightSettings(use_confidence=False))
         np.testing.assert_array_equal(_prior_trust(own, saliency, without), 1.0)
-    with pytest.raises(InputError, match="`depth_trust` is 'omega'"):
+    with pytest.raises(InputError, match="depth_trust` is 'omega'"):
         DepthSettings(depth_trust="omega")
 
 

@@ -69,6 +69,7 @@ def test_single_precision_of_the_caller_changes_nothing(room, tracked: Slam) -> 
     np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
 
 
+@pytest.mark.slow
 def test_two_ends_lines_recover_the_truth(room) -> None:
     """ATE below 1.5 cm where each segment has two unknowns; oracle: the renderer's poses."""
     frames, camera, truth = room
@@ -119,7 +120,9 @@ def _shaken(slam: Slam, metres: float, degrees: float, from_keyframe: int = 1, t
     return replace(slam, keyframes=tuple(keyframes))
 
 
-@pytest.mark.parametrize("surfaces", [300.0, 0.0], ids=["with surfaces", "matches alone"])
+@pytest.mark.parametrize(
+    "surfaces", [pytest.param(300.0, id="with surfaces"), pytest.param(0.0, id="matches alone", marks=pytest.mark.slow)]
+)
 def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: float) -> None:
     """Keyframes moved by 5 cm and 2 degrees each come back to below 1 cm; oracle: the renderer's poses."""
     settings = updated(

@@ -158,7 +158,7 @@ def by_dense(solved: State) -> Tree:
     return eqx.filter_jit(jax.grad(loss))(MOVING, DenseCholesky(), solved)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", ["band", pytest.param("minimum residuals", marks=pytest.mark.slow)])
 def test_gradients_in_reverse_mode(name: str, solved: State, by_dense: Tree) -> None:
     # Proves the derivative of the optimum with the solver's own structure. Oracle: the dense factor.
     solver, tolerance = SOLVERS[name]
@@ -166,6 +166,7 @@ def test_gradients_in_reverse_mode(name: str, solved: State, by_dense: Tree) -> 
     assert worst(found, by_dense) < tolerance
 
 
+@pytest.mark.slow
 def test_gradients_in_forward_mode(solved: State, by_dense: Tree) -> None:
     # Proves that the band's derivative is the same forward. Oracle: the dense gradient, along a random direction.
     rng = np.random.default_rng(1)

@@ -87,15 +87,12 @@ def load_problem(
     )
     if not arrays["huber"] > 0:
         raise InputError(f"array `huber` of `{path}` is {arrays['huber']}; it must be positive")
-    return pack(
-        observations,
-        arrays["T_init"],
-        arrays["k_init"],
-        arrays["d_init"],
-        intrinsics_sigma=arrays["k_prior_sigma"],
-        kernel=Huber(jnp.asarray(float(arrays["huber"]), dtype)),
-        dtype=dtype,
-    )
+    kernel = Huber(jnp.asarray(float(arrays["huber"]), dtype))
+    start = arrays["T_init"], arrays["k_init"], arrays["d_init"]
+    try:
+        return pack(observations, *start, intrinsics_sigma=arrays["k_prior_sigma"], kernel=kernel, dtype=dtype)
+    except InputError as error:
+        raise InputError(f"`{path}`: {error}") from error
 
 
 def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -> None:
@@ -105,6 +102,15 @@ def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -
 
     Raises:
         InputError: a term holds something that is no array, number or text.
+
+    Example (with `problem, initial, index = vg.simulate_window().pack()`):
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     vg.save_problem(Path(folder) / "window.npz", problem, initial, index)
+        ...     again, start, _ = vg.load_problem(Path(folder) / "window.npz")
+        >>> bool(vg.energy(again, start) == vg.energy(problem, initial))
+        True
 
     """
     arrays: dict[str, np.ndarray] = {}
