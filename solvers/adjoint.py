@@ -145,7 +145,7 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
 
     def stationarity(moving: Any, point: Point) -> ArrowVector:
         shifted = eqx.combine(moving, fixed)
-        return _gradient(shifted, shifted.hold(point), system)
+        return _gradient(shifted, shifted.restore_fixed(point), system)
 
     _, right_hand_side = jax.jvp(lambda moving: stationarity(moving, at), (moving,), (moved,))
     trusted = _trusted(left, options)
@@ -165,7 +165,7 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
 
     def found(moving: Any, step: ArrowVector) -> Any:
         shifted = eqx.combine(moving, fixed)
-        return shifted.retract(shifted.hold(at), _expanded(system, step))
+        return shifted.retract(shifted.restore_fixed(at), _expanded(system, step))
 
     zero = jax.tree.map(jnp.zeros_like, solved)
     value, tangent = jax.jvp(found, (moving, zero), (moved, solved))

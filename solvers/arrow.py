@@ -37,7 +37,7 @@ class EdgeGraph(eqx.Module):
     of_host: Int[Array, "n k"]
 
     def neighbours(self) -> Int[Array, "n k"]:
-        """Target node of each rank of each host; `n` where there is no edge."""
+        """Target node of each edge of each host; `n` where there is no edge."""
         padded = jnp.append(self.target, self.of_host.shape[0])
         return padded[self.of_host]
 
@@ -49,7 +49,7 @@ class ArrowVector(eqx.Module):
     landmarks: Float[Array, "n s"]
 
 
-class Segments(eqx.Module):
+class SegmentLandmarks(eqx.Module):
     """Landmarks that lie on straight lines: the coordinates `(y_a, y_b)` of `segments.py`."""
 
     fraction: Float[Array, "n g q"]
@@ -84,15 +84,15 @@ class ArrowSystem(eqx.Module):
     """Second-order model of the energy at one point; `b` coordinates a node, `q` shared ones."""
 
     graph: EdgeGraph
-    transport: Float[Array, "e b b"]
+    source_adjoint: Float[Array, "e b b"]
     """`A` in `eta = x_j - A x_i`."""
     gram: Float[Array, "e m m"]
     """`m = b + q + 1`: second derivatives in `(eta, shared)`; the last row and column hold the gradient."""
     cross: Float[Array, "n r s"]
-    """`r = b k + q + 2`: second derivatives of `(eta of rank 0 ... k-1, shared)` with each landmark, then the
+    """`r = b k + q + 2`: second derivatives of `(eta of edge 0 ... k-1, shared)` with each landmark, then the
     landmark's gradient and its own second derivative. One array, because slicing it would copy it."""
-    twist: Float[Array, "e b b"]
-    """Curvature of `eta` itself, `x_j' twist (-A x_i)`; zero in a Gauss-Newton model."""
+    lie_curvature: Float[Array, "e b b"]
+    """Curvature of `eta` itself, `x_j' lie_curvature (-A x_i)`; zero in a Gauss-Newton model."""
     prior_hessian: Float[Array, "p p"]
     """Over the last `p` dense coordinates: `p = q` when only the shared ones have a prior, `p = c` when all may. It is
     the only dense matrix here, so a system without a prior on the nodes grows linearly with its edges."""
@@ -105,7 +105,7 @@ class ArrowSystem(eqx.Module):
     """Terms on nodes and pairs of nodes: blocks of the matrix, however many there are."""
     held: Bool[Array, "n s"] | None = None
     """Landmarks that stay where they are, at a bound that they press against; None = none."""
-    segments: Segments | None = None
+    segments: SegmentLandmarks | None = None
     """Where the last `2 g` landmarks are coordinates of segments of `q` samples."""
 
     @property
@@ -164,13 +164,13 @@ def host_products(system: ArrowSystem) -> Float[Array, "n t t"]:
 
 
 def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "n relative"]:
-    """Dense step in the coordinates of each host's cross terms: `(eta of each rank, shared)`."""
-    hosts, ranks = system.graph.of_host.shape
-    block = system.transport.shape[-1]
+    """Dense step in the coordinates of each host's cross terms: `(eta of each edge, shared)`."""
+    hosts, degree = system.graph.of_host.shape
+    block = system.source_adjoint.shape[-1]
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
-    eta = nodes[system.graph.target] - jnp.einsum("eab,eb->ea", system.transport, nodes[system.graph.source])
+    eta = nodes[system.graph.target] - jnp.einsum("eab,eb->ea", system.source_adjoint, nodes[system.graph.source])
     eta = jnp.concatenate([eta, jnp.zeros_like(eta[:1])])[system.graph.of_host]
-    return jnp.concatenate([eta.reshape(hosts, ranks * block), jnp.broadcast_to(shared, (hosts, len(shared)))], 1)
+    return jnp.concatenate([eta.reshape(hosts, degree * block), jnp.broadcast_to(shared, (hosts, len(shared)))], 1)
 
 
 def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> Float[Array, "n s"]:
@@ -195,17 +195,17 @@ def multiply(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
 
 def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, " c"]:
     """`H dense`, edge by edge: no matrix over all nodes is formed."""
-    hosts, block = system.graph.of_host.shape[0], system.transport.shape[-1]
+    hosts, block = system.graph.of_host.shape[0], system.source_adjoint.shape[-1]
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
     at_target = nodes[system.graph.target]
-    at_source = jnp.einsum("eab,eb->ea", system.transport, nodes[system.graph.source])
+    at_source = jnp.einsum("eab,eb->ea", system.source_adjoint, nodes[system.graph.source])
     spread = jnp.broadcast_to(shared, (len(at_target), len(shared)))
     local = jnp.concatenate([at_target - at_source, spread], 1)
     pulled = jnp.einsum("eab,eb->ea", system.gram[:, :-1, :-1], local)
-    bent = jnp.einsum("eba,eb->ea", system.twist, at_target)
+    bent = jnp.einsum("eba,eb->ea", system.lie_curvature, at_target)
     nodes = _gather_at_nodes(
         system,
-        pulled[:, :block] - jnp.einsum("eab,eb->ea", system.twist, at_source),
+        pulled[:, :block] - jnp.einsum("eab,eb->ea", system.lie_curvature, at_source),
         pulled[:, :block] + bent,
     )
     whole = jnp.concatenate([nodes.reshape(-1), pulled[:, block:].sum(0)])
@@ -215,7 +215,7 @@ def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array
 
 
 def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array, " c"]) -> Float[Array, " c"]:
-    hosts, block = system.graph.of_host.shape[0], system.transport.shape[-1]
+    hosts, block = system.graph.of_host.shape[0], system.source_adjoint.shape[-1]
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
     nodes = jnp.concatenate([nodes, jnp.zeros_like(nodes[:1])])
     spread = jnp.broadcast_to(shared, (len(factors.first), len(shared)))
@@ -225,7 +225,7 @@ def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array
 
 def _factors_gathered(system: ArrowSystem, factors: NodeFactors, local: Float[Array, "m l"]) -> Float[Array, " c"]:
     """Values in the factors' local coordinates added up at the nodes and the shared coordinates."""
-    hosts, block = system.graph.of_host.shape[0], system.transport.shape[-1]
+    hosts, block = system.graph.of_host.shape[0], system.source_adjoint.shape[-1]
     nodes = jnp.zeros((hosts + 1, block), local.dtype)
     nodes = nodes.at[factors.first].add(local[:, :block]).at[factors.second].add(local[:, block : 2 * block])
     return jnp.concatenate([nodes[:-1].reshape(-1), local[:, 2 * block :].sum(0)])
@@ -238,22 +238,22 @@ def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "n s"]) -> Float
 
 def from_relative(system: ArrowSystem, relative: Float[Array, "n relative"]) -> Float[Array, " c"]:
     """The transpose of `to_relative`: forces on each host's relative coordinates, added up at the nodes."""
-    hosts, ranks = system.graph.of_host.shape
-    block = system.transport.shape[-1]
-    eta = relative[:, : ranks * block].reshape(hosts, ranks, block)
+    hosts, degree = system.graph.of_host.shape
+    block = system.source_adjoint.shape[-1]
+    eta = relative[:, : degree * block].reshape(hosts, degree, block)
     eta = jnp.where(system.graph.of_host[..., None] < len(system.graph.source), eta, 0.0)
     to_host = -jnp.einsum("nkab,nka->nb", padded_transports(system), eta)
     nodes = jnp.zeros((hosts + 1, block), eta.dtype).at[system.graph.neighbours()].add(eta)[:-1]
-    return jnp.concatenate([(nodes + to_host).reshape(-1), relative[:, ranks * block :].sum(0)])
+    return jnp.concatenate([(nodes + to_host).reshape(-1), relative[:, degree * block :].sum(0)])
 
 
 def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """Gradient of the dense coordinates and the diagonal of their Hessian (no landmark eliminated)."""
-    block = system.transport.shape[-1]
+    block = system.source_adjoint.shape[-1]
     eta = system.gram[:, :block, :block]
     gradients = _gather_at_nodes(system, system.gram[:, :block, -1], system.gram[:, :block, -1])
     at_target = jnp.diagonal(eta, axis1=1, axis2=2)
-    at_source = jnp.einsum("eba,ebc,eca->ea", system.transport, eta, system.transport)
+    at_source = jnp.einsum("eba,ebc,eca->ea", system.source_adjoint, eta, system.source_adjoint)
     nodes = jnp.zeros_like(gradients).at[system.graph.target].add(at_target)
     nodes = nodes.at[system.graph.source].add(at_source)
     shared = system.gram[:, block:, block:].sum(0)
@@ -274,7 +274,7 @@ def _gather_at_nodes(
 ) -> Float[Array, "n b"]:
     """Add forces on relative coordinates up at the nodes: `at_target` at targets, `-A' at_source` at sources."""
     nodes = jnp.zeros((system.graph.of_host.shape[0], at_target.shape[1]), at_target.dtype)
-    carried = jnp.einsum("eba,eb->ea", system.transport, at_source)
+    carried = jnp.einsum("eba,eb->ea", system.source_adjoint, at_source)
     return nodes.at[system.graph.target].add(at_target).at[system.graph.source].add(-carried)
 
 
@@ -315,16 +315,16 @@ class Blocks(eqx.Module):
 
 
 def padded_transports(system: ArrowSystem) -> Float[Array, "n k b b"]:
-    """`A` of each rank of each host, zero where there is no edge."""
-    padded = jnp.concatenate([system.transport, jnp.zeros_like(system.transport[:1])])
+    """`A` of each edge of each host, zero where there is no edge."""
+    padded = jnp.concatenate([system.source_adjoint, jnp.zeros_like(system.source_adjoint[:1])])
     return padded[system.graph.of_host]
 
 
 def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout: AbstractLayout) -> Blocks:
     """Carry each host's matrix from relative to node coordinates and add them all up."""
-    hosts, ranks = system.graph.of_host.shape
-    block = system.transport.shape[-1]
-    wide = ranks * block
+    hosts, degree = system.graph.of_host.shape
+    block = system.source_adjoint.shape[-1]
+    wide = degree * block
     transports = padded_transports(system).reshape(hosts, wide, block)
     own = -jnp.einsum("nrw,nwb->nrb", products[:, :, :wide], transports)
     corner = -jnp.einsum("nwa,nwb->nab", transports, own[:, :wide])
@@ -332,13 +332,13 @@ def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout:
     to_neighbour = jnp.swapaxes(own[:, :wide], 1, 2)
     top = jnp.concatenate([products[:, :wide, :wide], own[:, :wide]], 2)
     bottom = jnp.concatenate([to_neighbour, corner], 2)
-    local = jnp.concatenate([top, bottom], 1).reshape(hosts, ranks + 1, block, ranks + 1, block)
+    local = jnp.concatenate([top, bottom], 1).reshape(hosts, degree + 1, block, degree + 1, block)
     index = jnp.concatenate([system.graph.neighbours(), jnp.arange(hosts)[:, None]], 1)
     rows, columns = jnp.broadcast_arrays(index[:, :, None], index[:, None, :])
     blocks = layout.empty(hosts, block, products.dtype)
     blocks = layout.add(blocks, rows, columns, local.transpose(0, 1, 3, 2, 4))
     border = jnp.concatenate([products[:, wide:, :wide], own[:, wide:]], 2)
-    border = border.reshape(hosts, -1, ranks + 1, block).transpose(0, 2, 3, 1)
+    border = border.reshape(hosts, -1, degree + 1, block).transpose(0, 2, 3, 1)
     borders = jnp.zeros((hosts + 1, block, border.shape[-1]), products.dtype).at[index].add(border)[:-1]
     return Blocks(blocks, borders, products[:, wide:, wide:].sum(0))
 
@@ -346,17 +346,17 @@ def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout:
 def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     """Hessian and gradient of all edges in node coordinates."""
     hosts = system.graph.of_host.shape[0]
-    block = system.transport.shape[-1]
+    block = system.source_adjoint.shape[-1]
     source, target = system.graph.source, system.graph.target
     eta, border = system.gram[:, :block, :block], system.gram[:, :block, block:]
-    own = jnp.einsum("eba,ebc,ecd->ead", system.transport, eta, system.transport)
-    mixed = -jnp.einsum("eab,ebc->eac", eta + system.twist, system.transport)
+    own = jnp.einsum("eba,ebc,ecd->ead", system.source_adjoint, eta, system.source_adjoint)
+    mixed = -jnp.einsum("eab,ebc->eac", eta + system.lie_curvature, system.source_adjoint)
     blocks = layout.empty(hosts, block, eta.dtype)
     blocks = layout.add(layout.add(blocks, target, target, eta), source, source, own)
     blocks = layout.add(blocks, target, source, mixed)
     blocks = layout.add(blocks, source, target, jnp.swapaxes(mixed, 1, 2))
     borders = jnp.zeros((hosts, block, border.shape[-1]), eta.dtype).at[target].add(border)
-    borders = borders.at[source].add(-jnp.einsum("eba,ebc->eac", system.transport, border))
+    borders = borders.at[source].add(-jnp.einsum("eba,ebc->eac", system.source_adjoint, border))
     whole = Blocks(blocks, borders, system.gram[:, block:, block:].sum(0))
     return whole if system.factors is None else _add_factors(whole, system.factors, layout)
 

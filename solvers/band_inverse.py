@@ -106,7 +106,7 @@ def _local(
     system: ArrowSystem, layout: BandLayout, found: SelectedInverse, hosts: Int[Array, " h"]
 ) -> Float[Array, "h l l"]:
     """Blocks of the local coordinates of each host, in balanced units."""
-    nodes, block = local_nodes(system, hosts), system.transport.shape[-1]
+    nodes, block = local_nodes(system, hosts), system.source_adjoint.shape[-1]
     rows, columns = jnp.broadcast_arrays(nodes[:, :, None], nodes[:, None, :])
     inner = layout.gather(found.groups, rows, columns).transpose(0, 1, 3, 2, 4)
     inner = inner.reshape(len(hosts), nodes.shape[1] * block, -1)

@@ -148,7 +148,7 @@ def assemble_bands(system: ArrowSystem, layout: BandLayout) -> tuple[BandMatrix,
     stays positive semi-definite (a block diagonal of one that is), so the band can precondition.
     """
     near = layout.near(system, layout.group // 2)
-    block = system.transport.shape[-1]
+    block = system.source_adjoint.shape[-1]
     border = jnp.where(near[:, None, None], system.gram[:, :block, block:], 0.0)
     near_system = eqx.tree_at(lambda s: s.gram, system, system.gram.at[:, :block, block:].set(border))
     hessian = add_prior_blocks(assemble_edges(near_system, layout), system, layout)
@@ -233,11 +233,11 @@ def _band(blocks: Blocks, layout: BandLayout) -> BandMatrix:
 
 def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "n t t"]:
     """Which entries of the hosts' products couple no far edge with anything else."""
-    block, tail = system.transport.shape[-1], system.gram.shape[-1] - system.transport.shape[-1]
-    hosts, ranks = system.graph.of_host.shape
+    block, tail = system.source_adjoint.shape[-1], system.gram.shape[-1] - system.source_adjoint.shape[-1]
+    hosts, degree = system.graph.of_host.shape
     far = jnp.append(~near, False)[system.graph.of_host]
-    # A far edge is a class of its own (1 + its rank); near edges, shared coordinates and the gradient are class 0.
-    classes = jnp.repeat(jnp.where(far, 1 + jnp.arange(ranks), 0), block, axis=1)
+    # A far edge is a class of its own (1 + its index); near edges, shared coordinates and the gradient are class 0.
+    classes = jnp.repeat(jnp.where(far, 1 + jnp.arange(degree), 0), block, axis=1)
     classes = jnp.concatenate([classes, jnp.zeros((hosts, tail), classes.dtype)], 1)
     return classes[:, :, None] == classes[:, None, :]
 

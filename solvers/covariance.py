@@ -50,10 +50,10 @@ def covariance(
     """
     hosts = jnp.arange(len(system.graph.of_host)) if hosts is None else hosts
     found = (DenseCholesky() if solver is None else solver).inverse(system, hosts)
-    ranks, block = system.graph.of_host.shape[1], system.transport.shape[-1]
+    degree, block = system.graph.of_host.shape[1], system.source_adjoint.shape[-1]
     local = _marked(found.covariance, found.undetermined)
-    own, end = slice(ranks * block, (ranks + 1) * block), (ranks + 1) * block
-    beside = local[:, own, : ranks * block].reshape(len(hosts), block, ranks, block).transpose(0, 2, 1, 3)
+    own, end = slice(degree * block, (degree + 1) * block), (degree + 1) * block
+    beside = local[:, own, : degree * block].reshape(len(hosts), block, degree, block).transpose(0, 2, 1, 3)
     present = system.graph.of_host[hosts] < len(system.graph.source)
     return ArrowCovariance(
         nodes=local[:, own, own],

@@ -37,7 +37,7 @@ def local_nodes(system: ArrowSystem, hosts: Int[Array, " h"]) -> Int[Array, "h m
 
 def local_coordinates(system: ArrowSystem, hosts: Int[Array, " h"]) -> Int[Array, "h l"]:
     """Which of the dense coordinates the local ones of each host are."""
-    block, inner = system.transport.shape[-1], len(system.graph.of_host) * system.transport.shape[-1]
+    block, inner = system.source_adjoint.shape[-1], len(system.graph.of_host) * system.source_adjoint.shape[-1]
     nodes = local_nodes(system, hosts)[:, :, None] * block + jnp.arange(block)
     shared = jnp.arange(inner, len(system.free))
     return jnp.concatenate([nodes.reshape(len(hosts), -1), jnp.broadcast_to(shared, (len(hosts), len(shared)))], 1)
@@ -45,8 +45,8 @@ def local_coordinates(system: ArrowSystem, hosts: Int[Array, " h"]) -> Int[Array
 
 def to_relative(system: ArrowSystem, hosts: Int[Array, " h"], local: Float[Array, "h l l"]) -> Float[Array, "h r r"]:
     """`J C J'`: a covariance of the local coordinates carried to `(eta of each rank, shared)`."""
-    ranks, block = system.graph.of_host.shape[1], system.transport.shape[-1]
-    wide, shared = ranks * block, local.shape[-1] - (ranks + 1) * block
+    degree, block = system.graph.of_host.shape[1], system.source_adjoint.shape[-1]
+    wide, shared = degree * block, local.shape[-1] - (degree + 1) * block
     present = system.graph.of_host[hosts] < len(system.graph.source)
     carry = jnp.zeros((len(hosts), wide + shared, wide + block + shared), local.dtype)
     carry = carry.at[:, jnp.arange(wide), jnp.arange(wide)].set(jnp.repeat(present, block, 1).astype(local.dtype))

@@ -40,7 +40,7 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
         """Move on the manifold; a zero step is the identity and the derivative there is the tangent map."""
 
     @abc.abstractmethod
-    def hold(self, point: Point) -> Point:
+    def restore_fixed(self, point: Point) -> Point:
         """`point` with every held coordinate taken from where the iteration starts, which the problem knows.
 
         Landmarks on segments stay where they are, but follow the fractions where those are differentiated.

@@ -15,7 +15,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from vggtgeo.solvers.arrow import ArrowSystem, Segments
+from vggtgeo.solvers.arrow import ArrowSystem, SegmentLandmarks
 
 
 def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> ArrowSystem:
@@ -32,7 +32,7 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
     rest = total(second, second)
     # Where one sample alone determines the segment, the second coordinate is rounding error.
     determined = jnp.abs(rest) > 1e3 * jnp.finfo(rest.dtype).eps * (jnp.abs(own) + jnp.abs(other))
-    joint = Segments(fraction, ratio, determined)
+    joint = SegmentLandmarks(fraction, ratio, determined)
     joined = jnp.einsum("nrms,nmsk->nrkm", rows, joint.basis)
     joined = joined.at[:, -1].set(jnp.stack([own, jnp.where(determined, rest, 0.0)], 1))
     cross = jnp.concatenate([system.cross[..., :alone], joined.reshape(*joined.shape[:2], 2 * segments)], -1)
@@ -41,17 +41,17 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
     return eqx.tree_at(lambda s: (s.cross, s.segments, s.held), system, changed, is_leaf=lambda leaf: leaf is None)
 
 
-def expand(segments: Segments | None, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
+def expand(segments: SegmentLandmarks | None, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
     """From the system's landmarks to those of the problem: the samples of the segments."""
     return landmarks if segments is None else _expanded(segments.basis, landmarks)
 
 
-def expand_variance(segments: Segments | None, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
+def expand_variance(segments: SegmentLandmarks | None, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
     """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
     return variance if segments is None else _expanded(segments.basis**2, variance)
 
 
-def restrict(segments: Segments | None, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:
+def restrict(segments: SegmentLandmarks | None, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:
     """The transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
     if segments is None:
         return landmarks

@@ -56,10 +56,10 @@ def random_system(seed: int = 0, twisted: bool = False) -> ArrowSystem:
     free[1] = False
     return ArrowSystem(
         graph=EdgeGraph(*(jnp.asarray(a) for a in (EDGES[:, 0], EDGES[:, 1], OF_HOST))),
-        transport=jnp.asarray(rng.normal(size=(len(EDGES), BLOCK, BLOCK))),
+        source_adjoint=jnp.asarray(rng.normal(size=(len(EDGES), BLOCK, BLOCK))),
         gram=jnp.asarray(gram),
         cross=jnp.asarray(cross),
-        twist=jnp.asarray(rng.normal(size=(len(EDGES), BLOCK, BLOCK)) * twisted),
+        lie_curvature=jnp.asarray(rng.normal(size=(len(EDGES), BLOCK, BLOCK)) * twisted),
         prior_hessian=jnp.asarray(prior @ prior.T),
         prior_gradient=jnp.asarray(rng.normal(size=DENSE)),
         free=jnp.asarray(free),
@@ -73,7 +73,7 @@ def assemble(system: ArrowSystem) -> Dense:
     matrix, gradient = np.zeros((size, size)), np.zeros(size)
     matrix[:DENSE, :DENSE] += system.prior_hessian
     gradient[:DENSE] += system.prior_gradient
-    gram, cross, transport = (np.asarray(a) for a in (system.gram, system.cross, system.transport))
+    gram, cross, transport = (np.asarray(a) for a in (system.gram, system.cross, system.source_adjoint))
     for edge, (host, target) in enumerate(EDGES):
         carry = np.zeros((BLOCK + SHARED, size))
         carry[:BLOCK, BLOCK * target : BLOCK * (target + 1)] = np.eye(BLOCK)
@@ -81,7 +81,7 @@ def assemble(system: ArrowSystem) -> Dense:
         carry[BLOCK:, NODES * BLOCK : DENSE] = np.eye(SHARED)
         matrix += carry.T @ gram[edge, :-1, :-1] @ carry
         gradient += carry.T @ gram[edge, :-1, -1]
-        bend = -np.asarray(system.twist[edge]) @ transport[edge]
+        bend = -np.asarray(system.lie_curvature[edge]) @ transport[edge]
         rows, columns = np.arange(BLOCK) + BLOCK * target, np.arange(BLOCK) + BLOCK * host
         matrix[np.ix_(rows, columns)] += bend
         matrix[np.ix_(columns, rows)] += bend.T

@@ -93,7 +93,7 @@ def test_the_order_of_the_lists_does_not_matter() -> None:
 def test_ranks_invert_the_graph(size: PaddedSize | None) -> None:
     # Proves that `of_host` finds each edge by host and rank. Oracle: the definition of both.
     edges = SCENE.pack(size=size)[0].edges
-    for edge, (host, rank) in enumerate(zip(edges.source, edges.rank, strict=True)):
+    for edge, (host, rank) in enumerate(zip(edges.source, edges.index_at_host, strict=True)):
         assert int(edges.of_host[host, rank]) == edge
     assert int(jnp.sum(edges.of_host < len(edges.source))) == len(edges.source)
 
@@ -159,7 +159,7 @@ def test_wrong_lists_are_refused_by_name() -> None:
             scene.pack()
 
 
-@pytest.mark.parametrize("name", ["keyframes", "points", "lines", "ranks", "edges"])
+@pytest.mark.parametrize("name", ["keyframes", "points", "lines", "degree", "edges"])
 def test_a_size_that_is_too_small_is_refused(name: str) -> None:
     # Proves that nothing is cut off silently: the error names the size and what is needed.
     fits = PaddedSize(3, 6, 3, 2, 6)

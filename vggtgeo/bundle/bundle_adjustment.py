@@ -60,7 +60,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         lines = _shortened(depth[:, first:], moved[:, first:], self.problem.fraction.shape[1])
         return jnp.concatenate([_positive(moved[:, :first]), lines], 1)
 
-    def hold(self, point: State) -> State:
+    def restore_fixed(self, point: State) -> State:
         initial = point if self.start is None else self.start
         fixed_pose = self.problem.fixed_pose[:, None]
         poses = jnp.where(fixed_pose, initial.poses.wxyz_xyz, point.poses.wxyz_xyz)

@@ -54,4 +54,4 @@ class Graduation(eqx.Module):
         detached = jax.lax.stop_gradient((problem, initial))
         problem, state = detached
         state, _ = jax.lax.scan(stage, state, factors)
-        return BundleAdjustment(problem, initial).hold(jax.lax.stop_gradient(state))
+        return BundleAdjustment(problem, initial).restore_fixed(jax.lax.stop_gradient(state))

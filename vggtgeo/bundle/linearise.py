@@ -38,23 +38,23 @@ def linearise(
     kernels' curvature, see `terms/term.py`.
     """
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
-    ranks, size = problem.edges.of_host.shape[1], lie.TANGENT + problem.num_parameters
-    wide = lie.TANGENT * ranks
+    degree, size = problem.edges.of_host.shape[1], lie.TANGENT + problem.num_parameters
+    wide = lie.TANGENT * degree
 
     def body(cross: Array, edge: Any) -> tuple[Array, Array]:
-        ends, rank, motion, data = edge
+        ends, index, motion, data = edge
         host = ends[0]
         seen = of_edge(problem, view_of(cameras, hosts, ends, motion), data)
         gram, coupled = (_exact if exact else _reweighted)(seen, correction, state.inverse_depth.shape[1])
         zero = jnp.zeros_like(host)
-        cross = jax.lax.dynamic_update_slice(cross, coupled[None, : lie.TANGENT], (host, lie.TANGENT * rank, zero))
+        cross = jax.lax.dynamic_update_slice(cross, coupled[None, : lie.TANGENT], (host, lie.TANGENT * index, zero))
         tail = coupled[None, lie.TANGENT :]
         shared = jax.lax.dynamic_slice(cross, (host, zero + wide, zero), (1, *tail.shape[1:]))
         return jax.lax.dynamic_update_slice(cross, shared + tail, (host, zero + wide, zero)), gram
 
     cross = _slot_terms(problem, state, wide, correction, exact)
     if problem.edge_terms:
-        edges = (problem.edges.ends, problem.edges.rank, motions_of(relative), edge_data(problem))
+        edges = (problem.edges.ends, problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         cross, gram = jax.lax.scan(body, cross, edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
@@ -63,10 +63,12 @@ def linearise(
     held = _held(problem, state, cross[:, -2])
     system = ArrowSystem(
         graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
-        transport=lie.adjoint(relative),
+        source_adjoint=lie.adjoint(relative),
         gram=gram,
         cross=cross,
-        twist=twist(force) if exact else jnp.zeros_like(gram, shape=(len(gram), lie.TANGENT, lie.TANGENT)),
+        lie_curvature=lie_curvature(force)
+        if exact
+        else jnp.zeros_like(gram, shape=(len(gram), lie.TANGENT, lie.TANGENT)),
         prior_hessian=hessian,
         prior_gradient=gradient,
         free=free_coordinates(problem),
@@ -127,7 +129,7 @@ def scale_direction(problem: Problem, state: State) -> Float[Array, "c 1"]:
     return (direction / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)))[:, None]
 
 
-def twist(gradient: Float[Array, "e 6"]) -> Float[Array, "e 6 6"]:
+def lie_curvature(gradient: Float[Array, "e 6"]) -> Float[Array, "e 6 6"]:
     """Curvature of the relative tangent in the two poses: `B_ab = 1/2 <gradient by eta, [e_a, e_b]>`.
 
     `exp(x_j) M exp(-x_i) = exp(eta) M` with `eta = x_j - A x_i + 1/2 [x_j, -A x_i] + O(3)` (Baker-Campbell-Hausdorff),

@@ -150,8 +150,8 @@ def _as_arrays(observations: Observations) -> Observations:
 def _layout(observations: Observations, keyframes: int, size: PaddedSize | None) -> tuple[PaddedSize, Edges, SlotIndex]:
     """The padded size, the graph, and where each landmark and edge lies in them."""
     slots = assign_slots(observations, keyframes, size.samples if size else None)
-    edges, order, ranks = sort_edges(observations.edges, keyframes)
-    needed = PaddedSize(keyframes, slots.points, slots.lines, ranks, len(edges), slots.samples)
+    edges, order, degree = sort_edges(observations.edges, keyframes)
+    needed = PaddedSize(keyframes, slots.points, slots.lines, degree, len(edges), slots.samples)
     size = size or needed
     check_size(size, needed)
     graph, position = pad_edges(edges, size)

@@ -235,7 +235,7 @@ def check_size(size: PaddedSize, needed: PaddedSize) -> None:
     """A padded size that is large enough."""
     if needed.samples is not None and size.lines % needed.samples:
         raise InputError(f"`size.lines` is {size.lines}; it must be a multiple of `size.samples`, {needed.samples}")
-    for name in ("keyframes", "points", "lines", "ranks", "edges"):
+    for name in ("keyframes", "points", "lines", "degree", "edges"):
         have, need = getattr(size, name), getattr(needed, name)
         if have is not None and (have < need or (name == "edges" and have != need)):
             raise InputError(f"`size.{name}` is {have}; this problem needs {need}")

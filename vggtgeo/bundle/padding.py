@@ -30,7 +30,7 @@ class PaddedSize:
 
     Example:
         >>> import vggtgeo as vg
-        >>> size = vg.PaddedSize(keyframes=10, points=320, lines=192, ranks=9)
+        >>> size = vg.PaddedSize(keyframes=10, points=320, lines=192, degree=9)
         >>> small, _, _ = vg.simulate_window(3).pack(size=size)
         >>> small.pixels.shape
         (10, 512, 2)
@@ -40,10 +40,10 @@ class PaddedSize:
     keyframes: int
     points: int
     lines: int
-    ranks: int
+    degree: int
     """Largest number of edges of one host."""
     edges: int | None = None
-    """Number of edges stored; None = `keyframes * ranks`, every host padded to `ranks` edges."""
+    """Number of edges stored; None = `keyframes * degree`, every host padded to `degree` edges."""
     samples: int | None = None
     """Samples of a segment, where observations have a `segment`; `lines` is a multiple of it."""
     terms: tuple[tuple[str, int], ...] = ()
@@ -54,9 +54,9 @@ class PaddedSize:
     def of(observations: Observations, keyframes: int, terms: Sequence[GivenTerm] = ()) -> PaddedSize:
         """The smallest that fits, every host padded to the same number of edges."""
         slots = assign_slots(observations, keyframes)
-        _, _, ranks = sort_edges(observations.edges, keyframes)
+        _, _, degree = sort_edges(observations.edges, keyframes)
         counts = tuple((term.name, np.size(term.weight)) for term in terms if isinstance(term, COUNTED))
-        return PaddedSize(keyframes, slots.points, slots.lines, ranks, samples=slots.samples, terms=counts)
+        return PaddedSize(keyframes, slots.points, slots.lines, degree, samples=slots.samples, terms=counts)
 
     @staticmethod
     def largest(sizes: Sequence[PaddedSize]) -> PaddedSize:
@@ -69,7 +69,7 @@ class PaddedSize:
         if sizes[0].samples is not None:
             samples = most("samples")
             lines = samples * max(size.lines // max(size.samples or 1, 1) for size in sizes)
-        shape = (most("keyframes"), most("points"), lines, most("ranks"))
+        shape = (most("keyframes"), most("points"), lines, most("degree"))
         return PaddedSize(*shape, samples=samples, terms=tuple(counts.items()))
 
 
@@ -152,18 +152,15 @@ def sort_edges(edges: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarra
 def pad_edges(edges: np.ndarray, size: PaddedSize) -> tuple[Edges, np.ndarray]:
     """The graph as arrays, and the stored position of each sorted edge."""
     hosts, first = edges[:, 0], np.searchsorted(edges[:, 0], np.arange(size.keyframes))
-    rank = np.arange(len(edges)) - first[hosts]
+    index = np.arange(len(edges)) - first[hosts]
     if size.edges == len(edges):
-        position, source, target, ranks = np.arange(len(edges)), hosts, edges[:, 1], rank
+        position, source, target = np.arange(len(edges)), hosts, edges[:, 1]
     else:
-        position = hosts * size.ranks + rank
-        source, ranks = (
-            np.repeat(np.arange(size.keyframes), size.ranks),
-            np.tile(np.arange(size.ranks), size.keyframes),
-        )
+        position = hosts * size.degree + index
+        source, index = np.divmod(np.arange(size.keyframes * size.degree), size.degree)
         target = source.copy()
         target[position] = edges[:, 1]
-    of_host = np.full((size.keyframes, size.ranks), len(source))
-    of_host[source, ranks] = np.arange(len(source))
-    arrays = (jnp.asarray(array, jnp.int32) for array in (source, target, ranks, of_host))
+    of_host = np.full((size.keyframes, size.degree), len(source))
+    of_host[source, index] = np.arange(len(source))
+    arrays = (jnp.asarray(array, jnp.int32) for array in (source, target, index, of_host))
     return Edges(*arrays), position

@@ -70,10 +70,10 @@ class Edges(eqx.Module):
     """Host keyframe i, ascending."""
     target: Int[Array, " e"]
     """Keyframe j in which the slots of i are observed."""
-    rank: Int[Array, " e"]
+    index_at_host: Int[Array, " e"]
     """Position of the edge among the edges of its host, from 0."""
     of_host: Int[Array, "n k"]
-    """Index of the edge of each rank of each host, or `e` where a host has fewer than `k`: the inverse of `rank`."""
+    """The edges of each host, in their order, and `e` where it has fewer than `k`: the inverse of `index_at_host`."""
 
     @property
     def ends(self) -> tuple[Int[Array, " e"], Int[Array, " e"]]:

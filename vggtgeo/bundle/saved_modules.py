@@ -147,7 +147,7 @@ def check_problem(problem: Any, state: Any, index: Any) -> None:
         "state/intrinsics": (state.intrinsics, problem.fixed_intrinsics.shape),
         "problem/fixed_pose": (problem.fixed_pose, (keyframes,)),
         "problem/edges/target": (problem.edges.target, (edges,)),
-        "problem/edges/rank": (problem.edges.rank, (edges,)),
+        "problem/edges/index_at_host": (problem.edges.index_at_host, (edges,)),
     }
     for name, (array, shape) in expected.items():
         if array.shape != shape:

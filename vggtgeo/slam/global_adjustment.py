@@ -48,8 +48,8 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
     edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
     edges = _thin(edges, len(slam.keyframes), settings)
-    ranks = max(np.bincount([edge.host for edge in edges]))
-    size = replace(window_size(settings), keyframes=len(slam.keyframes), ranks=int(ranks), edges=len(edges))
+    degree = max(np.bincount([edge.host for edge in edges]))
+    size = replace(window_size(settings), keyframes=len(slam.keyframes), degree=int(degree), edges=len(edges))
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = _surfaces(slam)
     given = slam.given_intrinsics
