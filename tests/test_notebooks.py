@@ -17,7 +17,7 @@ SMALL_WINDOW = (
     "size=4, point_slots=96, line_slots=48, window_iterations=8), "
     "refinement=vg.RefinementSettings(global_adjustment=False)"
 )
-QUICK = ("own_residuals", "solve")
+QUICK = ("solve",)
 # What CI replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.
 SHORTER: dict[str, dict[str, str]] = {
     "own_video": {"frames=45": "frames=16", WINDOW: SMALL_WINDOW},

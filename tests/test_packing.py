@@ -202,9 +202,10 @@ def test_a_problem_in_which_nothing_is_observed_is_refused() -> None:
     # that says nothing does not count, and that a traced solve stays where it starts. Oracle: the message; the start.
     seen = SCENE.observations
     zero = {name: 0 * getattr(seen, name) for name in ("point_weight", "line_weight", "depth_weight")}
-    for options in ({}, {"terms": [vg.no_prior(3)]}):
+    start = SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth
+    for options in ({"intrinsics_sigma": 5.0}, {"terms": [vg.no_prior(3)]}):
         with pytest.raises(InputError, match="nothing is observed: all weights"):
-            bad(**zero).pack(**options)
+            pack(replace(seen, **zero), *start, **options)
     problem, state, _ = SCENE.pack()
     nothing = problem.with_terms(tuple(term.reweighted(jnp.zeros_like(term.weight)) for term in problem.terms))
     with pytest.raises(InputError, match="nothing is observed: all weights"):
@@ -212,4 +213,4 @@ def test_a_problem_in_which_nothing_is_observed_is_refused() -> None:
     solution = jax.jit(vg.solve)(nothing, state)
     assert float(jnp.abs(solution.state.poses.wxyz_xyz - state.poses.wxyz_xyz).max()) == 0.0
     fix = vg.BaselinePrior(first=[0], second=[1], length=jnp.ones(1), sigma=jnp.ones(1), weight=jnp.ones(1))
-    assert float(vg.energy(bad(**zero).pack(terms=[fix])[0], state)) > 0
+    assert float(vg.energy(pack(replace(seen, **zero), *start, terms=[fix])[0], state)) > 0

@@ -158,7 +158,8 @@ def by_dense(solved: State) -> Tree:
     return eqx.filter_jit(jax.grad(loss))(MOVING, DenseCholesky(), solved)
 
 
-@pytest.mark.parametrize("name", ["band", pytest.param("minimum residuals", marks=pytest.mark.slow)])
+@pytest.mark.slow  # half a minute of compilation each; `test_exact_hessians_are_solved` is the solve that they need
+@pytest.mark.parametrize("name", SOLVERS)
 def test_gradients_in_reverse_mode(name: str, solved: State, by_dense: Tree) -> None:
     # Proves the derivative of the optimum with the solver's own structure. Oracle: the dense factor.
     solver, tolerance = SOLVERS[name]
