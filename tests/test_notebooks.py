@@ -18,7 +18,7 @@ SMALL_WINDOW = (
     "refinement=vg.RefinementSettings(global_adjustment=False)"
 )
 QUICK = ("solve",)
-# What CI replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.
+# What the shorter run replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.
 SHORTER: dict[str, dict[str, str]] = {
     "own_video": {"frames=45": "frames=16", WINDOW: SMALL_WINDOW},
     "evaluate": {'"small"': '"small", scenes=["room"], seeds=1'},
@@ -59,7 +59,7 @@ def test_notebook_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("path", [path for path in NOTEBOOKS if path.stem not in QUICK], ids=lambda path: path.stem)
 def test_notebook_runs_on_less_data(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The same of the long ones, with what CI has time for."""
+    """The same of the long ones, on less data."""
     _run(path, SHORTER.get(path.stem, {}))
     assert capsys.readouterr().out, f"`{path.name}` printed nothing"
 
