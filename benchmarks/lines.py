@@ -1,12 +1,12 @@
 """Line segments in tracking and in edges: what each gives, where there is texture and where there is hardly any.
 
     .venv/bin/python benchmarks/lines.py [--data ../shared/data] [--sources building-walk poor corridor]
-        [--variants none tracking edges both] [--without-picture | --rgb-only] [--frames 120]
+        [--variants none tracking edges both] [--without-picture | --rgb-only] [--points 80]
 
 Sources: the clips by their names; `poor`, those pieces of the two HoloLens clips where a frame has fewer than 100
 matches with the frame three before it; `corridor`, the simulated one with bare white walls and equal doors, with exact
 truth. `--without-picture` tracks by key points (and segments) alone, as without an alignment of the picture as a whole;
-`--rgb-only` gives no depth either.
+`--rgb-only` gives no depth either. `--points` leaves that many key points a frame, the best spread over the image.
 
 Printed as Markdown: frames tracked; ATE RMSE and the worst frame in cm after SE(3) alignment (without depth Sim(3)), of
 all frames; how far a frame's pose against its keyframe was off when it was tracked, before any adjustment, in cm,
@@ -83,10 +83,11 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))
     parser.add_argument("--without-picture", action="store_true")
     parser.add_argument("--rgb-only", action="store_true")
+    parser.add_argument("--points", type=int, default=SiftMatcher().count)
     parser.add_argument("--frames", type=int, default=240, help="of each source, at most")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)  # as the program does
-    matcher = RememberingMatcher()
+    matcher = RememberingMatcher(count=arguments.points)
     roles = Roles(points=matcher)
     if arguments.rgb_only:
         roles = replace(roles, depth=NoDepth())

@@ -48,7 +48,7 @@ def _refined(
 ) -> Refined | None:
     frame, intrinsics = view[1], view[3]
     settings = {"radius": SEARCH_RADIUS, "sigma": PIXEL_SIGMA}
-    return refine_by_map(frame.features, those, frame, start, known, intrinsics, with_systematic, **settings)
+    return refine_by_map(frame.features, keyframes, frame, start, known, intrinsics, with_systematic, **settings)
 
 
 def test_points_of_several_keyframes_bring_a_pose_right(view: View) -> None:

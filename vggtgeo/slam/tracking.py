@@ -77,13 +77,13 @@ class Expectation:
 class Track:
     """A frame's pose against one keyframe.
 
-    pose: float64 [4, 4], world -> camera. information: float64 [6, 6] of the motion from the keyframe to the frame,
-    over its left tangent, translation first. result: why there is no pose, where there is none.
+    pose: float64 [4, 4], world -> camera. measured: float64 [6, 6], what all samples know of the motion from the
+    keyframe to the frame, over its left tangent, translation first. result: why there is no pose, where there is none.
     """
 
     keyframe: Keyframe
     pose: np.ndarray
-    information: np.ndarray
+    measured: np.ndarray
     evidence: Evidence
     result: GeometryResult
 
@@ -95,6 +95,11 @@ class Track:
     def relative(self) -> np.ndarray:
         """Keyframe camera -> frame camera."""
         return self.pose @ rigid.invert(self.keyframe.pose)
+
+    @property
+    def information(self) -> np.ndarray:
+        """What is left of `measured` where the errors that no sample removes are counted in."""
+        return with_systematic(self.measured, self.relative)
 
 
 def track(
@@ -132,8 +137,7 @@ def track(
         found, evidence = with_lines(found, prior, evidence, keyframe, sight.lines, intrinsics, roles.line_matches)
     if found is None:
         return Track(keyframe, guess.pose, np.zeros((6, 6)), evidence, guess.result)
-    pose = rigid.orthonormal(found.motion @ keyframe.pose)
-    return _judged(pose, with_systematic(found.information, found.motion), evidence, keyframe, expected)
+    return _judged(rigid.orthonormal(found.motion @ keyframe.pose), found.information, evidence, keyframe, expected)
 
 
 def refined_by_map(
@@ -157,9 +161,10 @@ def refined_by_map(
     )
     if refined is None:
         return found
-    information = found.information + refined.information
+    # What no sample removes is common to all keyframes, and counted once.
+    measured = found.measured + refined.information
     evidence = replace(found.evidence, map_points=refined.points)
-    return _judged(rigid.orthonormal(refined.pose), information, evidence, found.keyframe, expected)
+    return _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, expected)
 
 
 def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
@@ -203,17 +208,18 @@ def _by_points(
 
 
 def _judged(
-    pose: np.ndarray, information: np.ndarray, evidence: Evidence, keyframe: Keyframe, expected: Expectation | None
+    pose: np.ndarray, measured: np.ndarray, evidence: Evidence, keyframe: Keyframe, expected: Expectation | None
 ) -> Track:
     """A pose with how well it is known in its worst direction, and how far it is from what was expected."""
-    sigma_translation, sigma_rotation = worst_sigma(information)
+    track = Track(keyframe, pose, measured, evidence, GeometryResult.SUCCESS)
+    sigma_translation, sigma_rotation = worst_sigma(track.information)
     evidence = replace(
         evidence,
         sigma_translation=sigma_translation,
         sigma_rotation=sigma_rotation,
         chi2=float("nan") if expected is None else step_chi2(pose, expected.pose, expected.step, expected.waited),
     )
-    return Track(keyframe, pose, information, evidence, GeometryResult.SUCCESS)
+    return replace(track, evidence=evidence)
 
 
 def _seen(guess: PoseGuess, matches: int, by_points: Motion | None, dense: Aligned | None) -> Evidence:
