@@ -91,13 +91,13 @@ def refine_by_map(
 
 def in_view(keyframes: Sequence[Keyframe], pose: np.ndarray, but: int) -> list[Keyframe]:
     """Those that stand nearest to the frame and look the same way, nearest first, without the keyframe `but`."""
-    scored = []
-    for keyframe in keyframes:
-        turned = rigid.angle_between(keyframe.pose, pose)
-        if keyframe.number != but and turned < WIDEST_TURN:
-            away = float(np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(pose)))
-            scored.append((away + turned, keyframe.number, keyframe))
-    return [keyframe for _, _, keyframe in sorted(scored)[:MOST_KEYFRAMES]]
+    others = [keyframe for keyframe in keyframes if keyframe.number != but]
+    poses = np.array([keyframe.pose for keyframe in others]).reshape(-1, 4, 4)
+    away = np.linalg.norm(rigid.invert(poses)[:, :3, 3] - rigid.centre(pose), axis=1)
+    cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1) / 2
+    turned = np.arccos(np.clip(cosine, -1.0, 1.0))
+    order = [i for i in np.argsort(away + turned, kind="stable") if turned[i] < WIDEST_TURN]
+    return [others[i] for i in order[:MOST_KEYFRAMES]]
 
 
 @dataclass(frozen=True, eq=False)

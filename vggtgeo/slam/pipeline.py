@@ -117,7 +117,8 @@ def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Tra
     assert best is not None
     if not best.accepted or not settings.tracking.search_map:
         return best
-    return refined_by_map(best, sight, slam.keyframes, expected, slam.intrinsics)
+    piece = slam.keyframes[slam.origins[-1] :]
+    return refined_by_map(best, sight, piece, expected, slam.intrinsics)
 
 
 def _with_lines(sight: Sight, roles: Roles, settings: SlamSettings) -> Sight:
