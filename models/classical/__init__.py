@@ -1,7 +1,7 @@
 """Classical implementations of the five perception roles: OpenCV and numpy, no weights."""
 
 from vggtgeo.models.classical.depth import NoDepth, SensorDepth
-from vggtgeo.models.classical.guided_search import can_search, search_near, search_tree
+from vggtgeo.models.classical.guided_search import can_search, search_around, search_near, search_tree
 from vggtgeo.models.classical.line_detector import LsdDetector
 from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
 from vggtgeo.models.classical.line_matcher import BandLineMatcher
@@ -37,6 +37,7 @@ __all__ = [
     "place_vector",
     "pose_information",
     "sample_segments",
+    "search_around",
     "search_near",
     "search_tree",
     "segment_depths",

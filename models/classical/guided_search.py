@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
+from vggtgeo.models.classical.nearest import exclude_far, mutual_nearest
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, confidence_of
 from vggtgeo.models.roles import Features, PointMatches
 
@@ -62,6 +63,23 @@ def search_near(
     good, target = good[keep], target[keep]
     pixels_i, pixels_j = features_i.pixels[index[good]], features_j.pixels[target]
     return PointMatches(index[good], target, pixels_i, pixels_j, confidence_of(clarity[good]))
+
+
+def search_around(
+    features_i: Features,
+    index: np.ndarray,
+    predicted: np.ndarray,
+    features_j: Features,
+    *,
+    radius: float,
+    ratio: float = 0.85,
+) -> PointMatches:
+    """The same where the place is known roughly: `radius` holds many key points, and the best must be mutual."""
+    similarity = _vectors(features_i)[index] @ _vectors(features_j).T
+    exclude_far(similarity, predicted, features_j.pixels, radius)
+    rows, target, clarity = mutual_nearest(similarity, ratio)
+    own = index[rows]
+    return PointMatches(own, target, features_i.pixels[own], features_j.pixels[target], confidence_of(clarity))
 
 
 def _vectors(features: Features) -> np.ndarray:

@@ -17,7 +17,7 @@ from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.models.classical import can_search, search_near, search_tree
+from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.evidence import tangent
 from vggtgeo.slam.keyframe import Keyframe
@@ -89,7 +89,25 @@ def refine_by_map(
     return Refined(current, information, sum(len(part.points) for part in parts), len(parts)) if parts else None
 
 
-def in_view(keyframes: Sequence[Keyframe], pose: np.ndarray, but: int) -> list[Keyframe]:
+def joint_matches(
+    features: Features, keyframes: Sequence[Keyframe], pose: np.ndarray, intrinsics: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of all keyframes in view, matched within `radius` of where a rough `pose` puts them.
+
+    World points float64 [n, 3], pixels [n, 2], confidence [n]. A key point of the frame may have a point of each
+    keyframe.
+    """
+    found = [(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))]
+    for keyframe in in_view(keyframes, pose) if can_search(features) else []:
+        if can_search(keyframe.features):
+            index, points, pixels = _should_show(keyframe, pose, intrinsics)
+            matches = search_around(keyframe.features, index, pixels, features, radius=radius)
+            found.append((points[np.searchsorted(index, matches.index_i)], matches.pixels_j, matches.confidence))
+    points, pixels, confidence = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return points, pixels, confidence
+
+
+def in_view(keyframes: Sequence[Keyframe], pose: np.ndarray, but: int = -1) -> list[Keyframe]:
     """Those that stand nearest to the frame and look the same way, nearest first, without the keyframe `but`."""
     others = [keyframe for keyframe in keyframes if keyframe.number != but]
     poses = np.array([keyframe.pose for keyframe in others]).reshape(-1, 4, 4)
@@ -140,7 +158,19 @@ def _matched(
     """Some of the keyframe's points with known depth that the image should show, where it shows them."""
     if not can_search(keyframe.features):
         return None
+    index, points, pixels = _should_show(keyframe, pose, intrinsics)
     # Key points come strongest first, spread over the image.
+    index, points, pixels = index[:MOST_POINTS], points[:MOST_POINTS], pixels[:MOST_POINTS]
+    found = search_near(keyframe.features, index, pixels, features, tree, radius=radius)
+    if len(found) < LEAST_POINTS:
+        return None
+    return _Part(keyframe, points[np.searchsorted(index, found.index_i)], found.pixels_j)
+
+
+def _should_show(
+    keyframe: Keyframe, pose: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Key points with known depth that fall into the image: their numbers (ascending), world points, pixels."""
     known = np.nonzero(np.isfinite(keyframe.points.inverse_depth))[0]
     points = rigid.unproject(
         keyframe.features.pixels[known], keyframe.points.inverse_depth[known], keyframe.pose, intrinsics
@@ -148,13 +178,8 @@ def _matched(
     height, width = keyframe.image.shape[:2]
     pixels = rigid.project(points, pose, intrinsics)
     with np.errstate(invalid="ignore"):
-        inside = np.nonzero(((pixels > 0) & (pixels < [width - 1, height - 1])).all(1))[0][:MOST_POINTS]
-    found = search_near(keyframe.features, known[inside], pixels[inside], features, tree, radius=radius)
-    if len(found) < LEAST_POINTS:
-        return None
-    row = np.zeros(len(keyframe.features), int)
-    row[known] = np.arange(len(known))
-    return _Part(keyframe, points[row[found.index_i]], found.pixels_j)
+        inside = ((pixels > 0) & (pixels < [width - 1, height - 1])).all(1)
+    return known[inside], points[inside], pixels[inside]
 
 
 def _agrees(own: _Equations, known: np.ndarray, bound: Bound) -> bool:

@@ -21,7 +21,7 @@ from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, si
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking import Expectation, Sight, Track, refined_by_map, tie_between, track
+from vggtgeo.slam.tracking import Expectation, Sight, Track, refined_by_map, tie_between, track, track_by_map
 from vggtgeo.slam.window import adjust, enter
 
 LOST_PATIENCE = 10
@@ -115,9 +115,13 @@ def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Tra
         if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
             break
     assert best is not None
-    if not best.accepted or not settings.tracking.search_map:
+    if not settings.tracking.search_map:
         return best
     piece = slam.keyframes[slam.origins[-1] :]
+    if not best.accepted:
+        source = view_of(best.keyframe, slam, roles)
+        joint = track_by_map(sight, piece, best.keyframe, source, expected, slam.intrinsics, roles)
+        return joint if joint.accepted else best
     return refined_by_map(best, sight, piece, expected, slam.intrinsics)
 
 

@@ -24,7 +24,7 @@ from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, worst_s
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.fusion import Motion, agreed, drawn_to, lines_wanted, with_lines, with_systematic
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.map_points import refine_by_map
+from vggtgeo.slam.map_points import joint_matches, refine_by_map
 from vggtgeo.slam.rgbd_alignment import Aligned
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles
@@ -33,6 +33,8 @@ PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
 SEARCH_RADIUS = 8.0
 """Pixels around the place where a point of the map must be: four standard deviations of a match."""
+ROUGH_RADIUS = 60.0
+"""The same where only the motion so far tells the place: its 6 degrees are 52 px at a focal length of 500."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,15 +122,55 @@ def track(
     aligner = roles.alignment if views is not None else None
     matcher = roles.points if aligner is None else roles.coarse_points
     guess, matches, points = _by_points(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
+    return _placed(sight, keyframe, views, expected, guess, points, len(matches), intrinsics, roles)
+
+
+def track_by_map(
+    sight: Sight,
+    keyframes: Iterable[Keyframe],
+    reference: Keyframe,
+    source: RgbdView | None,
+    expected: Expectation,
+    intrinsics: np.ndarray,
+    roles: Roles,
+) -> Track:
+    """The pose of a frame from the points of all keyframes in view together, where no keyframe alone has enough.
+
+    They are searched around where the motion so far leads. Picture and lines are those of `reference`.
+    """
+    points, pixels, confidence = joint_matches(
+        sight.features, tuple(keyframes), expected.pose, intrinsics, ROUGH_RADIUS
+    )
+    query = PoseQuery(sight.frame.image, intrinsics, points, pixels, confidence, expected.pose)
+    guess = roles.geometry.locate(query)
+    views = None if source is None or sight.view is None else (source, sight.view)
+    return _placed(sight, reference, views, expected, guess, points, len(points), intrinsics, roles)
+
+
+def _placed(
+    sight: Sight,
+    keyframe: Keyframe,
+    views: tuple[RgbdView, RgbdView] | None,
+    expected: Expectation | None,
+    guess: PoseGuess,
+    points: np.ndarray,
+    matches: int,
+    intrinsics: np.ndarray,
+    roles: Roles,
+) -> Track:
+    """The pose by key points, then by picture, surface and lines from there, or from where the motion so far leads.
+
+    points: [n, 3], the world points that `guess` is from, of so many `matches`.
+    """
     known = guess.result is GeometryResult.SUCCESS
-    dense = None
+    aligner, dense = roles.alignment, None
     if aligner is not None and views is not None and (known or expected):
         dense = aligner.align(*views, guess.pose @ rigid.invert(keyframe.pose))
     by_points = None
     if known:
         information = pose_information(guess.pose, points[guess.inliers], intrinsics, PIXEL_SIGMA)
         by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
-    evidence = _seen(guess, len(matches), by_points, dense)
+    evidence = _seen(guess, matches, by_points, dense)
     prior = None if expected is None else expected.motion_from(keyframe)
     found = agreed(by_points, dense, evidence)
     if found is not None and prior is not None:
