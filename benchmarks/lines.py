@@ -8,9 +8,10 @@ matches with the frame three before it; `corridor`, the simulated one with bare 
 truth. `--without-picture` tracks by key points (and segments) alone, as without an alignment of the picture as a whole;
 `--rgb-only` gives no depth either. `--points` leaves that many key points a frame, the best spread over the image.
 
-Printed as Markdown: frames tracked; ATE RMSE and the worst frame in cm after SE(3) alignment (without depth Sim(3)), of
-all frames; how far a frame's pose against its keyframe was off when it was tracked, before any adjustment, in cm,
-median and 95th percentile; and milliseconds of tracking a frame, key points and keyframes not counted in.
+Printed as Markdown: frames tracked, and those in whose pose lines took part; ATE RMSE and the worst frame in cm after
+SE(3) alignment (without depth Sim(3)), of all frames; how far a frame's pose against its keyframe was off when it was
+tracked, before any adjustment, in cm, median and 95th percentile; and milliseconds of tracking a frame, key points and
+keyframes not counted in.
 """
 
 from __future__ import annotations
@@ -93,7 +94,19 @@ def main() -> None:
         roles = replace(roles, depth=NoDepth())
     elif arguments.without_picture:
         roles = replace(roles, alignment=None)
-    print("| source | frames | lines in | tracked | ATE | worst | tracking, median | 95th | ms |\n" + "|---" * 9 + "|")
+    columns = (
+        "source",
+        "frames",
+        "lines in",
+        "tracked",
+        "by lines too",
+        "ATE",
+        "worst",
+        "tracking, median",
+        "95th",
+        "ms",
+    )
+    print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
     for source in arguments.sources:
         for piece in pieces(source, arguments.data, arguments.frames, matcher):
             for variant in arguments.variants:
@@ -143,6 +156,7 @@ def line(piece: Piece, variant: str, roles: Roles) -> str:
         str(len(slam.frames)),
         variant,
         str(tracked),
+        str(sum(record.evidence.lines > 0 for record in slam.frames)),
         f"{100 * errors.rmse:.2f}",
         f"{100 * errors.maximum:.2f}",
         *(f"{value:.2f}" for value in off),
