@@ -19,7 +19,16 @@ from vggtgeo.slam.fusion import with_systematic
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.map_points import Refined, refine_by_map
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.tracking import PIXEL_SIGMA, SEARCH_RADIUS, Expectation, Sight, track, track_by_map
+from vggtgeo.slam.tracking import (
+    PIXEL_SIGMA,
+    SEARCH_RADIUS,
+    Expectation,
+    Sight,
+    refined_by_map,
+    tie_to,
+    track,
+    track_by_map,
+)
 
 SIZE = (320, 240)
 ROLES = Roles(points=SiftMatcher(count=500))
@@ -83,6 +92,24 @@ def test_a_keyframe_that_drifted_is_left_out(view: View) -> None:
     assert without is not None
     assert found.keyframes == 2
     np.testing.assert_allclose(found.pose, without.pose, atol=1e-9)
+
+
+def test_a_tie_counts_what_other_keyframes_know_only_once(view: View) -> None:
+    """A pose that the points of others refined ties a new keyframe by what its own keyframe measured.
+
+    Oracle: the track before the refinement.
+    """
+    keyframes, frame, true, intrinsics = view
+    sight = Sight(Frame(8, 0.8, frame.image, None, ""), frame.features, None)
+    expected = Expectation(true, np.eye(4))
+    own = track(sight, keyframes[2], None, expected, intrinsics, ROLES)
+    refined = refined_by_map(own, sight, keyframes, expected, intrinsics)
+    assert refined.evidence.map_points > 0
+    assert np.linalg.eigvalsh(refined.measured - own.measured)[0] > 0
+    tie = tie_to(refined, 9)
+    assert tie.keyframes == (2, 9)
+    np.testing.assert_allclose(tie.information, own.information)
+    np.testing.assert_allclose(tie.pose, own.relative)
 
 
 def test_keyframes_with_too_few_points_each_place_a_frame_together(view: View) -> None:

@@ -21,7 +21,7 @@ from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, si
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking import Expectation, Sight, Track, refined_by_map, tie_between, track, track_by_map
+from vggtgeo.slam.tracking import Expectation, Sight, Track, refined_by_map, tie_between, tie_to, track, track_by_map
 from vggtgeo.slam.window import adjust, enter
 
 LOST_PATIENCE = 10
@@ -151,7 +151,7 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
             number, frame, found.pose, sight.features, roles, settings, slam.intrinsics, sight.found_lines
         )
     with clock.measure("match keyframes"):
-        tie = MeasuredRelativePose(found.keyframe.number, number, found.relative, found.information)
+        tie = tie_to(found, number)
         if found.keyframe.number not in slam.window:
             slam = _window_around(slam, found.keyframe.number, settings)
         slam = enter(slam, keyframe, roles, settings)

@@ -56,7 +56,8 @@ class Sight:
     @property
     def found_lines(self) -> LineFeatures | None:
         """The segments, where they were asked for."""
-        return self.__dict__.get("lines")
+        found: LineFeatures | None = self.__dict__.get("lines")
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,7 @@ class Track:
     measured: np.ndarray
     evidence: Evidence
     result: GeometryResult
+    alone: Track | None = None
 
     @property
     def accepted(self) -> bool:
@@ -206,11 +208,22 @@ def refined_by_map(
     # What no sample removes is common to all keyframes, and counted once.
     measured = found.measured + refined.information
     evidence = replace(found.evidence, map_points=refined.points)
-    return _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, expected)
+    better = _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, expected)
+    return replace(better, alone=found)
+
+
+def tie_to(found: Track, number: int) -> MeasuredRelativePose:
+    """What the track of a frame that is now keyframe `number` says of its motion from the one it was tracked against.
+
+    What other keyframes know of it enters by their own edges: in the tie it would count twice.
+    """
+    own = found.alone or found
+    return MeasuredRelativePose(own.keyframe.number, number, own.relative, own.information)
 
 
 def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
     """What two tracks of one frame say of the motion between their keyframes."""
+    first, second = first.alone or first, second.alone or second
     motion = rigid.invert(second.relative) @ first.relative
     # Both errors are tangents at the frame; carried to the second keyframe by the adjoint of its motion.
     carry = rigid.adjoint(rigid.invert(second.relative))

@@ -103,7 +103,7 @@ def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings) 
 
 def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
-    slam = _with_line_depths(slam)
+    slam = slam if slam.metric else _with_line_depths(slam)
     members = [slam.keyframes[number] for number in slam.window]
     adjustment = window_problem(slam, members, settings)
     solution = solve_jit(adjustment.problem, adjustment.initial, solver=window_solver(settings))
@@ -125,7 +125,10 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
 
 
 def _with_line_depths(slam: Slam) -> Slam:
-    """The state with the depths of segments that nothing measured and that the window's views tell."""
+    """The state with the depths of segments that the window's views tell.
+
+    Not beside measured depth: what that leaves out is glass, mirrors and what is far away.
+    """
     inside = {number: slam.keyframes[number] for number in slam.window}
     keyframes = list(slam.keyframes)
     for number, keyframe in with_segment_depths(inside, window_edges(slam), slam.intrinsics).items():
