@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from vggtgeo.cli.jax_flags import set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.interruption import end_on_signals
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1
@@ -165,6 +166,8 @@ def _leave(error: BaseException) -> NoReturn:
     """End the program with one line on stderr."""
     if isinstance(error, KeyboardInterrupt):
         message, code = "interrupted", EXIT_INTERRUPTED
+    elif isinstance(error, OSError) and error.filename is not None:
+        message, code = f"error: `{error.filename}`: {error.strerror}", EXIT_INPUT
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
     elif _is_usage_error(error):
@@ -211,6 +214,7 @@ def make_app() -> typer.Typer:
 def main() -> None:
     """Entry point of the program."""
     set_jax_flags()
+    end_on_signals()
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
     make_app()(prog_name="vggtgeo")
 

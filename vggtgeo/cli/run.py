@@ -79,7 +79,7 @@ def run(
         sequence,
         perceived,
         slam_settings,
-        Output(output, flags, rerun, save_depth, quiet, as_json),
+        Output(output, flags, rerun, save_depth, quiet, as_json, source=path),
         (start, end, stride),
         seed=seed,
         warned=warned,

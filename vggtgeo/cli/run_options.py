@@ -11,9 +11,9 @@ Provider = Literal["auto", "cuda", "cpu"]
 SequenceArgument = Annotated[Path, typer.Argument(help="Folder of a sequence, or a video file.", show_default=False)]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
 KindOption = Annotated[str | None, typer.Option(help="Reader: 7scenes, tum, images or video; found by looking.")]
-StartOption = Annotated[int, typer.Option(help="First frame.")]
-EndOption = Annotated[int | None, typer.Option(help="Frame to stop before.")]
-StrideOption = Annotated[int, typer.Option(help="Take every n-th frame.")]
+StartOption = Annotated[int, typer.Option(min=0, help="First frame.")]
+EndOption = Annotated[int | None, typer.Option(min=1, help="Frame to stop before.")]
+StrideOption = Annotated[int, typer.Option(min=1, help="Take every n-th frame.")]
 IntrinsicsOption = Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels, in place of the folder's.")]
 RgbOnlyOption = Annotated[
     bool, typer.Option("--rgb-only/--no-rgb-only", help="Ignore depth images: the scale stays free.")

@@ -51,7 +51,7 @@ class SevenScenes(FolderSequence):
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses; pose files with NaN or infinity (tracking was lost) are left out with an InputWarning."""
-        if (self.folder / COLOUR_TRUTH).is_file():
+        if (self.folder / COLOUR_TRUTH).exists():
             return Trajectory.load_tum(self.folder / COLOUR_TRUTH)
         times, poses = [], []
         for file in self.files:

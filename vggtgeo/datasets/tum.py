@@ -60,7 +60,7 @@ class TumRgbd(FolderSequence):
     def ground_truth(self) -> Trajectory | None:
         """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
         file = self.folder / _TRUTH
-        return Trajectory.load_tum(file) if file.is_file() else None
+        return Trajectory.load_tum(file) if file.exists() else None
 
 
 def _read_list(file: Path, frames: bool = False) -> list[_Entry]:

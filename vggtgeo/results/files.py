@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 import tomli_w
 
-from vggtgeo.io.files import atomic_path, write_text
+from vggtgeo.io.files import atomic_open, write_text
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
@@ -34,8 +33,9 @@ def write_depth(folder: Path, keyframes: Sequence[Keyframe], depths: Sequence[np
         metres = np.zeros(keyframe.depth.shape) if depth is None else np.nan_to_num(depth)
         counts = np.clip(metres * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
         for name, image in (("depth", counts), ("confidence", keyframe.depth_confidence)):
-            with atomic_path(folder / "depth" / f"{keyframe.frame:06d}.{name}.png") as temporary:
-                cv2.imwrite(os.fspath(temporary), image)
+            # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
+            with atomic_open(folder / "depth" / f"{keyframe.frame:06d}.{name}.png", "wb") as file:
+                file.write(cv2.imencode(".png", image)[1].tobytes())
 
 
 def write_settings(path: Path, values: Mapping[str, Any]) -> None:
