@@ -39,6 +39,7 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
 def handlers() -> Iterator[None]:
     """The signals as the program's entry has them."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts jobs in the background without it
     end_on_signals()
     yield
     for number, handler in before.items():

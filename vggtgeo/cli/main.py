@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import sys
 import warnings
 from collections.abc import Callable
@@ -186,6 +187,14 @@ def _usage_message(error: Any) -> str:
     return f"{message} (see `{command} --help`)"
 
 
+def _version(asked: bool) -> bool:
+    """Print the version of the package, and end."""
+    if asked:
+        typer.echo(f"vggtgeo {importlib.metadata.version('vggtgeo')}")
+        raise typer.Exit
+    return asked
+
+
 def _stand_in() -> None:
     """Never called: `_LazyGroup` puts the real command in its place."""
 
@@ -203,6 +212,9 @@ def make_app() -> typer.Typer:
     @app.callback()
     def options(
         debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+        version: Annotated[
+            bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        ] = False,
     ) -> None:
         """Dense indoor SLAM with a functional, differentiable bundle adjustment."""
 

@@ -68,7 +68,7 @@ def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
     if not file.is_file():
         raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
     entries = []
-    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         text = line.split("#", 1)[0].strip()
         if text:
             entries.append(_parse_entry(file, number, text))

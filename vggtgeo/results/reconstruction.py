@@ -22,6 +22,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.warned import collected_warnings
+from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
@@ -34,10 +35,13 @@ from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
-from vggtgeo.slam.trust.input import check_input
+from vggtgeo.slam.trust.input import check_input, check_refusals
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.window import warm_up
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
+
+LEAST_SIDE = 32
+"""Pixels: windows of features and of the image pyramid do not fit into less."""
 
 
 def reconstruct(
@@ -106,7 +110,10 @@ def reconstruct(
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
         }
-        ending = _Ending(slam, source.truth, report, (*warned, *collected), title or source.name, known, clock, began)
+        notices = (*warned, *collected)
+        ending = _Ending(
+            slam, source.truth, report, notices, perception.refusals, title or source.name, known, clock, began
+        )
         return _concluded(ending, settings, hooks, windows.records, evidence)
 
 
@@ -118,6 +125,7 @@ class _Ending:
     truth: Trajectory | None
     report: TrajectoryReport | None
     warned: tuple[Warning | str, ...]
+    refusals: Mapping[str, Refusals]
     title: str
     facts: Mapping[str, Any]
     clock: Clock
@@ -134,7 +142,8 @@ def _concluded(
         cloud = map_points(slam.keyframes, slam.intrinsics, depths)
     hooks.each("on_finish", slam, cloud)
     with clock.measure("verdict"):
-        verdict = judge(slam, evidence.frames, check_input(run.warned, len(slam.frames)))
+        left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
+        verdict = judge(slam, evidence.frames, left_out)
     summary = summarise(
         slam,
         verdict,
@@ -167,7 +176,12 @@ class _Source:
         return self.frames.has_depth
 
     def check(self, start: int, end: int | None, stride: int) -> None:
-        """InputError for a selection that is none, before anything is compiled."""
+        """InputError for a selection that is none, or images too small for features, before anything is compiled."""
+        if min(self.camera.width, self.camera.height) < LEAST_SIDE:
+            raise InputError(
+                f"the images of `{self.name}` are {self.camera.width} x {self.camera.height} pixels; both sides must "
+                f"be at least {LEAST_SIDE}"
+            )
         length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames)
         check_selection(self.name, length, start, end, stride)
 

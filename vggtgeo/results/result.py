@@ -113,7 +113,7 @@ class Result:
             fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
             metric = summary["scale"] == "metric"
             verdict = Verdict.from_dict(summary["verdict"], metric)
-        except (OSError, json.JSONDecodeError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             message = f"`{place}` has no usable `summary.json` ({error}); give a folder that `vggtgeo run` wrote"
             raise InputError(message) from None
         return cls(
@@ -168,7 +168,7 @@ class Result:
         write_json(place / "summary.json", plain)
         self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
         if depth and self.record is not None:
-            write_depth(place, self.record.slam.keyframes, self.record.depths)
+            write_depth(place, self.record.slam.keyframes, self.record.depths, self.record.slam.metric)
         run.publish()
 
     def _draw(self, place: Path, name: str, summary: Mapping[str, Any]) -> None:
