@@ -22,7 +22,7 @@ from vggtgeo.models.roles import (
 )
 from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.fusion import Motion, agreed, drawn_to, lines_wanted, with_lines, with_systematic
+from vggtgeo.slam.fusion import Motion, agreed, drawn_to, wanting, with_lines, with_systematic
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.map_points import joint_matches, refine_by_map
 from vggtgeo.slam.rgbd_alignment import Aligned
@@ -177,7 +177,8 @@ def _placed(
     found = agreed(by_points, dense, evidence)
     if found is not None and prior is not None:
         found = drawn_to(found, prior)
-    if lines_wanted(found, prior) and sight.lines is not None:
+    needed = prior is not None if found is None else wanting(found)
+    if needed and sight.lines is not None:
         found, evidence = with_lines(found, prior, evidence, keyframe, sight.lines, intrinsics, roles.line_matches)
     if found is None:
         return Track(keyframe, guess.pose, np.zeros((6, 6)), evidence, guess.result)
@@ -191,7 +192,9 @@ def refined_by_map(
     expected: Expectation | None,
     intrinsics: np.ndarray,
 ) -> Track:
-    """The same with what the points of all other keyframes in view know of the pose."""
+    """The same with what the points of all other keyframes in view know of the pose, where something is wanting."""
+    if not wanting(Motion(found.relative, found.measured)):
+        return found
     refined = refine_by_map(
         sight.features,
         tuple(keyframes),
