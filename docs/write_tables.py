@@ -41,7 +41,8 @@ def main() -> None:
     folder = arguments.folder or Path("runs") / name
     suite, rows = load_suite(name), load_rows(folder / "runs.csv")
     if arguments.clips:
-        page, tables = DOCS.parent / "README.md", markdown.details(suite, [row for row in rows if row["status"] == "ok"])
+        good = [row for row in rows if row["status"] == "ok"]
+        page, tables = DOCS.parent / "README.md", markdown.details(suite, good)
     else:
         page, tables = DOCS / "paper-tables.md", (folder / "tables.md").read_text().partition("\n\n")[2]
         with atomic_path(DOCS / "paper-tables.png") as temporary:

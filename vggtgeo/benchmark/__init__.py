@@ -6,6 +6,7 @@
 | `jobs` | the runs of a suite, each with all it depends on |
 | `inputs`, `worker`, `measure` | one run: what it looks at, the run, its row of numbers |
 | `processes`, `scheduling` | a process with limits; many of them in turn or side by side |
+| `cluster` | the same on a Ray cluster |
 | `store`, `provenance` | finished runs as folders, so that a second call goes on; where numbers come from |
 | `table`, `statistics`, `cells` | CSV and Parquet; means, intervals, paired differences |
 | `external`, `published` | trajectories of other systems; figures that others published, shown apart |

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark import markdown
+from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
 from vggtgeo.benchmark.external import external_rows
 from vggtgeo.benchmark.figures import ablation_figure
 from vggtgeo.benchmark.inputs import data_folders
@@ -93,6 +94,7 @@ def bench(
     memory_gb: float | None = None,
     retry: bool = False,
     progress: Progress | None = None,
+    cluster: Cluster | None = None,
 ) -> BenchReport:
     """Run a suite (sequences x settings x seeds) and write its tables and its page into the folder `output`.
 
@@ -114,6 +116,7 @@ def bench(
         memory_gb: limit of one run, in place of the suite's.
         retry: run again what ended without a result.
         progress: see `Progress`.
+        cluster: a Ray cluster to run on, in place of processes here.
 
     Raises:
         InputError: a suite, a name in it or a folder that is not there.
@@ -136,7 +139,7 @@ def bench(
     minutes, memory = timeout_minutes or chosen.timeout_minutes, memory_gb or chosen.memory_gb
     jobs = jobs_of(chosen, data_folders(data))
     store = Store(folder, chosen.name, source_digest())
-    rows = all_rows(jobs, store, Limits(60 * minutes, memory), workers, retry, progress)
+    rows = all_rows(jobs, store, Limits(60 * minutes, memory), workers, retry, progress, cluster)
     base = Path(suite).parent if not isinstance(suite, Suite) else Path()
     rows += external_rows(chosen, jobs, folder / "runs", base)
     report = BenchReport(chosen, tuple(rows), folder)
@@ -151,9 +154,10 @@ def all_rows(
     workers: int = 1,
     retry: bool = False,
     progress: Progress | None = None,
+    cluster: Cluster | None = None,
     **options: Any,
 ) -> list[Row]:
-    """The rows of `jobs` in their order, from the store or by running them."""
+    """The rows of `jobs` in their order, from the store or by running them, in processes here or on a cluster."""
     rows: dict[str, Row] = {}
 
     def note(job: Job, row: Row) -> None:
@@ -168,7 +172,10 @@ def all_rows(
             missing.append(job)
         else:
             note(job, row)
-    run_jobs(missing, store, limits, min(workers, max(len(missing), 1)), note, **options)
+    if cluster is not None:
+        run_jobs_on_cluster(missing, store, limits, cluster, note, **options)
+    else:
+        run_jobs(missing, store, limits, min(workers, max(len(missing), 1)), note, **options)
     return [rows[job.name] for job in jobs]
 
 

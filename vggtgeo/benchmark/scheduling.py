@@ -9,10 +9,11 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from vggtgeo.benchmark.inputs import walk_name
 from vggtgeo.benchmark.jobs import Job
-from vggtgeo.benchmark.processes import Limits, run_limited, shares
+from vggtgeo.benchmark.processes import Ending, Limits, run_limited, shares
 from vggtgeo.benchmark.store import Row, Store
 from vggtgeo.benchmark.worker import LOG
 
@@ -20,6 +21,7 @@ Command = Callable[[Path, Path], Sequence[str]]
 """The command line of a run, given its folder and the scratch folder."""
 Finished = Callable[[Job, Row], None]
 _WAIT = 0.1
+_LAST = 2000  # characters of a log that are looked at for its last line
 
 
 def worker_command(folder: Path, scratch: Path) -> list[str]:
@@ -80,21 +82,24 @@ def run_one(
     """One run and its row."""
     place = store.begin(job)
     began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    ending = run_limited(command(place, scratch), place / LOG, limits, cores, stop)
-    status = "crash" if ending.status in ("ended", "killed") else ending.status
+    log = place / LOG
+    ending = run_limited(command(place, scratch), log, limits, cores, stop)
+    return store.complete(job, **described(ending, log.read_bytes()), started=began, cpus=len(cores))
+
+
+def described(ending: Ending, log: bytes) -> dict[str, Any]:
+    """The columns of a row that tell how its process ended; the status is that of a run that left no row itself."""
     message = ending.message
     if ending.status == "ended" and ending.code > 0:
-        message = f"{message}: {store.last_line(job)}"
-    return store.complete(
-        job,
-        status=status,
-        message=message,
-        started=began,
-        seconds_wall=ending.seconds,
-        peak_memory_gb=ending.peak_gb,
-        tries=ending.tries,
-        cores=len(cores),
-    )
+        lines = log[-_LAST:].decode(errors="replace").splitlines()
+        message = f"{message}: {next((line.strip() for line in reversed(lines) if line.strip()), '')}"
+    return {
+        "status": "crash" if ending.status in ("ended", "killed") else ending.status,
+        "message": message,
+        "seconds_wall": ending.seconds,
+        "peak_memory_gb": ending.peak_gb,
+        "tries": ending.tries,
+    }
 
 
 class _Queue:

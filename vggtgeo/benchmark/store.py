@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.jobs import Job
-from vggtgeo.benchmark.worker import JOB, LOG, ROW, identity
+from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 
 Row = Mapping[str, Any]
 """A line of the table: plain values by the names of the columns."""
-_LAST = 2000  # characters of a log that are looked at for its last line
 
 
 @dataclass(frozen=True)
@@ -50,13 +49,13 @@ class Store:
         """An empty folder with what the run is to do."""
         place = self.place(job)
         shutil.rmtree(place, ignore_errors=True)
-        write_json(place / JOB, self._described(job))
+        write_json(place / JOB, self.described(job))
         return place
 
     def complete(self, job: Job, **columns: Any) -> Row:
         """The row that the run left, or one that says that it left none, with `columns`."""
         path = self.place(job) / ROW
-        row = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else identity(self._described(job))
+        row = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else identity(self.described(job))
         if "status" in row:
             row = {**{name: value for name, value in columns.items() if name != "message"}, **row}
         else:
@@ -66,16 +65,12 @@ class Store:
 
     def absent(self, job: Job) -> Row:
         """The row of a run whose recording is not there; not stored, as it may be there tomorrow."""
-        return {**identity(self._described(job)), "status": "absent", "message": "the recording is not there"}
+        return {**identity(self.described(job)), "status": "absent", "message": "the recording is not there"}
 
-    def last_line(self, job: Job) -> str:
-        """The last line of what the run printed."""
-        log = self.place(job) / LOG
-        text = log.read_text(encoding="utf-8", errors="replace")[-_LAST:] if log.is_file() else ""
-        return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
-
-    def _described(self, job: Job) -> dict[str, Any]:
+    def described(self, job: Job) -> dict[str, Any]:
+        """What a run is to do, as `job.json` holds it."""
         return {
+            "name": job.name,
             "suite": self.suite,
             "sequence": job.sequence,
             "setting": job.setting,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -35,10 +35,17 @@ def bench(
     timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
     memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
     retry: Annotated[bool, typer.Option("--retry/--no-retry", help="Run again what ended without a result.")] = False,
+    engine: Annotated[
+        Literal["processes", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
+    ] = "processes",
+    address: Annotated[str, typer.Option(help="Of the Ray cluster; local starts one.")] = "auto",
+    cpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 1.0,
+    gpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 0.0,
     quiet: Annotated[bool, typer.Option("--quiet/--no-quiet", help="Print the tables only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a suite of sequences, settings and seeds, and write its tables and its page."""
+    from vggtgeo.benchmark.cluster import Cluster
     from vggtgeo.benchmark.runner import bench as run_suite  # brings JAX, which --help does without
     from vggtgeo.benchmark.suite import shipped
 
@@ -62,6 +69,7 @@ def bench(
             memory_gb=memory_gb,
             retry=retry,
             progress=bar.advance,
+            cluster=Cluster(address, cpus, gpus) if engine == "ray" else None,
         )
     typer.echo(json.dumps(report.to_dict()) if as_json else report.markdown())
     if not (quiet or as_json):

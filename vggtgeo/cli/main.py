@@ -87,6 +87,15 @@ COMMANDS = (
         ("vggtgeo models list  # what each is for, its licence, and whether its file is there",),
     ),
     CommandEntry(
+        "data",
+        "vggtgeo.cli.data",
+        "Where to get recordings, and what is wrong with one.",
+        (
+            "vggtgeo data list  # benchmarks: where to get them, sizes, licences, layouts",
+            "vggtgeo data check /disk/tum/rgbd_dataset_freiburg1_desk  # what is wrong with a folder",
+        ),
+    ),
+    CommandEntry(
         "bench",
         "vggtgeo.cli.bench",
         "Run a suite of sequences, settings and seeds, and write its tables and its page.",

@@ -29,6 +29,7 @@ def run(
     output: options.OutputOption = Path("run"),
     settings: SettingsOption = None,
     kind: options.KindOption = None,
+    fps: options.FpsOption = None,
     start: options.StartOption = 0,
     end: options.EndOption = None,
     stride: options.StrideOption = 1,
@@ -72,7 +73,7 @@ def run(
     }
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:
-        sequence = open_input(path, kind, intrinsics, rgb_only)
+        sequence = open_input(path, kind, intrinsics, rgb_only, fps)
     classical = classical_roles(sequence.has_depth, init, features)
     perceived = make_perception(preset, classical, models, cache, provider, memory_limit_gb)
     flags = settings.values() if settings else {}
@@ -95,11 +96,13 @@ def check_flags(preset: str, features: str, memory_limit_gb: float | None) -> No
         raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be positive")
 
 
-def open_input(path: Path, kind: str | None, intrinsics: str | None, rgb_only: bool) -> Sequence:
+def open_input(
+    path: str | Path, kind: str | None, intrinsics: str | None, rgb_only: bool, fps: float | None = None
+) -> Sequence:
     """The sequence at `path`, with what the flags say otherwise."""
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
 
-    sequence = open_sequence(path, kind)
+    sequence = open_sequence(path, kind, fps)
     if intrinsics is not None:
         sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
     return without_depth(sequence) if rgb_only else sequence
