@@ -11,7 +11,7 @@ import pytest
 import tiny_sequences as tiny
 from bad_row import Row, good, line, nothing, rows, run_with
 
-from vggtgeo.cli.jax_flags import cache_folder
+from vggtgeo.io.jax_environment import cache_folder
 from vggtgeo.results import Result
 from vggtgeo.results.run_folder import taken
 

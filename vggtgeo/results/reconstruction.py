@@ -190,6 +190,8 @@ class _Source:
         if isinstance(self.frames, FrameStream):
             return None
         length = len(self.frames)
+        if not length:  # a camera that is running
+            return None
         return len(range(start, length if end is None else min(length, end), stride))
 
 
