@@ -155,7 +155,7 @@ RUN = rows(
         ("`--features orb --preset paper`", good, flags("--features", "orb", "--preset", "paper")),
         ("`--set` without a value", good, flags("--set", "nonsense")),
         ("`--set` of a setting that is none", good, flags("--set", "tracking.least_inlier=3")),
-        ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=many")),
+        ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=-3")),
         ("`--rerun` to a text file", good, flags("--rerun", "run.txt")),
         ("`--seed -1`", good, flags("--seed", "-1")),
         ("`--seed` beyond 32 bits", good, flags("--seed", "99999999999")),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from vggtgeo.cli.options import JsonOption
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -50,7 +51,11 @@ def evaluate(
 def load_estimate(path: Path) -> Trajectory:
     """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`."""
     from vggtgeo.geometry.trajectory import Trajectory
+    from vggtgeo.results.run_folder import check_finished
 
+    unfinished = check_finished(path)
+    if unfinished:
+        warnings.warn(unfinished, InputWarning, stacklevel=2)
     return Trajectory.load_tum(path / "trajectory.txt" if path.is_dir() else path)
 
 

@@ -78,7 +78,7 @@ class FolderSequence:
             read = self._read_image(file, bits)
             if read is None:
                 continue
-            if read.bits > max(bits, 8):
+            if read.bits > bits and (bits > 8 or read.bits < 16):
                 _warn(f"`{file.image}` has values of {read.bits} bits: taken for an image of so many from here on")
             bits = max(bits, read.bits)
             if read.orientation != 1 and not turned:

@@ -8,6 +8,7 @@ folder holds files of one run only, without a summary, and `unfinished/` says so
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tomllib
@@ -139,11 +140,20 @@ def _begun(run: RunFolder, reserve: int) -> RunFolder:
         )
         if reserve and hasattr(os, "posix_fallocate"):
             with (run.stage / _RESERVED).open("wb") as file:
-                os.posix_fallocate(file.fileno(), 0, reserve)
+                _allocate(file.fileno(), reserve)
     except OSError as error:
         _remove(run.stage)
         raise _not_written(run.folder, error, reserve) from None
     return run
+
+
+def _allocate(file: int, size: int) -> None:
+    """Takes the space on the disk; some file systems cannot promise any."""
+    try:
+        os.posix_fallocate(file, 0, size)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):
+            raise
 
 
 def _end(stage: Path) -> None:
