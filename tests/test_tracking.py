@@ -268,7 +268,14 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
     seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:16], *frames[14:4:-1]))]
     whole = replace(_run(seen, camera), metric=False)
     origin = len(whole.keyframes) // 2
-    apart = scaled_piece(replace(whole, origins=(0, origin)), 1.6)
+    own = lambda ends: len({number < origin for number in ends}) == 1
+    torn_apart = replace(
+        whole,
+        origins=(0, origin),
+        pairs=tuple(pair for pair in whole.pairs if own(pair.key)),
+        factors=tuple(factor for factor in whole.factors if own(factor.keyframes)),
+    )
+    apart = scaled_piece(torn_apart, 1.6)
     moved = np.eye(4)
     moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
     moved[:3, 3] = [0.5, -1.0, 2.0]

@@ -32,6 +32,28 @@ def relocalise(
     return None
 
 
+def revisit(slam: Slam, sight: Sight, roles: Roles) -> Track | None:
+    """The frame's pose by an old keyframe that shows the same place, wherever drift has put it: a loop that is closed
+    while the run goes on. The camera goes on from there, and the last adjustment spreads what the loop was off.
+
+    One keyframe is verified at most, and only one that looks as much like the frame as those of the window do: that
+    costs as much as a tracked frame. Without metric depth the unit drifts, too, and loops wait for the end.
+    """
+    place = place_vector(sight.features)
+    recent = slam.window[0] if slam.window else 0
+    old = [k for k in slam.keyframes if k.number < recent and k.place is not None and k.number not in slam.window]
+    near = [slam.keyframes[number].place for number in slam.window]
+    if not slam.metric or place is None or not old:
+        return None
+    usual = np.median([known @ place for known in near if known is not None] or [1.0])
+    similarity = [float(k.place @ place) for k in old if k.place is not None]
+    best = int(np.argmax(similarity))
+    if similarity[best] < usual:
+        return None
+    found = track(sight, old[best], view_of(old[best], slam, roles), None, slam.intrinsics, roles)
+    return found if found.accepted and found.evidence.certain else None
+
+
 def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Keyframe, ...]:
     """The keyframes that look most like the frame, best first; the newest, where descriptors do not tell."""
     place = place_vector(features)

@@ -32,7 +32,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     aligned = [by_frame[frame] for frame in estimate.frames if frame in by_frame]
     found = [*input_findings, *check_record(estimate), *check_speed(estimate)]
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
-        height, width = slam.keyframes[0].image.shape[:2]
+        height, width = slam.keyframes[0].size
         found += _images(estimate, aligned, (width, height))
     return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)
 
