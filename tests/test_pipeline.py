@@ -196,6 +196,7 @@ def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
         assert off < bound, f"{off:.4f} m"
 
 
+@pytest.mark.long
 def test_rgb_recovers_the_shape(room) -> None:
     """Without depth the trajectory is right up to scale, and the state says that lengths are not metres."""
     frames, camera, truth = room
