@@ -66,7 +66,8 @@ def pieces(slam: Slam) -> list[dict[str, Any]]:
     """
     found = []
     for piece, numbers in enumerate(pieces_by_size(slam)):
-        own = [record.frame for record in slam.frames if record.tracked and record.reference in numbers]
+        inside = set(numbers)
+        own = [record.frame for record in slam.frames if record.tracked and record.reference in inside]
         ends = [min(own), max(own)] if own else []
         file = piece_file("trajectory", piece)
         found.append({"trajectory": file, "frames": ends, "poses": len(own), "keyframes": len(numbers)})

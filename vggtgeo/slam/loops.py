@@ -38,13 +38,13 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     label, known = piece_of(slam), {pair.key for pair in slam.pairs}
     proposed = list(dict.fromkeys([*_by_estimate(slam, settings, known), *_by_appearance(slam, settings, known)]))
     found = list(_verified(slam, proposed, label, roles, settings))
-    before, (straight, believed) = slam, straightened(slam, found, settings)
+    before, (straight, believed) = slam, straightened(slam, found)
     slam = replace(straight, pairs=(*slam.pairs, *(loop.pair for loop in believed)))
     if straight is before:
         return slam
     known |= {loop.pair.key for loop in found}
     more = _verified(slam, _by_estimate(slam, settings, known), piece_of(slam), roles, settings)
-    return replace(slam, pairs=(*slam.pairs, *(loop.pair for loop in more if loop.agrees(slam, settings))))
+    return replace(slam, pairs=(*slam.pairs, *(loop.pair for loop in more if loop.agrees(slam))))
 
 
 def _verified(

@@ -219,10 +219,10 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         expected = Expectation(found.pose, slam.velocity)
         again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
         if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
-            again = None
+            again = None  # drift may have put another keyframe there
     if again is None:
-        again = revisit(slam, sight, roles)
-    if again is None:
+        again = revisit(slam, sight, found.pose, roles)
+    if again is None or _needs_keyframe(again, settings):
         return slam, found
     near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):

@@ -17,12 +17,14 @@ from vggtgeo.slam.evidence import tangent
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.loop_witnesses import witnessed
 from vggtgeo.slam.pose_graph import BELIEF, PoseGraph, distance, solve_pose_graph
-from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.start import NOMINAL_DEPTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.unit_graph import UnitRatio, solve_units
 from vggtgeo.slam.units import longer, scaled_factor, scaled_keyframe, scaled_record
 
+MENDABLE = 20.0
+"""Pixels of the median match beyond which the map is straightened before it is adjusted. An adjustment alone brings
+back 5 cm and 2 degrees, 16 pixels (`tests/test_pipeline.py`)."""
 UNTRACKED = (0.02, np.deg2rad(1.0))
 """Standard deviation of a motion between keyframes that no tracking has measured, metres and radians: that of two
 views that start a map of free scale."""
@@ -36,39 +38,40 @@ class Loop:
     motion: MeasuredRelativePose
     ratio: float | None
 
-    def agrees(self, slam: Slam, settings: SlamSettings) -> bool:
-        """Whether the map's adjustment can take the matches: half of them reproject within the gate of a match."""
+    def agrees(self, slam: Slam) -> bool:
+        """Whether the map's adjustment can take the matches: half of them reproject within `MENDABLE`."""
         first, second = (slam.keyframes[number] for number in self.pair.key)
         matches = self.pair.points
         inverse = first.points.inverse_depth[matches.index_i]
         points = rigid.unproject(matches.pixels_i, inverse, first.pose, slam.intrinsics)
         off = np.linalg.norm(rigid.project(points, second.pose, slam.intrinsics) - matches.pixels_j, axis=1)
-        return bool(np.median(np.where(np.isfinite(off), off, np.inf)) < settings.matching.match_gate)
+        return bool(np.median(np.where(np.isfinite(off), off, np.inf)) < MENDABLE)
 
 
-def straightened(slam: Slam, loops: Sequence[Loop], settings: SlamSettings) -> tuple[Slam, list[Loop]]:
+def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     """The map after a pose graph, if any loop contradicts it by more than its adjustment can mend, and the loops that
     are believed.
     """
     motions, closing = odometry(slam)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
-    drifted = [loop for loop in loops if not loop.agrees(slam, settings)]
-    torn = [
-        tie for tie in closing if distance(tie, poses) > BELIEF and _pixels(tie, slam) > settings.matching.match_gate
-    ]
+    drifted = [loop for loop in loops if not loop.agrees(slam)]
+    torn = [tie for tie in closing if distance(tie, poses) > BELIEF and _pixels(tie, slam) > MENDABLE]
     if not drifted and not torn:
         return slam, list(loops)
     units = np.ones(len(poses)) if slam.metric else _units(slam, motions, loops)
     graph = _graph(slam, motions, (*closing, *(loop.motion for loop in loops)), units)
     sure = witnessed(graph.loops, graph.motions, BELIEF) | (np.arange(len(graph.loops)) < len(closing))
     if not sure.any():
-        agreeing = [loop for loop in loops if loop.agrees(slam, settings)]
+        agreeing = [loop for loop in loops if loop.agrees(slam)]
         return _noted(slam, len(loops) - len(agreeing)), agreeing
     found = solve_pose_graph(replace(graph, loops=tuple(compress(graph.loops, sure))))
     dropped = [tie for tie, true in zip(closing, found.believed[: len(closing)], strict=True) if not true]
     moved = _taken(slam, found.poses, units, dropped)
     # A loop without a witness took no part; where the straightened map agrees with it, its matches are used.
-    believed = [loop for loop in loops if loop.agrees(moved, settings)]
+    true = np.zeros(len(graph.loops), bool)
+    true[sure] = found.believed
+    own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
+    believed = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
     return _noted(moved, len(loops) - len(believed), slam), believed
 
 
@@ -87,10 +90,10 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     between = lambda first, second: rigid.orthonormal(poses[second] @ rigid.invert(poses[first]))
     loose = np.diag(1.0 / np.repeat(UNTRACKED, 3) ** 2)
-    motions, label = [], piece_of(slam)
+    motions, matched = [], {pair.key for pair in slam.pairs if len(pair.points)}
     for number in range(1, len(slam.keyframes)):
         tie = tree.get(number)
-        if tie is None and label[number] != label[number - 1]:
+        if tie is None and (number - 1, number) not in matched:
             continue
         if tie is None:
             tie = MeasuredRelativePose(number - 1, number, between(number - 1, number), loose)
