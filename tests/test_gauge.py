@@ -22,6 +22,10 @@ from vggtgeo.bundle.terms.relative_pose import RelativePose
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.small_window import SimulatedWindow, simulate_window
 from vggtgeo.slam.gauge import gauge_notes, with_one_gauge
+from vggtgeo.slam.setting_groups import WindowSettings
+from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.window import make_room
 from vggtgeo.slam.window_prior import WindowPrior
 
 KEYFRAMES, POINTS = 7, 12
@@ -180,3 +184,16 @@ def test_a_unit_that_nothing_tells_is_held() -> None:
     held, gauge = with_one_gauge(problem, initial, KEYFRAMES, metric=False)
     assert gauge.loose == (tuple(range(KEYFRAMES)),)
     assert _null_dimensions(held, initial) == 0
+
+
+def test_the_keyframe_that_the_next_is_tied_to_stays() -> None:
+    """Of a full window the oldest leaves, but not the one that the next keyframe hangs on: without it nothing might tie
+    the next. Oracle: the numbers.
+    """
+    settings = SlamSettings(window=WindowSettings(size=4, point_slots=16, line_slots=12))
+    k = np.array([100.0, 100.0, 50.0, 50.0])
+    slam = Slam(k, k, np.ones(4), True, window=(3, 4, 5, 6))
+    assert make_room(slam, settings).window == (4, 5, 6)
+    assert make_room(slam, settings, needed=3).window == (3, 5, 6)
+    assert make_room(slam, settings, needed=5).window == (4, 5, 6)
+    assert make_room(replace(slam, window=(4, 5, 6)), settings, needed=4).window == (4, 5, 6)
