@@ -23,7 +23,6 @@ from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.summary import pieces
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.loops import close_loops
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
@@ -164,17 +163,13 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
 
 
 def _visited_twice(slam: Slam, motion: np.ndarray) -> Slam:
-    """The map with every keyframe once more, as of a second visit that drift has carried away by `motion`; the step
-    between the visits is tracked as wrongly as that.
-    """
+    """The map with every keyframe once more, as of a second visit that began a piece of its own, off by `motion`."""
     count = len(slam.keyframes)
     again = tuple(replace(k, number=k.number + count, pose=k.pose @ rigid.invert(motion)) for k in slam.keyframes)
     pairs = tuple(replace(p, first=p.first + count, second=p.second + count) for p in slam.pairs)
     ties = tuple(replace(t, first=t.first + count, second=t.second + count) for t in slam.ties)
-    step = again[0].pose @ rigid.invert(slam.keyframes[-1].pose)
-    wrong = MeasuredRelativePose(count - 1, count, step, ties[0].information)
-    keyframes = (*slam.keyframes, *again)
-    return replace(slam, keyframes=keyframes, pairs=(*slam.pairs, *pairs), factors=(*slam.factors, wrong, *ties))
+    everything = {"keyframes": (*slam.keyframes, *again), "pairs": (*slam.pairs, *pairs)}
+    return replace(slam, **everything, factors=(*slam.factors, *ties), origins=(0, count))
 
 
 def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
