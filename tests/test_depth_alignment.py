@@ -130,7 +130,7 @@ def test_a_depth_twice_as_uncertain_knows_a_quarter(keyframes: list[Keyframe]) -
     found = []
     for factor in (1.0, 2.0):
         sigma = np.full(SIZE, 0.01 * factor, np.float16)
-    views = [replace(each, images=replace(each.images, depth_sigma=sigma)) for each in keyframes]
+        views = [replace(each, images=replace(each.images, depth_sigma=sigma)) for each in keyframes]
         found.append(align(0, 1, [Surface.of(each, INTRINSICS) for each in views], truth, EFFECTIVE))
     np.testing.assert_allclose(found[0].hessian, 4 * found[1].hessian, rtol=2e-2)
 
