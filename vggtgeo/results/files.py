@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,8 +22,6 @@ DEPTH_UNIT = 5000.0
 """Counts a metre in the 16-bit depth images, as in the TUM RGB-D format."""
 
 
-PIECES = "pieces"
-"""Folder of the smaller pieces of a map that is in pieces."""
 MOST_COUNTS = 65535
 DEPTH_NOTE = (
     "NNNNNN.depth.png: depth z of the keyframe of frame NNNNNN, 16 bit, 0 = none.\n"
@@ -37,10 +34,12 @@ NO_METRES = "5000 counts are one unit of trajectory.txt, which is no metre: the 
 def write_trajectories(folder: Path, slam: Slam) -> None:
     """`trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world.
 
-    Of a map in pieces they hold the one of most frames, `pieces/trajectory-2.txt` and `pieces/keyframes-2.txt` the
-    next, and so on.
+    Of a map in pieces they hold the one of most frames, `trajectory-2.txt` and `keyframes-2.txt` the next, and so on.
+    Those of pieces that have been joined since they were last written are taken away.
     """
-    shutil.rmtree(folder / PIECES, ignore_errors=True)
+    for name in ("trajectory", "keyframes"):
+        for old in folder.glob(f"{name}-[0-9]*.txt"):
+            old.unlink()
     for piece in range(max(len(pieces_by_size(slam)), 1)):
         frame_trajectory(slam, piece).save_tum(folder / piece_file("trajectory", piece))
         keyframe_trajectory(slam, piece).save_tum(folder / piece_file("keyframes", piece))
@@ -48,7 +47,7 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
 
 def piece_file(name: str, piece: int) -> str:
     """File of a piece of the map, counted from 0 by size."""
-    return f"{PIECES}/{name}-{piece + 1}.txt" if piece else f"{name}.txt"
+    return f"{name}-{piece + 1}.txt" if piece else f"{name}.txt"
 
 
 def write_depth(

@@ -20,6 +20,7 @@ from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
 from vggtgeo.slam.gauge import Gauge, gauge_notes, with_one_gauge
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.line_triangulation import with_segment_depths
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
@@ -107,6 +108,7 @@ def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, 
 
 def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
+    slam = slam if slam.metric else _with_line_depths(slam)
     members = [slam.keyframes[number] for number in slam.window]
     adjustment, gauge = window_problem(slam, members, settings)
     told = (note for note in gauge_notes(gauge, adjustment.keyframes, "window") if note not in slam.notes)
@@ -127,6 +129,18 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
         energies=history[np.isfinite(history)],
         iterations=solution.record,
     )
+
+
+def _with_line_depths(slam: Slam) -> Slam:
+    """The state with the depths of segments that the window's views tell.
+
+    Not beside measured depth: what that leaves out is glass, mirrors and what is far away.
+    """
+    inside = {number: slam.keyframes[number] for number in slam.window}
+    keyframes = list(slam.keyframes)
+    for number, keyframe in with_segment_depths(inside, window_edges(slam), slam.intrinsics).items():
+        keyframes[number] = keyframe
+    return replace(slam, keyframes=tuple(keyframes))
 
 
 def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> tuple[Adjustment, Gauge]:

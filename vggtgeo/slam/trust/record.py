@@ -41,7 +41,7 @@ def check_record(estimate: Estimate) -> list[Finding]:
     if estimate.pieces > 1:
         text = (
             f"the map is in {estimate.pieces} parts that nothing ties to each other; trajectory.txt and map.ply hold "
-            "the one of most frames, pieces/ the others"
+            "the one of most frames, trajectory-2.txt the next"
         )
         found.append(Finding("parts", "degraded", text))
     return found
