@@ -153,7 +153,8 @@ def test_depth_of_another_scene_is_told(kind: str) -> None:
         "5 % off": lambda depth: depth * rng.normal(1.0, 0.05, depth.shape),
         "random": lambda depth: rng.uniform(0.5, 5.0, depth.shape),
     }[kind]
-    keyframes = tuple(replace(member, depth=change(member.depth).astype(np.float16)) for member in slam.keyframes)
+    images = [replace(k.images, depth=change(k.depth).astype(np.float16)) for k in slam.keyframes]
+    keyframes = tuple(replace(k, images=own) for k, own in zip(slam.keyframes, images, strict=True))
     found = list(check_surfaces(keyframes, np.asarray(slam.intrinsics)))
     assert [finding.level for finding in found] == (["degraded"] if kind == "random" else [])
     verdict = judge(replace(slam, keyframes=keyframes))

@@ -35,7 +35,11 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
     """`trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world.
 
     Of a map in pieces they hold the one of most frames, `trajectory-2.txt` and `keyframes-2.txt` the next, and so on.
+    Those of pieces that have been joined since they were last written are taken away.
     """
+    for name in ("trajectory", "keyframes"):
+        for old in folder.glob(f"{name}-[0-9]*.txt"):
+            old.unlink()
     for piece in range(max(len(pieces_by_size(slam)), 1)):
         frame_trajectory(slam, piece).save_tum(folder / piece_file("trajectory", piece))
         keyframe_trajectory(slam, piece).save_tum(folder / piece_file("keyframes", piece))
