@@ -139,7 +139,7 @@ class WindowDataset:
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str], terms: Sequence[type] = ()) -> Self:
-        """Reads the index that `WindowWriter` left; InputError where there is none: a writer did not come to its end."""
+        """Reads the index that `WindowWriter` left; InputError where there is none, as a writer did not end."""
         place = Path(folder)
         try:
             index = json.loads((place / _INDEX).read_text(encoding="utf-8"))
