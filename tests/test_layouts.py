@@ -12,7 +12,7 @@ import tiny_layouts as tiny
 import tiny_sequences
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets import Sequence, open_sequence
+from vggtgeo.datasets import Sequence, open_sequence, with_rate
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.registration import registered_depth
 from vggtgeo.datasets.seven_scenes import _TO_COLOUR
@@ -239,14 +239,13 @@ def test_a_stream_is_read_until_it_ends(tmp_path: Path) -> None:
         open_sequence("rtsp://127.0.0.1:9/nothing")
 
 
-def test_a_folder_of_images_takes_a_rate(tmp_path: Path) -> None:
-    # Proves `rate` on a plain folder, and its refusal where the recording has times of its own.
-    folder = tiny_sequences.images(tmp_path / "images")
-    assert [frame.timestamp for frame in open_sequence(folder, rate=5.0).frames()] == pytest.approx([0.0, 0.2, 0.4])
-    with pytest.raises(InputError, match="`rate` is 0"):
-        open_sequence(folder, rate=0.0)
-    with pytest.raises(InputError, match="has times of its own"):
-        open_sequence(tiny_sequences.tum(tmp_path / "tum"), rate=5.0)
+def test_a_rate_is_for_what_has_no_times(tmp_path: Path) -> None:
+    # Proves that layouts without times take a rate, and that those with times of their own refuse it.
+    room = with_rate(_open(tiny.replica(tmp_path / "room0")), 5.0)
+    assert [frame.timestamp for frame in room.frames()] == pytest.approx([0.0, 0.2, 0.4])
+    for write in (tiny.euroc, tiny.kitti, tiny.arkit):
+        with pytest.raises(InputError, match="has times of its own"):
+            with_rate(_open(write(tmp_path / write.__name__)), 5.0)
 
 
 @pytest.mark.parametrize("write", LOSSLESS, ids=lambda write: write.__name__)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import signal
 import threading
 import time
 from collections.abc import Mapping
@@ -83,6 +84,9 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
         facts={"simulated": True} if simulated else None,
         warned=warned,
     )
+    if result.summary["interrupted"]:  # by a signal of somebody else: a part of the frames is no result
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
     _save(folder, result, given.truth, spec)
     return {**measured(result, given, spec), "simulated": simulated}
 

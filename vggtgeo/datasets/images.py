@@ -1,8 +1,7 @@
 """A plain folder of images, in natural order (2 before 10)."""
 
-import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -22,14 +21,8 @@ class ImageFolder(FolderSequence):
     """Images of one folder, without depth. Truth: `groundtruth.txt` (TUM format), where there is one.
 
     Time is position / 30 s, unless all names are times: seconds with a decimal point (`12.034.png`) or
-    nanoseconds (18 or 19 digits), or `at_rate` says otherwise.
+    nanoseconds (18 or 19 digits).
     """
-
-    def at_rate(self, rate: float) -> Self:
-        """The same with frames at `rate` a second; InputError where that is not positive."""
-        if not (math.isfinite(rate) and rate > 0):
-            raise InputError(f"`rate` is {rate}; it must be positive frames a second")
-        return replace(self, files=tuple(replace(file, timestamp=file.index / rate) for file in self.files))
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -53,7 +46,7 @@ class ImageFolder(FolderSequence):
     def ground_truth(self) -> Trajectory | None:
         """The true poses, if the folder has them."""
         file = self.folder / "groundtruth.txt"
-        return Trajectory.load_tum(file) if file.is_file() else None
+        return Trajectory.load_tum(file) if file.exists() else None
 
 
 def natural_key(name: str) -> list[int | str]:

@@ -51,13 +51,12 @@ FOLDER_KINDS: dict[str, FolderReader] = {
 KINDS = (*FOLDER_KINDS, "video", "bag", "live")
 
 
-def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: float | None = None) -> Sequence:
+def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequence:
     """Opens a folder of a benchmark or of images, a video file, a ROS bag, a webcam (`webcam:0`) or a stream (`rtsp://`).
 
     Args:
         path: the folder or file, or the name of a camera.
         kind: one of `KINDS` to name the reader; None to find it by looking.
-        rate: frames a second of a plain folder of images, whose files have no times; by default 30.
 
     The camera comes from `calibration.txt` or `camera-intrinsics.txt` in the folder, else from published
     values where the name tells the camera, else it is a guess (`camera.known` is False), with an
@@ -75,14 +74,7 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
         raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(KINDS)}")
     if kind == "live" or (kind is None and is_live(os.fspath(path))):
         return LiveCamera.open(os.fspath(path))
-    sequence = _open_place(Path(path).expanduser(), kind)
-    return sequence if rate is None else _at_rate(sequence, rate)
-
-
-def _at_rate(sequence: Sequence, rate: float) -> Sequence:
-    if not isinstance(sequence, ImageFolder):
-        raise InputError(f"`rate` is {rate:g}, and `{sequence.name}` has times of its own; it is for folders of images")
-    return sequence.at_rate(rate)
+    return _open_place(Path(path).expanduser(), kind)
 
 
 def _open_place(place: Path, kind: str | None) -> Sequence:
@@ -110,6 +102,10 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
 def _open_video(file: Path) -> Sequence:
     if file.is_dir():
         raise InputError(f"`{file}` is a folder; the reader 'video' needs a file")
+    if not file.is_file():
+        raise InputError(f"`{file}` is no regular file; give a folder of images or a video file")
+    if file.suffix.lower() == ".gif":
+        raise InputError(f"`{file}` is a GIF, whose colours and times are not those of a camera; give the video itself")
     if file.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
     return VideoFile.open(file)

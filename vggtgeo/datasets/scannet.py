@@ -5,7 +5,7 @@ fewer, so that no depth is made up. The two cameras are taken to be at one place
 Source: A. Dai et al., "ScanNet", CVPR 2017.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile
-from vggtgeo.datasets.image_files import MILLIMETRES, read_depth, read_image
+from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_intrinsics
@@ -50,9 +50,10 @@ class ScanNet(FolderSequence):
         camera = Camera(depth, width, height)
         return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour)
 
-    def load_image(self, path: Path) -> np.ndarray:
+    def load_image(self, path: Path, bits: int = 8) -> ImageFile:
         """The image as the depth camera would see it: an affine change of pixels, reduced with an average."""
-        image = read_image(path)
+        read = super().load_image(path, bits)
+        image = read.image
         fx, fy, cx, cy = self.camera.intrinsics
         gx, gy, dx, dy = self.colour
         blur = max(gx / fx, 1.0), max(gy / fy, 1.0)
@@ -61,7 +62,8 @@ class ScanNet(FolderSequence):
         change = np.array([[gx / fx, 0.0, dx - cx * gx / fx], [0.0, gy / fy, dy - cy * gy / fy]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         size = (self.camera.width, self.camera.height)
-        return np.asarray(cv2.warpAffine(image, change, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        warped = cv2.warpAffine(image, change, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return replace(read, image=np.asarray(warped, np.uint8))
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses."""
