@@ -71,7 +71,7 @@ def _peak_gb() -> float:
 def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None) -> dict[str, Any]:
     with collected_warnings() as warned:
         given = open_input(spec, seed, scratch)
-    simulated = given.oracle is not None
+    simulated = given.simulated or given.oracle is not None
     result = reconstruct(
         given.sequence,
         given.perception,
