@@ -239,6 +239,16 @@ def test_a_stream_is_read_until_it_ends(tmp_path: Path) -> None:
         open_sequence("rtsp://127.0.0.1:9/nothing")
 
 
+def test_a_video_of_varying_rate_has_its_own_times(tmp_path: Path) -> None:
+    # Proves that frames of a phone's video have the times of the container, not those of a mean rate. Oracle: a file
+    # with a pause of a quarter of a second.
+    times = (0, 33, 67, 317, 350)
+    sequence = _open(tiny.matroska(tmp_path / "clip.mkv", times))
+    frames = list(sequence.frames())
+    assert [frame.timestamp for frame in frames] == pytest.approx([time / 1000 for time in times], abs=1e-3)
+    assert [int(frame.image.mean()) for frame in frames] == pytest.approx([30, 70, 110, 150, 190], abs=4)
+
+
 def test_a_rate_is_for_what_has_no_times(tmp_path: Path) -> None:
     # Proves that layouts without times take a rate, and that those with times of their own refuse it.
     room = with_rate(_open(tiny.replica(tmp_path / "room0")), 5.0)

@@ -112,11 +112,7 @@ def _connected(cluster: Cluster) -> Any:
     except ImportError:
         raise InputError("a cluster needs Ray: pip install 'vggtgeo[cluster]'") from None
     try:
-        ray.init(
-            address=None if cluster.address == "local" else cluster.address,
-            log_to_driver=False,
-            include_dashboard=False if cluster.address == "local" else None,
-        )
+        ray.init(address=cluster.address, log_to_driver=False)
     except (ConnectionError, ValueError) as error:
         text = str(error).splitlines()[0]
         raise InputError(f"no Ray cluster at `{cluster.address}` ({text}); start one with `ray start --head`") from None

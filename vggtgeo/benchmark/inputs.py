@@ -61,7 +61,9 @@ def find_sequence(path: str, folders: Iterable[Path]) -> Path | None:
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """sequence: what the run reads. perception: who looks at it. oracle: the exact truth of a rendered walk."""
+    """sequence: what the run reads. perception: who looks at it. oracle: the exact truth of a rendered walk, where
+    what is read is what was rendered. simulated: nothing was recorded.
+    """
 
     sequence: Sequence
     perception: Perception
