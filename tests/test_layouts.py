@@ -250,10 +250,10 @@ def test_a_video_of_varying_rate_has_its_own_times(tmp_path: Path) -> None:
 
 
 def test_a_rate_is_for_what_has_no_times(tmp_path: Path) -> None:
-    # Proves that layouts without times take a rate, and that those with times of their own refuse it.
-    room = with_rate(_open(tiny.replica(tmp_path / "room0")), 5.0)
-    assert [frame.timestamp for frame in room.frames()] == pytest.approx([0.0, 0.2, 0.4])
-    for write in (tiny.euroc, tiny.kitti, tiny.arkit):
+    # Proves that a folder of images takes a rate, and that the layouts of benchmarks refuse it.
+    folder = open_sequence(tiny_sequences.images(tmp_path / "images"), rate=5.0)
+    assert [frame.timestamp for frame in folder.frames()] == pytest.approx([0.0, 0.2, 0.4])
+    for write in (tiny.replica, tiny.euroc, tiny.kitti, tiny.arkit):
         with pytest.raises(InputError, match="has times of its own"):
             with_rate(_open(write(tmp_path / write.__name__)), 5.0)
 

@@ -1,4 +1,4 @@
-"""Runs on a Ray cluster (`pip install 'vggtgeo[cluster]'`): each run is a task with processors, and a GPU if asked for.
+"""Runs on a Ray cluster (`pip install "vggtgeo[cluster]"`): a run is a task with processors and, if asked for, a GPU.
 
 A task starts the same process with the same limits as `scheduling` does, and hands back its row and its small files,
 which the driver writes into the store: a result is taken once, whatever was tried how often. Ray starts a task again

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from vggtgeo.cli.options import JsonOption
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,7 +26,7 @@ def evaluate(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM format), or a run's output folder.")],
     truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM format), or a dataset folder.")],
     max_dt: Annotated[float, typer.Option(min=0, help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
-    delta: Annotated[float, typer.Option(help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0,
+    delta: Annotated[float, typer.Option(min=0, help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0,
     unit: Annotated[
         Literal["poses", "seconds", "metres"], typer.Option(help="Of --delta: poses, seconds, or metres of true path.")
     ] = "poses",
@@ -50,7 +51,11 @@ def evaluate(
 def load_estimate(path: Path) -> Trajectory:
     """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`."""
     from vggtgeo.geometry.trajectory import Trajectory
+    from vggtgeo.results.run_folder import check_finished
 
+    unfinished = check_finished(path)
+    if unfinished:
+        warnings.warn(unfinished, InputWarning, stacklevel=2)
     return Trajectory.load_tum(path / "trajectory.txt" if path.is_dir() else path)
 
 

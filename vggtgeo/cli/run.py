@@ -112,13 +112,13 @@ def check_provider(preset: str, provider: options.Provider) -> None:
         warnings.warn("`--provider cuda` has no effect with `--preset classical`", InputWarning, stacklevel=2)
 
 
-def open_input(path: str, kind: str | None, intrinsics: str | None, rgb_only: bool, fps: float | None) -> Sequence:
+def open_input(
+    path: str | Path, kind: str | None, intrinsics: str | None, rgb_only: bool, fps: float | None = None
+) -> Sequence:
     """The sequence at `path`, with what the flags say otherwise."""
-    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, with_rate, without_depth
+    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
 
-    sequence = open_sequence(path, kind)
-    if fps is not None:
-        sequence = with_rate(sequence, fps)
+    sequence = open_sequence(path, kind, fps)
     if intrinsics is not None:
         sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
     return without_depth(sequence) if rgb_only else sequence

@@ -62,9 +62,9 @@ class FolderSequence:
         """No truth, unless the layout knows one."""
         return None
 
-    def load_image(self, path: Path, bits: int = 8) -> ImageFile:
-        """The image in a file (see `read_image_file`); a layout whose images do not fit its depth changes them here."""
-        return read_image_file(path, bits)
+    def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
+        """The image in a file, see `read_image_file`; a layout whose images do not fit its depth changes them here."""
+        return read_image_file(path, least_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
@@ -78,7 +78,7 @@ class FolderSequence:
             read = self._read_image(file, bits)
             if read is None:
                 continue
-            if read.bits > max(bits, 8):
+            if read.bits > bits and (bits > 8 or read.bits < 16):
                 _warn(f"`{file.image}` has values of {read.bits} bits: taken for an image of so many from here on")
             bits = max(bits, read.bits)
             if read.orientation != 1 and not turned:

@@ -19,6 +19,7 @@ from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
+from vggtgeo.datasets.views import with_rate
 from vggtgeo.io.errors import InputError
 
 
@@ -57,6 +58,7 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequ
     Args:
         path: the folder or file, or the name of a camera.
         kind: one of `KINDS` to name the reader; None to find it by looking.
+        rate: frames a second of a plain folder of images, whose files have no times (by default 30), or of a video.
 
     The camera comes from `calibration.txt` or `camera-intrinsics.txt` in the folder, else from published
     values where the name tells the camera, else it is a guess (`camera.known` is False), with an
@@ -74,7 +76,8 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequ
         raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(KINDS)}")
     if kind == "live" or (kind is None and is_live(os.fspath(path))):
         return LiveCamera.open(os.fspath(path))
-    return _open_place(Path(path).expanduser(), kind)
+    sequence = _open_place(Path(path).expanduser(), kind)
+    return sequence if rate is None else with_rate(sequence, rate)
 
 
 def _open_place(place: Path, kind: str | None) -> Sequence:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile
-from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth
+from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_intrinsics
@@ -50,9 +50,9 @@ class ScanNet(FolderSequence):
         camera = Camera(depth, width, height)
         return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour)
 
-    def load_image(self, path: Path, bits: int = 8) -> ImageFile:
+    def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
         """The image as the depth camera would see it: an affine change of pixels, reduced with an average."""
-        read = super().load_image(path, bits)
+        read = read_image_file(path, least_bits)
         image = read.image
         fx, fy, cx, cy = self.camera.intrinsics
         gx, gy, dx, dy = self.colour
@@ -62,8 +62,8 @@ class ScanNet(FolderSequence):
         change = np.array([[gx / fx, 0.0, dx - cx * gx / fx], [0.0, gy / fy, dy - cy * gy / fy]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         size = (self.camera.width, self.camera.height)
-        warped = cv2.warpAffine(image, change, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        return replace(read, image=np.asarray(warped, np.uint8))
+        seen = cv2.warpAffine(image, change, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return replace(read, image=np.asarray(seen, np.uint8))
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses."""

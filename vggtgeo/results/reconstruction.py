@@ -27,6 +27,7 @@ from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.connected import main_piece
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.presets import Perception
@@ -139,7 +140,8 @@ def _concluded(
     slam, clock = run.slam, run.clock
     with clock.measure("dense map"):
         depths = tuple(fused_depths(slam.keyframes, slam.intrinsics))
-        cloud = map_points(slam.keyframes, slam.intrinsics, depths)
+        keyframes, own_depths = main_piece(slam, depths)
+        cloud = map_points(keyframes, slam.intrinsics, own_depths)
     hooks.each("on_finish", slam, cloud)
     with clock.measure("verdict"):
         left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
