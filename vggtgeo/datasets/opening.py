@@ -52,7 +52,7 @@ FOLDER_KINDS: dict[str, FolderReader] = {
 KINDS = (*FOLDER_KINDS, "video", "bag", "live")
 
 
-def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequence:
+def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: float | None = None) -> Sequence:
     """Opens a folder of a benchmark or of images, a video file, a ROS bag, a webcam (`webcam:0`) or a stream (`rtsp://`).
 
     Args:
