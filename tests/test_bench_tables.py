@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from vggtgeo.benchmark import cells, markdown, runner
 from vggtgeo.benchmark.external import external_rows
 from vggtgeo.benchmark.figures import ablation_figure
-from vggtgeo.benchmark.measure import trajectory_errors
+from vggtgeo.benchmark.measure import between, trajectory_errors
 from vggtgeo.benchmark.page import write_page
 from vggtgeo.benchmark.published import published
 from vggtgeo.benchmark.runner import BenchReport
@@ -154,6 +154,14 @@ def test_relative_errors_of_a_free_scale_are_taken_after_it() -> None:
     assert metric["rte_1s_m"] > 1.0
     assert "scale is 0.25" in metric["warnings"]
     assert trajectory_errors(Trajectory(times[:2], poses[:2]), Trajectory(times, poses))[0]["matched"] == 0
+
+
+def test_the_truth_is_that_of_the_frames_that_were_read() -> None:
+    # Proves that a run on a part of a recording is not told that it misses the rest. Oracle: by hand.
+    truth = Trajectory(np.arange(100) / 10, np.tile(np.eye(4), (100, 1, 1)))
+    part = between(truth, 2.0, 4.0)
+    assert (part.timestamps[0], part.timestamps[-1]) == (2.0, 4.0)
+    assert len(between(truth, 50.0, 60.0)) == 100
 
 
 def test_published_figures_have_source_and_protocol_and_stand_apart() -> None:

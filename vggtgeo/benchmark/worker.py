@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.inputs import open_input
-from vggtgeo.benchmark.measure import measured
+from vggtgeo.benchmark.measure import measured, truth_of_run
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -87,7 +87,7 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
     if result.summary["interrupted"]:  # by a signal of somebody else: a part of the frames is no result
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTERM)
-    _save(folder, result, given.truth, spec)
+    _save(folder, result, truth_of_run(result, given.truth), spec)
     return {**measured(result, given, spec), "simulated": simulated}
 
 
