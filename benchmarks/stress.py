@@ -4,8 +4,8 @@
         [--groups a b] [--variants overlay30 ...] [--jobs 1] [--timeout 240] [--out runs/stress] [--page docs/stress.md]
 
 Clips are degraded by `../shared/stress/make_variants.py` and are skipped where that is not there; simulated scenes by
-`benchmarks/degradations.py`. Each run is one `vggtgeo run` in a process of its own, which cannot see the truth. What is
-done already lies in `--out` and is not run again; `--fresh` runs all.
+`vggtgeo/simulation/degradations.py`. Each run is one `vggtgeo run` in a process of its own, which cannot see the truth.
+What is done already lies in `--out` and is not run again; `--fresh` runs all.
 
 - good: ATE at most twice that of the clip undisturbed, or 4 cm; 90 % of the frames tracked; called good.
 - alarm: the same, but called degraded or failed.
@@ -33,11 +33,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from degradations import DEGRADATIONS, record, write
+from recordings import record, write
 
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.simulation.degradations import DEGRADATIONS
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"

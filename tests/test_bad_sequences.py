@@ -51,8 +51,8 @@ def test_a_single_image_and_a_wrong_kind_are_errors(tmp_path: Path) -> None:
     tiny.images(tmp_path)
     with pytest.raises(InputError, match="is a single image; give the folder"):
         open_sequence(tmp_path / "a1.png")
-    with pytest.raises(InputError, match="`kind` is 'euroc'; it must be one of 7scenes, tum, images, video"):
-        open_sequence(tmp_path, "euroc")
+    with pytest.raises(InputError, match="`kind` is 'nuscenes'; it must be one of euroc, replica"):
+        open_sequence(tmp_path, "nuscenes")
     with pytest.raises(InputError, match="'tum' needs a folder"):
         open_sequence(tmp_path / "a1.png", "tum")
     with pytest.raises(InputError, match="'video' needs a file"):

@@ -15,7 +15,7 @@ from vggtgeo.benchmark.published import published
 from vggtgeo.benchmark.suite import limited, load_suite, read_suite, shipped
 from vggtgeo.io.errors import InputError
 
-WANTED = {"paper", "tum", "7scenes", "euroc", "replica", "tanks", "simulated", "quick", "clips"}
+WANTED = {"paper", "tum", "7scenes", "euroc", "replica", "tanks", "simulated", "stress", "quick", "clips"}
 
 
 def test_every_suite_that_comes_along_can_be_read() -> None:

@@ -24,7 +24,7 @@ def _good(folder: Path, count: int = 6) -> Path:
     lines = [f"{10 + 0.05 * n:.3f} {0.01 * n} 0 0 0 0 0 1\n" for n in range(2 * count)]
     (folder / "groundtruth.txt").write_text("".join(lines))
     for number, file in enumerate(sorted((folder / "rgb").iterdir())):
-        tiny.write_image(file, np.maximum(tiny.image(20 * number), 20))
+        tiny.write_image(file, np.maximum(tiny.image(20 * number + 20), 20))
     return folder
 
 

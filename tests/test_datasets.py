@@ -75,9 +75,9 @@ def test_seven_scenes_finds_the_sequence_in_a_scene(tmp_path: Path) -> None:
 
 
 def test_seven_scenes_without_intrinsics_takes_the_published_ones(tmp_path: Path) -> None:
-    # Proves the published camera for the published size, and that the unregistered depth is warned of.
+    # Proves the published camera for the published size, and a word about depth and poses.
     tiny.write_image(tmp_path / "frame-000000.color.png", tiny.image(0, 640, 480))
-    with pytest.warns(InputWarning, match=r"no intrinsics.*register the depth"):
+    with pytest.warns(InputWarning, match=r"no intrinsics.*taken as published"):
         camera = open_sequence(tmp_path).camera
     assert camera == Camera((525.0, 525.0, 320.0, 240.0), 640, 480)
 

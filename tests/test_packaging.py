@@ -127,7 +127,9 @@ def test_wheel_holds_every_source_file_and_nothing_else(source: Path, wheel: Pat
     found = {".".join(file.with_suffix("").parts).removesuffix(".__init__") for file in files if file.suffix == ".py"}
     assert found == _source_modules(source)
     data = {file for file in files if file.suffix != ".py"}
-    assert data == {Path("vggtgeo/py.typed"), Path("vggtgeo/report/page.html.j2")}
+    kinds = ("*.toml", "*.j2", "*.css", "py.typed")
+    assert data == {file.relative_to(source) for kind in kinds for file in (source / "vggtgeo").rglob(kind)}
+    assert Path("vggtgeo/benchmark/suites/quick.toml") in data
 
 
 def test_every_module_imports_from_a_users_folder(installation: Installation, source: Path, user_folder: Path) -> None:

@@ -213,3 +213,31 @@ def _camera_info(kinds: dict, header: object, ros2: bool) -> object:
     region = kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     values = (np.array([0.1, -0.02, 0.0, 0.0, 0.0]), matrix, np.eye(3).ravel(), np.zeros(12))
     return kinds["sensor_msgs/msg/CameraInfo"](header, HEIGHT, WIDTH, "plumb_bob", *values, 0, 0, region)
+
+
+def matroska(path: Path, milliseconds: tuple[int, ...]) -> Path:
+    """A video of 64 x 48 pixels with frames at just these times, as phones record them: brightness tells the number.
+
+    Written by hand (Matroska with Motion JPEG), as OpenCV's writer knows one rate only.
+    """
+
+    def element(name: str, content: bytes) -> bytes:
+        return bytes.fromhex(name) + (0x01 << 56 | len(content)).to_bytes(8, "big") + content
+
+    def number(name: str, value: int) -> bytes:
+        return element(name, value.to_bytes(4, "big"))
+
+    head = number("4286", 1) + number("42F7", 1) + number("42F2", 4) + number("42F3", 8)
+    head += element("4282", b"matroska") + number("4287", 4) + number("4285", 2)
+    info = number("2AD7B1", 1_000_000) + element("4D80", b"t") + element("5741", b"t")
+    picture = number("B0", 64) + number("BA", 48)
+    track = number("D7", 1) + number("73C5", 1) + number("83", 1) + element("86", b"V_MJPEG") + element("E0", picture)
+    blocks = b""
+    for row, time in enumerate(milliseconds):
+        done, code = cv2.imencode(".jpg", np.full((48, 64, 3), 30 + 40 * row, np.uint8))
+        assert done
+        blocks += element("A3", b"\x81" + time.to_bytes(2, "big") + b"\x80" + code.tobytes())
+    segment = element("1549A966", info) + element("1654AE6B", element("AE", track))
+    segment += element("1F43B675", number("E7", 0) + blocks)
+    path.write_bytes(element("1A45DFA3", head) + element("18538067", segment))
+    return path

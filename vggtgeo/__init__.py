@@ -71,6 +71,9 @@ if TYPE_CHECKING:
     from vggtgeo.geometry.cameras import SquarePinhole as SquarePinhole
     from vggtgeo.geometry.trajectory import Trajectory as Trajectory
     from vggtgeo.io.errors import InputError as InputError
+    from vggtgeo.learning.window_dataset import RunWindows as RunWindows
+    from vggtgeo.learning.window_dataset import WindowDataset as WindowDataset
+    from vggtgeo.learning.window_dataset import WindowWriter as WindowWriter
     from vggtgeo.results import Result as Result
     from vggtgeo.results import evaluate as evaluate
     from vggtgeo.results import read as read
@@ -138,6 +141,7 @@ _HOME = {
     "bundle.problem": ("Problem", "State"),
     "bundle.problem_file": ("load_problem", "save_problem"),
     "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),
+    "learning.window_dataset": ("RunWindows", "WindowDataset", "WindowWriter"),
     "results": ("Result", "evaluate", "read"),
     "results.reconstruction": ("reconstruct",),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),

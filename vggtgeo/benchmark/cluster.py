@@ -8,6 +8,7 @@ whose worker or node is gone. Recordings must lie under the same path on every n
 from __future__ import annotations
 
 import json
+import socket
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -106,18 +107,22 @@ def _taken(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[str, Any
     return store.complete(job, **ending)
 
 
+def _check_answers(address: str) -> None:
+    """OSError where nobody listens at `host:port`: Ray itself would try for minutes."""
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdigit() and "://" not in address:
+        socket.create_connection((host, int(port)), timeout=5.0).close()
+
+
 def _connected(cluster: Cluster) -> Any:
     try:
         import ray
     except ImportError:
         raise InputError("a cluster needs Ray: pip install 'vggtgeo[cluster]'") from None
     try:
-        ray.init(
-            address=None if cluster.address == "local" else cluster.address,
-            log_to_driver=False,
-            include_dashboard=False if cluster.address == "local" else None,
-        )
-    except (ConnectionError, ValueError) as error:
+        _check_answers(cluster.address)
+        ray.init(address=cluster.address, log_to_driver=False)
+    except (OSError, ValueError) as error:
         text = str(error).splitlines()[0]
         raise InputError(f"no Ray cluster at `{cluster.address}` ({text}); start one with `ray start --head`") from None
     return ray

@@ -24,6 +24,7 @@ from vggtgeo.models.roles import InitialGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.simulation import SimulatedOracle, simulate
+from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
 from vggtgeo.slam.presets import Perception, classical_roles, perception
 from vggtgeo.slam.settings import Roles
 
@@ -60,11 +61,14 @@ def find_sequence(path: str, folders: Iterable[Path]) -> Path | None:
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """sequence: what the run reads. perception: who looks at it. oracle: the exact truth of a rendered walk."""
+    """sequence: what the run reads. perception: who looks at it. oracle: the exact truth of a rendered walk, where
+    what is read is what was rendered. simulated: nothing was recorded.
+    """
 
     sequence: Sequence
     perception: Perception
     oracle: SimulatedOracle | None = None
+    simulated: bool = False
 
     @property
     def truth(self) -> Trajectory | None:
@@ -82,9 +86,16 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
         return Input(sequence, _perceived(spec, sequence.has_depth))
     rendered = _rendered(spec["simulate"], seed, scratch)
     if spec["perception"] == "simulated":
+        if spec["degrade"] != "base":
+            raise InputError(
+                "simulated roles know the images that were rendered; leave `degrade` out, or use real ones"
+            )
         return Input(rendered, Perception(simulated_roles(rendered.oracle, spec, seed), {}), rendered.oracle)
-    sequence = _without(rendered, spec)
-    return Input(sequence, _perceived(spec, sequence.has_depth), rendered.oracle)
+    if spec["degrade"] == "base":
+        sequence = _without(rendered, spec)
+        return Input(sequence, _perceived(spec, sequence.has_depth), rendered.oracle)
+    sequence = _without(degraded(rendered, spec["degrade"], seed), spec)
+    return Input(sequence, _perceived(spec, sequence.has_depth), simulated=True)
 
 
 def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
@@ -142,6 +153,40 @@ class RenderedWalk:
 
     def ground_truth(self) -> Trajectory:
         return self.oracle.ground_truth()
+
+
+@dataclass(frozen=True, eq=False)
+class DegradedWalk:
+    """A rendered walk to which something happened; its camera is what a user would believe it to be."""
+
+    name: str
+    recording: Recording
+
+    @property
+    def camera(self) -> Camera:
+        return self.recording.camera
+
+    @property
+    def has_depth(self) -> bool:
+        return self.recording.frames[0].depth is not None
+
+    def __len__(self) -> int:
+        return len(self.recording.frames)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """The frames at positions start, start + stride, ... below end."""
+        check_selection(self.name, len(self), start, end, stride)
+        yield from self.recording.frames[start:end:stride]
+
+    def ground_truth(self) -> Trajectory:
+        return self.recording.truth
+
+
+def degraded(walk: RenderedWalk, name: str, seed: int) -> DegradedWalk:
+    """The walk after the degradation `name`; its noise follows from the seed."""
+    recording = Recording(list(walk.rendered), walk.camera, walk.ground_truth())
+    changed = DEGRADATIONS[name](recording, np.random.default_rng([seed, 23]))
+    return DegradedWalk(f"{walk.name}, {name}", changed)
 
 
 def simulated_roles(oracle: SimulatedOracle, spec: Mapping[str, Any], seed: int) -> Roles:

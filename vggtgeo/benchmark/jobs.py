@@ -73,6 +73,7 @@ def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: P
         "path": None if place is None else str(place),
         "kind": sequence.kind,
         "simulate": dict(sequence.simulate),
+        "degrade": sequence.degrade,
         "protocol": protocol,
         "stride": PROTOCOLS[protocol].stride,
         "poses": PROTOCOLS[protocol].poses,

@@ -17,6 +17,8 @@ from vggtgeo.results import Result
 
 DELTAS: tuple[tuple[str, float, str], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0, "metres"))
 """Of RTE and RRE: the name in the columns, how far, and its unit."""
+_AROUND = 0.02
+"""Seconds before the first and after the last frame in which the truth still belongs to the run."""
 _DEPTH_MAPS = 40  # keyframes whose dense depth is compared, evenly spaced: more changes the mean by little
 
 
@@ -38,7 +40,7 @@ def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str,
         **{f"seconds_{name.replace(' ', '_')}": value for name, value in summary["seconds_by_stage"].items()},
     }
     estimate = result.trajectory if spec["poses"] == "all" else result.keyframes
-    truth = given.truth
+    truth = truth_of_run(result, given.truth)
     alignment = None
     if truth is not None:
         errors, alignment = trajectory_errors(estimate, truth, result.metric)
@@ -51,6 +53,20 @@ def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str,
     if given.oracle is not None and alignment is not None and len(result.cloud):
         row |= cloud_errors(alignment.points(result.cloud.points.astype(np.float64)), given, spec["threshold"])
     return {name: _plain(value) for name, value in row.items()}
+
+
+def truth_of_run(result: Result, truth: Trajectory | None) -> Trajectory | None:
+    """The part of the truth that lies between the first and the last frame of the run; None where there is none."""
+    if truth is None or result.record is None:
+        return truth
+    frames = result.record.slam.frames
+    return between(truth, frames[0].timestamp, frames[-1].timestamp)
+
+
+def between(truth: Trajectory, first: float, last: float) -> Trajectory:
+    """The poses from `first` to `last`, seconds; all of them where none lies in between."""
+    inside = (truth.timestamps >= first - _AROUND) & (truth.timestamps <= last + _AROUND)
+    return truth.select(inside) if inside.any() else truth
 
 
 def trajectory_errors(

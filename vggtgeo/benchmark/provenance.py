@@ -12,10 +12,9 @@ from typing import Any
 
 import psutil
 
-import vggtgeo
 from vggtgeo.results.summary import versions
 
-_PACKAGE = Path(vggtgeo.__file__).parent
+_PACKAGE = Path(__file__).parent.parent
 _COMPUTING = ("bundle", "datasets", "evaluation", "geometry", "simulation", "slam", "solvers", "models")
 """Packages that a result depends on; pages and commands do not change it."""
 _TEXT = frozenset({".txt", ".toml", ".yaml", ".yml", ".json", ".csv"})

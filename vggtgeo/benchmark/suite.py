@@ -18,6 +18,7 @@ from typing import Any, Self, TypeVar
 
 from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.io.errors import InputError
+from vggtgeo.simulation.degradations import DEGRADATIONS
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import Tables, updated
 
@@ -56,6 +57,7 @@ class SequenceTable(CheckedTable):
         path: below one of the data folders.
         kind: reader; found by looking.
         simulate: `{scene = "office", frames = 80, rate = 6.0, size = [320, 240]}`; the walk follows from the seed.
+        degrade: what happens to a rendered walk, see `vggtgeo/simulation/degradations.py`.
         protocol: see `vggtgeo/benchmark/protocols.py`; in place of the suite's.
         start, end: frames.
         rgb_only: without its depth.
@@ -69,6 +71,7 @@ class SequenceTable(CheckedTable):
     path: str = ""
     kind: str | None = None
     simulate: Mapping[str, Any] = field(default_factory=dict)
+    degrade: str = "base"
     protocol: str = ""
     start: int = 0
     end: int | None = None
@@ -82,6 +85,9 @@ class SequenceTable(CheckedTable):
         _check_name(self.name)
         if bool(self.path) == bool(self.simulate):
             raise InputError("a sequence has either a `path` or a table `simulate`")
+        _one_of("degrade", self.degrade, tuple(DEGRADATIONS))
+        if self.path and self.degrade != "base":
+            raise InputError(f"`degrade` is {self.degrade!r}; it is for rendered walks")
         _check_protocol(self.protocol)
         if not (math.isfinite(self.threshold) and self.threshold > 0):
             raise InputError(f"`threshold` is {self.threshold}; it must be positive metres")

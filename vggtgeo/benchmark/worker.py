@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import signal
 import threading
 import time
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.inputs import open_input
-from vggtgeo.benchmark.measure import measured
+from vggtgeo.benchmark.measure import measured, truth_of_run
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -70,7 +71,7 @@ def _peak_gb() -> float:
 def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None) -> dict[str, Any]:
     with collected_warnings() as warned:
         given = open_input(spec, seed, scratch)
-    simulated = given.oracle is not None
+    simulated = given.simulated or given.oracle is not None
     result = reconstruct(
         given.sequence,
         given.perception,
@@ -83,7 +84,10 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
         facts={"simulated": True} if simulated else None,
         warned=warned,
     )
-    _save(folder, result, given.truth, spec)
+    if result.summary["interrupted"]:  # by a signal of somebody else: a part of the frames is no result
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
+    _save(folder, result, truth_of_run(result, given.truth), spec)
     return {**measured(result, given, spec), "simulated": simulated}
 
 

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from vggtgeo.evaluation.clouds import CloudError, cloud_error
 from vggtgeo.io.errors import InputError
 
-Mesh = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]
+Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices, metres, and the rows of the three corners of each face."""
 
 

@@ -13,3 +13,8 @@ from vggtgeo.learning.training import compare as compare
 from vggtgeo.learning.training import error_and_gradient as error_and_gradient
 from vggtgeo.learning.training import stack as stack
 from vggtgeo.learning.training import train as train
+from vggtgeo.learning.window_dataset import LabelledWindow as LabelledWindow
+from vggtgeo.learning.window_dataset import RunWindows as RunWindows
+from vggtgeo.learning.window_dataset import WindowDataset as WindowDataset
+from vggtgeo.learning.window_dataset import WindowWriter as WindowWriter
+from vggtgeo.learning.window_dataset import stacked as stacked

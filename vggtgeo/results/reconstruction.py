@@ -184,7 +184,7 @@ class _Source:
                 f"the images of `{self.name}` are {self.camera.width} x {self.camera.height} pixels; both sides must "
                 f"be at least {LEAST_SIDE}"
             )
-        length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames)
+        length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames) or sys.maxsize
         check_selection(self.name, length, start, end, stride)
 
     def count(self, start: int, end: int | None, stride: int) -> int | None:
