@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from vggtgeo.evaluation import depth_error, evaluate_trajectory
+from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.paper_bench.stage import Stage
 from vggtgeo.paper_bench.variants import Variant
-from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.run import finish, frame_trajectory, run
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window import warm_up

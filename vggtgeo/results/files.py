@@ -12,6 +12,7 @@ import numpy as np
 import tomli_w
 
 from vggtgeo.io.files import atomic_path, write_text
+from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
@@ -26,14 +27,16 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
     keyframe_trajectory(slam).save_tum(folder / "keyframes.txt")
 
 
-def write_depth(folder: Path, keyframes: Sequence[Keyframe], depths: Sequence[np.ndarray | None]) -> None:
-    """The keyframes' `fused_depths` as `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none), and beside each
-    `depth/NNNNNN.confidence.png` (8 bit).
+def write_depth(folder: Path, keyframes: Sequence[Keyframe], depth_maps: Sequence[DepthMap | None]) -> None:
+    """The keyframes' dense depth as `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, or 1/5000 of the map's unit; 0 =
+    none), and beside each `depth/NNNNNN.confidence.png` (8 bit); nothing for a keyframe without dense depth.
     """
-    for keyframe, depth in zip(keyframes, depths, strict=True):
-        metres = np.zeros(keyframe.depth.shape) if depth is None else np.nan_to_num(depth)
-        counts = np.clip(metres * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
-        for name, image in (("depth", counts), ("confidence", keyframe.depth_confidence)):
+    for keyframe, depth_map in zip(keyframes, depth_maps, strict=True):
+        if depth_map is None:
+            continue
+        counts = np.clip(np.nan_to_num(depth_map.depth) * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
+        confidence = np.rint(255 * depth_map.confidence).astype(np.uint8)
+        for name, image in (("depth", counts), ("confidence", confidence)):
             with atomic_path(folder / "depth" / f"{keyframe.frame:06d}.{name}.png") as temporary:
                 cv2.imwrite(os.fspath(temporary), image)
 

@@ -18,12 +18,11 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.warned import collected_warnings
+from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.dense import map_points
-from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import default_roles, finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -46,6 +45,7 @@ def reconstruct(
     end: int | None = None,
     stride: int = 1,
     seed: int = 0,
+    dense: str = "auto",
     title: str | None = None,
     callbacks: Iterable[Callback] = (),
     facts: Mapping[str, Any] | None = None,
@@ -67,6 +67,9 @@ def reconstruct(
         end: frame to stop before.
         stride: take every n-th frame.
         seed: of OpenCV's random choices, a global setting of that package.
+        dense: whose depth the map is made of. "auto": what a sensor or a network measured; where nothing did, the
+            pictures by multi-view stereo. "mvs": the pictures, also in the holes of what was measured. "sensor" or
+            "network": what was measured alone. "none": the map is the adjusted points.
         title: of the report; by default the name of the sequence.
         callbacks: called with every frame.
         facts: what the summary shall say besides.
@@ -88,6 +91,7 @@ def reconstruct(
     with collected_warnings() as collected:
         source = _opened(frames, camera)
         perception = _perception(roles, source.has_depth)
+        check_dense(dense, perception.roles.metric)
         windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
         hooks = _Callbacks((windows, evidence, *callbacks), clock)
         with clock.measure("compile"):
@@ -100,7 +104,7 @@ def reconstruct(
         "frames_per_second": round(tracked.frames_per_second, 2),
         "interrupted": interrupted,
     }
-    ending = _Ending(slam, source.truth, (*warned, *collected), title or source.name, known, clock, began)
+    ending = _Ending(slam, source.truth, (*warned, *collected), title or source.name, known, clock, began, dense)
     return _concluded(ending, settings, hooks, windows.records, evidence)
 
 
@@ -115,6 +119,7 @@ class _Ending:
     facts: Mapping[str, Any]
     clock: Clock
     began: float
+    dense: str
 
 
 def _concluded(
@@ -123,9 +128,8 @@ def _concluded(
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
     with clock.measure("dense map"):
-        depths = tuple(fused_depths(slam.keyframes, slam.intrinsics))
-        cloud = map_points(slam.keyframes, slam.intrinsics, depths)
-    hooks.each("on_finish", slam, cloud)
+        built = dense_map(slam.keyframes, slam.intrinsics, run.dense, slam.metric)
+    hooks.each("on_finish", slam, built.cloud)
     with clock.measure("verdict"):
         verdict = judge(slam, evidence.frames, check_input(run.warned, len(slam.frames)))
     summary = summarise(
@@ -134,13 +138,12 @@ def _concluded(
         settings=changed(settings),
         seconds={**clock.seconds, "all": time.perf_counter() - run.began},
         report=compare(slam, run.truth),
-        map_points=len(cloud),
+        map_points=len(built.cloud),
+        dense=run.dense,
         **run.facts,
     )
     notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
-    return Result.assemble(
-        RunRecord(slam, depths, tuple(windows), run.truth, notices, run.title), cloud, verdict, summary
-    )
+    return Result.assemble(RunRecord(slam, built, tuple(windows), run.truth, notices, run.title), verdict, summary)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,20 +9,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
 from vggtgeo.figures.result_figure import result_figure
+from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
+from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
 from vggtgeo.results.files import write_depth, write_settings
+from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise
-from vggtgeo.slam.dense import map_points
-from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import Evidence
@@ -35,13 +34,12 @@ from vggtgeo.slam.window_recorder import WindowRecord
 class RunRecord:
     """What a result is made of, as long as it is in memory; the page and the depth images are drawn from it.
 
-    slam: the last state. depths: the keyframes' dense depth after adjustment, metres, NaN or None where there is none.
-    windows: one an adjustment of the window. truth: camera -> world, where it is known. warnings: about the input, and
-    about the weights of networks. title: of the run.
+    slam: the last state. dense: the dense map after adjustment. windows: one an adjustment of the window. truth:
+    camera -> world, where it is known. warnings: about the input, and about the weights of networks. title: of the run.
     """
 
     slam: Slam
-    depths: tuple[np.ndarray | None, ...]
+    dense: DenseMap
     windows: tuple[WindowRecord, ...] = ()
     truth: Trajectory | None = None
     warnings: tuple[str, ...] = ()
@@ -56,6 +54,7 @@ class Result:
         trajectory: camera -> world of every frame that has a pose.
         keyframes: those of the keyframes.
         cloud: the map, world frame.
+        mesh: the map's surface, world frame; None where there is no dense depth.
         intrinsics: fx, fy, cx, cy, pixels, as adjusted.
         metric: whether lengths are metres; without metric depth they have no unit.
         verdict: how far all this can be trusted, by segment of time.
@@ -78,26 +77,28 @@ class Result:
     verdict: Verdict
     summary: Mapping[str, Any] = field(default_factory=dict)
     record: RunRecord | None = None
+    mesh: Mesh | None = None
 
     @classmethod
-    def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None) -> Self:
+    def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
         """The result of a state: the last one that `vggtgeo.run` gave, or what `vggtgeo.finish` made of it.
 
         evidence: what an `EvidenceRecorder` noted of all frames; without it the verdict rests on the run's own record.
-        truth: camera -> world, where it is known.
+        truth: camera -> world, where it is known. dense: whose depth the map is made of, as of `vggtgeo.reconstruct`.
         """
-        verdict, depths = judge(slam, evidence), tuple(fused_depths(slam.keyframes, slam.intrinsics))
-        cloud = map_points(slam.keyframes, slam.intrinsics, depths)
-        summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=len(cloud))
-        return cls.assemble(RunRecord(slam, depths, truth=truth), cloud, verdict, summary)
+        verdict, built = judge(slam, evidence), dense_map(slam.keyframes, slam.intrinsics, dense, slam.metric)
+        count = len(built.cloud)
+        summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=count)
+        return cls.assemble(RunRecord(slam, built, truth=truth), verdict, summary)
 
     @classmethod
-    def assemble(cls, record: RunRecord, cloud: PointCloud, verdict: Verdict, summary: Mapping[str, Any]) -> Self:
+    def assemble(cls, record: RunRecord, verdict: Verdict, summary: Mapping[str, Any]) -> Self:
         """The result of parts that are there already."""
         slam = record.slam
         fx, fy, cx, cy = (float(value) for value in slam.intrinsics)
         poses = frame_trajectory(slam), keyframe_trajectory(slam)
-        return cls(*poses, cloud, (fx, fy, cx, cy), verdict.metric, verdict, summary, record)
+        mesh = record.dense.mesh if len(record.dense.mesh.faces) else None
+        return cls(*poses, record.dense.cloud, (fx, fy, cx, cy), verdict.metric, verdict, summary, record, mesh)
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Self:
@@ -119,6 +120,7 @@ class Result:
             metric,
             verdict,
             summary,
+            mesh=Mesh.load_ply(place / "mesh.ply") if (place / "mesh.ply").is_file() else None,
         )
 
     def save(
@@ -128,8 +130,9 @@ class Result:
         depth: bool = False,
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `trajectory.png`, `report.html`,
-        `summary.json` and `settings.toml`, each atomically; `vggtgeo.read` reads it.
+        """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (where there is dense
+        depth), `trajectory.png`, `report.html`, `summary.json` and `settings.toml`, each atomically; `vggtgeo.read`
+        reads it.
 
         A result that was read from a folder has neither images nor windows, so it is saved without page and depth.
 
@@ -153,10 +156,14 @@ class Result:
         self.trajectory.save_tum(place / "trajectory.txt")
         self.keyframes.save_tum(place / "keyframes.txt")
         self.cloud.save_ply(place / "map.ply")
+        if self.mesh is not None:
+            self.mesh.save_ply(place / "mesh.ply")
         write_json(place / "summary.json", plain)
         self._draw(place, {**plain, "settings": flags})
+        if self.record is not None:
+            write_scene(place, self.record.slam)
         if depth and self.record is not None:
-            write_depth(place, self.record.slam.keyframes, self.record.depths)
+            write_depth(place, self.record.slam.keyframes, self.record.dense.depth_maps)
 
     def _draw(self, place: Path, summary: Mapping[str, Any]) -> None:
         record = self.record
@@ -176,6 +183,7 @@ class Result:
                 title=record.title,
                 truth=record.truth,
                 cloud=self.cloud,
+                depth_maps=record.dense.depth_maps,
                 records=record.windows,
                 summary=summary,
                 verdict=self.verdict,

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,10 +34,35 @@ from vggtgeo.models.onnx.vggt import VggtWindow
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.slam.settings import Roles
 
+PRESETS: dict[str, dict[str, str]] = {
+    "classical": {},
+    "light": {
+        "line_matches": "dinov3-small",
+        "confidence": "dinov3-small",
+        "depth": "moge2-small",
+        "lines": "mlsd",
+    },
+    "paper": {
+        "geometry": "vggt",
+        "line_matches": "dinov3",
+        "confidence": "dinov3",
+        "depth": "moge2",
+        "lines": "letr",
+        "points": "mast3r",
+    },
+}
+"""The networks of each preset, by role."""
+CHOICES: dict[str, tuple[str, ...]] = {
+    "points": ("classical", "mast3r"),
+    "lines": ("classical", "mlsd", "letr"),
+    "depth": ("classical", "moge2-small", "moge2"),
+}
+"""Who may play a role apart from its preset, beside the roles that the caller has (`classical`)."""
+_FILES = {"mast3r": ("mast3r_encoder", "mast3r_decoder")}
+"""The registry's names of what is more than one file."""
 NEEDED = {
-    "classical": (),
-    "light": ("dinov3-small", "moge2-small", "mlsd"),
-    "paper": ("vggt", "dinov3", "moge2", "letr", "mast3r_encoder", "mast3r_decoder"),
+    preset: tuple(dict.fromkeys(file for name in roles.values() for file in _FILES.get(name, (name,))))
+    for preset, roles in PRESETS.items()
 }
 """The networks of each preset, by their names in the registry."""
 
@@ -84,6 +109,7 @@ def perception(
     cache: Path | None = None,
     provider: Provider = "auto",
     memory_limit_gb: float | None = None,
+    mixed: Mapping[str, str] | None = None,
 ) -> Perception:
     """The role objects of a preset, for `vggtgeo.reconstruct`; every file is opened, checked and warmed up here.
 
@@ -94,6 +120,7 @@ def perception(
         cache: folder for what the networks answer; by default nothing is kept beyond the run.
         provider: where networks run: auto, cuda or cpu.
         memory_limit_gb: most GPU memory of each network.
+        mixed: who plays a role in place of the preset's choice, by role, as `CHOICES` lists: `{"lines": "mlsd"}`.
 
     Raises:
         InputError: an unknown preset, a missing file, or a wrong one.
@@ -105,14 +132,14 @@ def perception(
 
     """
     classical = classical or Roles()
-    if preset not in NEEDED:
-        raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(NEEDED)}")
-    if not NEEDED[preset]:
+    parts = _parts(preset, mixed or {})
+    if not parts:
         return Perception(classical, {})
+    needed = tuple(dict.fromkeys(file for name in parts.values() for file in _FILES.get(name, (name,))))
     place = networks_folder(folder)
-    _check_present(preset, place)
+    _check_present(needed, place)
     with as_input_errors():
-        for name in NEEDED[preset]:
+        for name in needed:
             check_looks_like_onnx(place / NETWORKS[name].file)  # before gigabytes of others are read
         networks = {
             name: open_session(
@@ -121,48 +148,58 @@ def perception(
                 provider=provider,
                 memory_limit_gb=memory_limit_gb,
             )
-            for name in NEEDED[preset]
+            for name in needed
         }
-        build = _paper if preset == "paper" else _light
-        roles = build(classical, networks, cache)
+        roles = replace(classical, **_players(parts, classical, networks, cache))
         for session in networks.values():
             session.warm_up()
     return Perception(roles, networks)
 
 
-def _light(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Roles:
-    features = DinoFeatures(networks["dinov3-small"], _cache(cache))
-    return replace(
-        classical,
-        lines=MlsdDetector(networks["mlsd"], _cache(cache)),
-        line_matches=DenseLineMatcher(features),
-        depth=MogeDepth(networks["moge2-small"], _cache(cache)),
-        confidence=features,
-    )
+def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
+    """The network of each role that one plays."""
+    if preset not in PRESETS:
+        raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(PRESETS)}")
+    for role, name in mixed.items():
+        if name not in CHOICES.get(role, ()):
+            known = "; ".join(f"{role}: {', '.join(names)}" for role, names in CHOICES.items())
+            raise InputError(f"`{role}` is {name!r}; what can be mixed is {known}")
+    parts = {**PRESETS[preset], **mixed}
+    return {role: name for role, name in parts.items() if name != "classical"}
 
 
-def _paper(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Roles:
-    features = DinoFeatures(networks["dinov3"], _cache(cache))
-    window = _check_views(VggtWindow(networks["vggt"], _cache(cache)))
-    return Roles(
-        points=Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache)),
-        lines=LetrDetector(networks["letr"], _cache(cache)),
-        line_matches=DenseLineMatcher(features),
-        depth=MogeDepth(networks["moge2"], _cache(cache)),
-        confidence=features,
-        geometry=WindowLocator(window, classical.geometry, views=window.views),
-    )
+def _players(
+    parts: Mapping[str, str], classical: Roles, networks: Mapping[str, Session], cache: Path | None
+) -> dict[str, Any]:
+    """The role objects of the networks. One network in two roles is one object: it answers both from one call."""
+    features = {
+        name: DinoFeatures(networks[name], _cache(cache)) for name in parts.values() if name.startswith("dinov3")
+    }
+
+    def player(role: str, name: str) -> Any:
+        if name in features:
+            return DenseLineMatcher(features[name]) if role == "line_matches" else features[name]
+        if name == "mast3r":
+            return Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache))
+        if name == "vggt":
+            window = _check_views(VggtWindow(networks[name], _cache(cache)))
+            return WindowLocator(window, classical.geometry, views=window.views)
+        return {"lines": {"mlsd": MlsdDetector, "letr": LetrDetector}.get(name), "depth": MogeDepth}[role](
+            networks[name], _cache(cache)
+        )
+
+    return {role: player(role, name) for role, name in parts.items()}
 
 
 def _cache(folder: Path | None) -> OutputCache:
     return MemoryCache() if folder is None else FolderCache(folder)
 
 
-def _check_present(preset: str, place: Path) -> None:
-    missing = [NETWORKS[name].file for name in NEEDED[preset] if not (place / NETWORKS[name].file).is_file()]
+def _check_present(needed: Sequence[str], place: Path) -> None:
+    missing = [NETWORKS[name].file for name in needed if not (place / NETWORKS[name].file).is_file()]
     if missing:
         raise InputError(
-            f"`preset` {preset!r} needs {', '.join(missing)} in `{place}`, found no such "
+            f"what was chosen needs {', '.join(missing)} in `{place}`, found no such "
             f"{'files' if len(missing) > 1 else 'file'}; `vggtgeo models list` tells how to get each"
         )
 

@@ -1,0 +1,108 @@
+"""The dense map of a run: whose depth each keyframe has, and what is fused of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.errors import InputError
+from vggtgeo.mapping.cloud import map_points
+from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.keyframe_depth import fused_depths
+from vggtgeo.mapping.stereo import stereo_depths
+from vggtgeo.mapping.tsdf import fused_mesh
+from vggtgeo.slam.keyframe import Keyframe
+
+DenseMode = Literal["auto", "mvs", "sensor", "network", "none"]
+"""Where dense depth comes from. "auto": what was measured, by a sensor or a network; where nothing was, the pictures.
+"mvs": the pictures, by multi-view stereo, also in the holes of what was measured. "sensor", "network": what was
+measured alone. "none": the map is the adjusted points."""
+
+VOXEL = 0.02
+"""Edge of a voxel, metres."""
+VOXEL_PIXELS = 2.5
+"""The same in pixels, where there are no metres: 1.2 cm at 2.5 m and 525 pixels of focal length."""
+
+
+@dataclass(frozen=True, eq=False)
+class DenseMap:
+    """Fields: depth_maps, one a keyframe, None where there is none; cloud and mesh in the world frame, metres (the
+    map's unit where the scale is free).
+    """
+
+    depth_maps: tuple[DepthMap | None, ...]
+    cloud: PointCloud
+    mesh: Mesh
+
+
+def check_dense(mode: str, measured: bool) -> None:
+    """InputError for an unknown `mode`, or one that needs depth that was measured where there is none."""
+    if mode not in get_args(DenseMode):
+        raise InputError(f"`dense` is {mode!r}; it must be one of {', '.join(get_args(DenseMode))}")
+    if mode in ("sensor", "network") and not measured:
+        raise InputError(f"`dense` is {mode!r}, but no depth was measured; give frames with depth, or take `mvs`")
+
+
+def dense_map(
+    keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: str = "auto", metric: bool = True
+) -> DenseMap:
+    """Depth, cloud and mesh of adjusted keyframes.
+
+    Args:
+        keyframes: poses world -> camera.
+        intrinsics: float64 [4], pixels.
+        mode: a `DenseMode`.
+        metric: whether lengths are metres; else the voxels' size follows from the pixels'.
+
+    Raises:
+        InputError: see `check_dense`.
+
+    """
+    depth_maps = tuple(dense_depths(keyframes, intrinsics, mode))
+    voxel = VOXEL if metric else _voxel(depth_maps, intrinsics)
+    cloud = map_points(keyframes, intrinsics, depth_maps, voxel=voxel)
+    return DenseMap(depth_maps, cloud, fused_mesh(keyframes, depth_maps, intrinsics, voxel))
+
+
+def _voxel(depth_maps: Sequence[DepthMap | None], intrinsics: np.ndarray) -> float:
+    """What `VOXEL_PIXELS` cover at the middle depth, in the map's unit; `VOXEL` where there is no depth."""
+    middles = [float(np.nanmedian(depth_map.depth)) for depth_map in depth_maps if depth_map is not None]
+    return VOXEL_PIXELS * float(np.median(middles)) / float(intrinsics[0]) if middles else VOXEL
+
+
+def dense_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: str = "auto") -> list[DepthMap | None]:
+    """Dense depth of each keyframe, None where there is none; arguments and errors as of `dense_map`."""
+    measured = any(np.isfinite(keyframe.depth).any() for keyframe in keyframes)
+    check_dense(mode, measured)
+    if mode == "none":
+        return [None] * len(keyframes)
+    own = [
+        None if depth is None else _measured(keyframe, depth)
+        for keyframe, depth in zip(keyframes, fused_depths(keyframes, intrinsics), strict=True)
+    ]
+    if mode in ("sensor", "network") or (mode == "auto" and measured):
+        return own
+    return [_filled(*pair) for pair in zip(own, stereo_depths(keyframes, intrinsics), strict=True)]
+
+
+def _measured(keyframe: Keyframe, depth: np.ndarray) -> DepthMap:
+    return DepthMap(
+        depth.astype(np.float32),
+        keyframe.depth_sigma.astype(np.float32),
+        (keyframe.depth_confidence / 255.0).astype(np.float32),
+    )
+
+
+def _filled(measured: DepthMap | None, stereo: DepthMap | None) -> DepthMap | None:
+    """The measured depth, and that of the pictures in its holes."""
+    if measured is None or stereo is None:
+        return stereo if measured is None else measured
+    hole = ~np.isfinite(measured.depth)
+    return DepthMap(
+        *(np.where(hole, getattr(stereo, name), getattr(measured, name)) for name in ("depth", "sigma", "confidence"))
+    )
