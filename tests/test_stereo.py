@@ -111,8 +111,8 @@ def _paths(cost: np.ndarray, image: np.ndarray, down: int, right: int) -> np.nda
 
 
 def test_a_plane_is_carried_where_its_points_project() -> None:
-    # Proves the homography of a plane, for cameras turned, moved and of different focal lengths. Oracle: unproject, then
-    # project.
+    # Proves the homography of a plane, for cameras turned, moved and of different focal lengths. Oracle: unproject,
+    # then project.
     rng = np.random.default_rng(1)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = (

@@ -66,7 +66,9 @@ def dense_map(
     depth_maps = tuple(dense_depths(keyframes, intrinsics, mode))
     voxel = VOXEL if metric else _voxel(depth_maps, intrinsics)
     cloud = map_points(keyframes, intrinsics, depth_maps, voxel=voxel)
-    return DenseMap(depth_maps, cloud, fused_mesh(keyframes, depth_maps, intrinsics, voxel))
+    # A depth of the pictures was confirmed by two other views; one that was measured was not.
+    least_views = 2 if any(np.isfinite(keyframe.depth).any() for keyframe in keyframes) else 1
+    return DenseMap(depth_maps, cloud, fused_mesh(keyframes, depth_maps, intrinsics, voxel, least_views))
 
 
 def _voxel(depth_maps: Sequence[DepthMap | None], intrinsics: np.ndarray) -> float:

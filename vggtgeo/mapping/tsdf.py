@@ -40,8 +40,6 @@ GROUP = 32
 """Blocks that one compiled call works on."""
 LEAST_CONFIDENCE = 0.5
 """Of a pixel that takes part, as in the cloud: below it lies a jump of depth, and no surface."""
-LEAST_VIEWS = 2
-"""That must have measured at a voxel, where there are so many at all."""
 LEAST_PART = 200
 """Faces of the smallest separate piece of surface that is kept: smaller ones are false depths."""
 
@@ -61,6 +59,7 @@ def fused_mesh(
     depth_maps: Sequence[DepthMap | None],
     intrinsics: np.ndarray,
     voxel: float = 0.02,
+    least_views: int = 2,
 ) -> Mesh:
     """One coloured mesh of all keyframes' depth, in the world frame.
 
@@ -69,6 +68,8 @@ def fused_mesh(
         depth_maps: one a keyframe, None where there is none.
         intrinsics: float64 [4], pixels.
         voxel: edge of a voxel, metres.
+        least_views: keyframes that must have measured at a voxel, where there are so many; 1 where each depth was
+            confirmed by other views already.
 
     """
     if not voxel > 0:
@@ -82,7 +83,7 @@ def fused_mesh(
     for number, view in enumerate(views):
         for block in _blocks(view, voxel):
             seen_by[block].append(number)
-    least = min(LEAST_VIEWS, len(views))
+    least = min(least_views, len(views))
     blocks = sorted(block for block, numbers in seen_by.items() if len(numbers) >= least)
     parts = [
         _batch(blocks[first : first + BATCH], seen_by, views, voxel, least) for first in range(0, len(blocks), BATCH)
