@@ -7,7 +7,9 @@ Each keyframe is compared with the neighbours that see its points from a good an
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -26,6 +28,8 @@ from vggtgeo.slam.keyframe import Keyframe
 
 LEAST_POINTS = 8
 """Known points in view, below which nobody knows between which depths to search."""
+MOST_AT_ONCE = 8
+"""Keyframes searched at a time."""
 LARGEST_SIGMA = 0.05
 """Largest relative standard deviation of a depth: what is known worse would only blur the map."""
 BLEND = 0.03
@@ -73,11 +77,15 @@ def stereo_depths(
     views = choose_views(keyframes, intrinsics, settings.views)
     photos = [_photo(keyframe, intrinsics, settings.size) for keyframe in keyframes]
     points = [known_points(keyframe, intrinsics) for keyframe in keyframes]
-    found: list[PosedDepth | None] = []
-    for i, photo in enumerate(photos):
+
+    def search(i: int) -> PosedDepth | None:
         around = np.concatenate([points[j] for j in (i, *views[i])])
-        depth_map = _search(around, photo, [photos[j] for j in views[i]], settings)
-        found.append(None if depth_map is None else PosedDepth(depth_map, photo.pose, photo.intrinsics))
+        depth_map = _search(around, photos[i], [photos[j] for j in views[i]], settings)
+        return None if depth_map is None else PosedDepth(depth_map, photos[i].pose, photos[i].intrinsics)
+
+    # OpenCV and JAX leave Python's lock; a search holds some 150 MB.
+    with ThreadPoolExecutor(max_workers=min(MOST_AT_ONCE, os.cpu_count() or 1)) as pool:
+        found = list(pool.map(search, range(len(photos))))
     result: list[DepthMap | None] = []
     for i, own in enumerate(found):
         others = [other for j in views[i] if (other := found[j]) is not None]
