@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_problem
-from vggtgeo.cli.jax_flags import cache_folder
 from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command, make_app
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.jax_environment import cache_folder
 
 HEAVY = {"jax", "cv2", "matplotlib", "scipy", "onnxruntime", "rerun", "equinox", "numpy"}
 PROBE = """
@@ -91,7 +91,7 @@ def failing(monkeypatch: pytest.MonkeyPatch):
     ("error", "code", "message"),
     [
         (InputError("`x` is 3; it must be 4"), 2, "error: `x` is 3; it must be 4"),
-        (PermissionError(13, "Permission denied", "/root/x"), 2, "error: [Errno 13] Permission denied: '/root/x'"),
+        (PermissionError(13, "Permission denied", "/root/x"), 2, "error: `/root/x`: Permission denied"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (ZeroDivisionError("by zero"), 1, "internal error: ZeroDivisionError: by zero (where: `vggtgeo --debug ...`)"),
         (typer.Exit(7), 7, ""),

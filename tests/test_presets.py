@@ -157,7 +157,7 @@ def test_the_program_says_what_random_weights_are_worth(files: Path, tmp_path: P
     with pytest.warns(InputWarning, match=r"the weights of vggt, dinov3.* are random: this result means nothing"):
         result = _run(tmp_path, "--preset", "paper", "--models", files)
     assert result.exit_code == 0, result.output
-    assert isinstance(called["roles"].points, Mast3rMatcher)
+    assert isinstance(called["roles"].points.source, Mast3rMatcher)
     networks = called["facts"]["networks"]
     assert set(networks) == set(NEEDED["paper"])
     assert {network["weights"] for network in networks.values()} == {"random"}
@@ -177,7 +177,7 @@ def test_the_preset_builds_the_roles_it_documents(files: Path) -> None:
     assert light.geometry is classical.geometry
     assert light.metric
     paper = perception("paper", classical, files).roles
-    assert isinstance(paper.points, Mast3rMatcher)
+    assert isinstance(paper.points.source, Mast3rMatcher)
     assert isinstance(paper.geometry, WindowLocator)
     assert paper.geometry.views == 3
     assert paper.geometry.judge is classical.geometry
@@ -307,12 +307,12 @@ def test_roles_are_mixed_by_name(files: Path) -> None:
     classical = Roles()
     found = perception("classical", classical, files, mixed={"lines": "mlsd", "depth": "moge2-small"})
     assert set(found.networks) == {"mlsd", "moge2-small"}
-    assert type(found.roles.lines).__name__ == "MlsdDetector"
-    assert type(found.roles.depth).__name__ == "MogeDepth"
+    assert type(found.roles.lines.source).__name__ == "MlsdDetector"
+    assert type(found.roles.depth.source).__name__ == "MogeDepth"
     assert found.roles.points is classical.points
     less = perception("light", classical, files, mixed={"depth": "classical", "lines": "letr"})
     assert set(less.networks) == {"dinov3-small", "letr"}
     assert less.roles.depth is classical.depth
-    assert less.roles.line_matches.features is less.roles.confidence
+    assert less.roles.line_matches.source.features is less.roles.confidence.source
     with pytest.raises(InputError, match="`lines` is 'moge2'; what can be mixed is points: classical, mast3r;"):
         perception("classical", classical, files, mixed={"lines": "moge2"})

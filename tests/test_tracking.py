@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from vggtgeo.models.classical import NoDepth, PnpGeometry, SiftMatcher, place_vector
-from vggtgeo.models.roles import DepthEstimate, GeometryResult, PoseGuess, PoseQuery
+from vggtgeo.models.roles import DepthEstimate, GeometryResult, PoseGuess, PoseQuery, Segments
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
@@ -18,6 +19,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.rgbd_view import RgbdView
@@ -26,7 +28,7 @@ from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking import Sight
+from vggtgeo.slam.tracking import Expectation, Sight, Track, track
 
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
@@ -135,6 +137,45 @@ def test_alignment_of_different_places_says_that_they_differ(room: Room) -> None
     assert found is None or found.correlation < 0.3
 
 
+def _by_lines(room: Room, keep: Callable[[np.ndarray], np.ndarray]) -> tuple[Track, np.ndarray]:
+    """Frame 2 against a keyframe at frame 0 by its segments alone, those that `keep` says of their ends [l, 2, 2], from
+    4 cm and 2 degrees off; and the true pose.
+    """
+    frames, camera, truth = room
+    poses, intrinsics = rigid.invert(truth.poses), np.array(camera.intrinsics)
+    blank = ROLES.points.describe(np.zeros_like(frames[0].image))
+    keyframe = make_keyframe(0, frames[0], poses[0], blank, ROLES, SETTINGS, intrinsics)
+    segments = ROLES.lines.detect(frames[2].image)
+    kept = keep(segments.endpoints)
+    segments = Segments(segments.endpoints[kept], segments.scores[kept])
+    sight = Sight(frames[2], blank, None, lambda: ROLES.line_matches.describe(frames[2].image, segments))
+    wrong = rigid.exponential(np.array([0.03, -0.02, 0.02, 0.02, -0.025, 0.015])) @ poses[2]
+    return track(sight, keyframe, None, Expectation(wrong, np.eye(4)), intrinsics, ROLES), poses[2]
+
+
+def test_lines_alone_hold_a_frame(room: Room) -> None:
+    """Without a key point and without depth of its own a frame is placed by its segments to 1 cm, and believed.
+
+    Oracle: the renderer's poses.
+    """
+    found, true = _by_lines(room, lambda ends: np.ones(len(ends), bool))
+    off = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(true))
+    assert off < 0.01, f"{1000 * off:.1f} mm"
+    assert rigid.angle_between(found.pose, true) < np.deg2rad(0.3)
+    assert found.accepted, found.evidence
+
+
+def test_lines_that_leave_a_direction_open_are_not_believed(room: Room) -> None:
+    """The upright segments of the same frame leave the height open: no pose. Oracle: they are parallel in space."""
+
+    def upright(ends: np.ndarray) -> np.ndarray:
+        along = np.abs(ends[:, 1] - ends[:, 0])
+        return along[:, 1] > 5 * along[:, 0]
+
+    found, _ = _by_lines(room, upright)
+    assert not found.accepted, found.evidence
+
+
 class _Mirage:
     """A pose solver that from a certain frame on is sure of a pose 2 m off, on 12 of its matches."""
 
@@ -177,8 +218,24 @@ def test_a_step_that_no_hand_makes_is_not_believed(room: Room) -> None:
         (Evidence(matches=0, inliers=0, correlation=0.75, surface=0.97, overlap=0.6, chi2=90.0), False),
         (Evidence(matches=300, inliers=280, correlation=-0.1, surface=0.5, overlap=0.5, chi2=4.0), False),
         (Evidence(matches=90, inliers=80, sigma_translation=0.4, chi2=4.0), False),
+        (Evidence(lines=20, visible_lines=35, sigma_translation=0.02, chi2=4.0), True),
+        (Evidence(lines=20, visible_lines=35, sigma_translation=0.4, chi2=4.0), False),
+        (Evidence(lines=20, visible_lines=35, sigma_translation=0.02, chi2=90.0), False),
+        (Evidence(lines=20, visible_lines=70, sigma_translation=0.02, chi2=4.0), False),
     ],
-    ids=["mirrored", "a fifth agrees", "points and picture", "picture", "picture, far", "picture differs", "vague"],
+    ids=[
+        "mirrored",
+        "a fifth agrees",
+        "points and picture",
+        "picture",
+        "picture, far",
+        "picture differs",
+        "vague",
+        "lines",
+        "parallel lines",
+        "lines, far",
+        "few of the lines",
+    ],
 )
 def test_what_is_believed(evidence: Evidence, believed: bool) -> None:
     """Two witnesses or one beyond doubt; oracle: cases measured on real pairs of frames, right and wrong."""
@@ -238,6 +295,7 @@ def test_a_place_is_recognised(room: Room) -> None:
     assert int(np.argmax(similarity)) == 0, similarity
 
 
+@pytest.mark.long
 def test_pieces_join_where_they_meet(room: Room) -> None:
     """Two parts of a room, the second begun without knowing the first, become one map when the camera comes back.
 

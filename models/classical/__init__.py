@@ -1,6 +1,7 @@
 """Classical implementations of the five perception roles: OpenCV and numpy, no weights."""
 
 from vggtgeo.models.classical.depth import NoDepth, SensorDepth
+from vggtgeo.models.classical.guided_search import can_search, search_around, search_near, search_tree
 from vggtgeo.models.classical.line_detector import LsdDetector
 from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
 from vggtgeo.models.classical.line_matcher import BandLineMatcher
@@ -30,10 +31,14 @@ __all__ = [
     "SiftMatcher",
     "StructureTensor",
     "TwoViewStart",
+    "can_search",
     "line_coefficients",
     "nearest_frame",
     "place_vector",
     "pose_information",
     "sample_segments",
+    "search_around",
+    "search_near",
+    "search_tree",
     "segment_depths",
 ]

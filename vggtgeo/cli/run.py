@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +33,7 @@ def run(
     start: options.StartOption = 0,
     end: options.EndOption = None,
     stride: options.StrideOption = 1,
+    fps: options.RateOption = None,
     intrinsics: options.IntrinsicsOption = None,
     rgb_only: options.RgbOnlyOption = False,
     lines: options.LinesOption = True,
@@ -44,13 +44,13 @@ def run(
     features: options.FeaturesOption = "sift",
     refine_intrinsics: options.RefineIntrinsicsOption = None,
     preset: options.PresetOption = "classical",
-    points: options.PointsOption = None,
-    line_detector: options.LineDetectorOption = None,
-    depth: options.DepthOption = None,
     models: options.ModelsOption = None,
     cache: options.CacheOption = None,
     provider: options.ProviderOption = "auto",
     memory_limit_gb: options.MemoryOption = None,
+    points: options.PointsOption = None,
+    line_detector: options.LineDetectorOption = None,
+    depth: options.DepthOption = None,
     dense: options.DenseOption = "auto",
     save_depth: options.SaveDepthOption = False,
     assignments: AssignmentsOption = None,
@@ -63,11 +63,13 @@ def run(
     from vggtgeo.cli.pipeline_settings import Switches, pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
+    from vggtgeo.slam.presets import classical_roles
     from vggtgeo.slam.setting_groups import DepthSettings
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
-    check_flags(preset, features, memory_limit_gb)
+    check_flags(preset, features, memory_limit_gb, fps)
+    check_provider(preset, provider)
     switches: Switches = {
         "lines": {"line": {"use_lines": lines}},
         "confidence": {"weights": {"use_confidence": confidence}},
@@ -77,8 +79,8 @@ def run(
     }
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:
-        sequence = open_input(path, kind, intrinsics, rgb_only)
-    classical = make_roles(sequence, init, features)
+        sequence = open_input(path, kind, intrinsics, rgb_only, fps)
+    classical = classical_roles(sequence.has_depth, init, features)
     mixed = {"points": points, "lines": line_detector, "depth": depth}
     perceived = make_perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
     flags = settings.values() if settings else {}
@@ -86,7 +88,7 @@ def run(
         sequence,
         perceived,
         slam_settings,
-        Output(output, flags, rerun, save_depth, quiet, as_json),
+        Output(output, flags, rerun, save_depth, quiet, as_json, source=path),
         (start, end, stride),
         seed=seed,
         dense=dense,
@@ -94,19 +96,36 @@ def run(
     )
 
 
-def check_flags(preset: str, features: str, memory_limit_gb: float | None) -> None:
+def check_flags(preset: str, features: str, memory_limit_gb: float | None, fps: float | None = None) -> None:
     """InputError for flags that do not go together, or cannot be."""
     if preset == "paper" and features != "sift":
         raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
     if memory_limit_gb is not None and not memory_limit_gb > 0:
         raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be positive")
+    if fps is not None and not 0 < fps < float("inf"):
+        raise InputError(f"`--fps` is {fps:g}; it must be a positive number of frames a second")
 
 
-def open_input(path: Path, kind: str | None, intrinsics: str | None, rgb_only: bool) -> Sequence:
+def check_provider(preset: str, provider: options.Provider) -> None:
+    """InputError for a GPU that is asked for and not there; a warning where no network would use it."""
+    if provider != "cuda":
+        return
+    from vggtgeo.io.network_errors import as_input_errors
+    from vggtgeo.models.onnx.session import choose_provider
+
+    with as_input_errors():
+        choose_provider(provider)
+    if preset == "classical":
+        warnings.warn("`--provider cuda` has no effect with `--preset classical`", InputWarning, stacklevel=2)
+
+
+def open_input(
+    path: str | Path, kind: str | None, intrinsics: str | None, rgb_only: bool, fps: float | None = None
+) -> Sequence:
     """The sequence at `path`, with what the flags say otherwise."""
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
 
-    sequence = open_sequence(path, kind)
+    sequence = open_sequence(path, kind, fps)
     if intrinsics is not None:
         sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
     return without_depth(sequence) if rgb_only else sequence
@@ -129,17 +148,3 @@ def make_perception(
     if perceived.random:
         warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
     return perceived
-
-
-def make_roles(sequence: Sequence, init: str, features: str) -> Roles:
-    """The classical role objects for a sequence; the one place where names become objects."""
-    from vggtgeo.models.classical import ConstantVelocity, NoDepth, OrbMatcher, SiftMatcher
-    from vggtgeo.slam.settings import Roles
-
-    roles = Roles(points={"sift": SiftMatcher, "orb": OrbMatcher}[features]())
-    if init == "constant-velocity":
-        # The ablation is a start by motion alone: nothing else may mend the pose before the window does.
-        roles = replace(roles, geometry=ConstantVelocity(), alignment=None)
-    if not sequence.has_depth:
-        roles = replace(roles, depth=NoDepth())
-    return roles

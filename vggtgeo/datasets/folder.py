@@ -9,7 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import MILLIMETRES, DepthFormat, read_depth, read_image
+from vggtgeo.datasets.image_files import (
+    MILLIMETRES,
+    DepthFormat,
+    ImageFile,
+    read_depth,
+    read_image,
+    read_image_file,
+)
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
@@ -55,12 +62,32 @@ class FolderSequence:
         """No truth, unless the layout knows one."""
         return None
 
+    def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
+        """The image in a file, see `read_image_file`; a layout whose images do not fit its depth changes them here."""
+        return read_image_file(path, least_bits)
+
+    def load_depth(self, path: Path) -> np.ndarray:
+        """The depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
+        return read_depth(path, self.depth_format)
+
     def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
         empty = 0
+        bits = 8
+        turned = False
         for file in files:
-            image = self._read_image(file)
-            if image is None:
+            read = self._read_image(file, bits)
+            if read is None:
                 continue
+            if read.bits > bits and (bits > 8 or read.bits < 16):
+                _warn(f"`{file.image}` has values of {read.bits} bits: taken for an image of so many from here on")
+            bits = max(bits, read.bits)
+            if read.orientation != 1 and not turned:
+                turned = True
+                _warn(
+                    f"`{file.image}` asks to be turned (EXIF orientation {read.orientation}): images are used as they "
+                    "are stored, and intrinsics and depth must be those of the stored images"
+                )
+            image = read.image
             depth = self._read_depth(file) if self.has_depth else None
             if file.depth is not None and depth is not None and not np.isfinite(depth).any():
                 empty += 1
@@ -70,13 +97,13 @@ class FolderSequence:
         if empty > _NAMED_EMPTY_DEPTHS:
             _warn(f"`{self.name}`: {empty} of {len(files)} depth images gave no valid depth")
 
-    def _read_image(self, file: FrameFile) -> np.ndarray | None:
+    def _read_image(self, file: FrameFile, bits: int) -> ImageFile | None:
         try:
-            image = read_image(file.image)
+            read = self.load_image(file.image, bits)
         except InputError as error:
             _warn(f"{error}; the frame is skipped", LeftOutWarning)
             return None
-        height, width = image.shape[:2]
+        height, width = read.image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             _warn(
                 f"`{file.image}` is {width} x {height} pixels; the sequence's images are "
@@ -84,14 +111,14 @@ class FolderSequence:
                 LeftOutWarning,
             )
             return None
-        return image
+        return read
 
     def _read_depth(self, file: FrameFile) -> np.ndarray:
         nothing = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
         if file.depth is None:
             return nothing
         try:
-            depth = read_depth(file.depth, self.depth_format)
+            depth = self.load_depth(file.depth)
         except InputError as error:
             _warn(f"{error}; the frame is used without depth")
             return nothing
@@ -128,11 +155,13 @@ def depth_is_usable(name: str, files: Sequence[FrameFile], coding: DepthFormat, 
     valid.
     """
     with_depth = [file for file in files if file.depth is not None]
+    reason = ""
     for file in _spread(with_depth):
         assert file.depth is not None
         try:
             depth = read_depth(file.depth, coding)
-        except InputError:
+        except InputError as error:
+            reason = reason or f" ({error})"
             continue
         if depth.shape != (height, width):
             raise InputError(
@@ -142,7 +171,9 @@ def depth_is_usable(name: str, files: Sequence[FrameFile], coding: DepthFormat, 
         if np.isfinite(depth).any():
             return True
     if with_depth:
-        _warn(f"`{name}`: none of the {len(with_depth)} depth images has a valid pixel; reading the images only")
+        _warn(
+            f"`{name}`: none of the {len(with_depth)} depth images has a valid pixel{reason}; reading the images only"
+        )
     return False
 
 

@@ -21,7 +21,7 @@ class ImageFolder(FolderSequence):
     """Images of one folder, without depth. Truth: `groundtruth.txt` (TUM format), where there is one.
 
     Time is position / 30 s, unless all names are times: seconds with a decimal point (`12.034.png`) or
-    nanoseconds (18 or 19 digits).
+    nanoseconds (18 or 19 digits), or `with_rate` says otherwise.
     """
 
     @classmethod
@@ -46,7 +46,7 @@ class ImageFolder(FolderSequence):
     def ground_truth(self) -> Trajectory | None:
         """The true poses, if the folder has them."""
         file = self.folder / "groundtruth.txt"
-        return Trajectory.load_tum(file) if file.is_file() else None
+        return Trajectory.load_tum(file) if file.exists() else None
 
 
 def natural_key(name: str) -> list[int | str]:

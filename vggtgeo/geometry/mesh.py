@@ -6,8 +6,9 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
+from plyfile import PlyData, PlyElement
 
+from vggtgeo.geometry.point_cloud import UNREADABLE
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 
@@ -73,5 +74,5 @@ class Mesh:
             vertices, faces = data["vertex"].data, data["face"].data["vertex_indices"]
             column = lambda *names: np.column_stack([vertices[name] for name in names])
             return cls(column("x", "y", "z"), np.array(faces), column("nx", "ny", "nz"), column("red", "green", "blue"))
-        except (OSError, KeyError, ValueError, PlyHeaderParseError, PlyParseError) as error:
+        except UNREADABLE as error:
             raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY mesh: {error}") from None

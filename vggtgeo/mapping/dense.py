@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -31,13 +32,24 @@ VOXEL_PIXELS = 2.5
 
 @dataclass(frozen=True, eq=False)
 class DenseMap:
-    """Fields: depth_maps, one a keyframe, None where there is none; cloud and mesh in the world frame, metres (the
-    map's unit where the scale is free).
+    """Fields: keyframes and intrinsics that the map is made of; depth_maps, one a keyframe, None where there is none;
+    cloud in the world frame, metres (the map's unit where the scale is free); voxel, the edge of a cell of cloud and
+    mesh.
     """
 
+    keyframes: tuple[Keyframe, ...]
+    intrinsics: np.ndarray
     depth_maps: tuple[DepthMap | None, ...]
     cloud: PointCloud
-    mesh: Mesh
+    voxel: float
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The surface, world frame, made when it is first asked for; None where there is none."""
+        # A depth of the pictures was confirmed by two other views; one that was measured was not.
+        measured = any(np.isfinite(keyframe.depth).any() for keyframe in self.keyframes)
+        found = fused_mesh(self.keyframes, self.depth_maps, self.intrinsics, self.voxel, 2 if measured else 1)
+        return found if len(found.faces) else None
 
 
 def check_dense(mode: str, measured: bool) -> None:
@@ -51,7 +63,7 @@ def check_dense(mode: str, measured: bool) -> None:
 def dense_map(
     keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: str = "auto", metric: bool = True
 ) -> DenseMap:
-    """Depth, cloud and mesh of adjusted keyframes.
+    """Depth and cloud of adjusted keyframes, and, when it is asked for, the mesh.
 
     Args:
         keyframes: poses world -> camera.
@@ -66,9 +78,7 @@ def dense_map(
     depth_maps = tuple(dense_depths(keyframes, intrinsics, mode))
     voxel = VOXEL if metric else _voxel(depth_maps, intrinsics)
     cloud = map_points(keyframes, intrinsics, depth_maps, voxel=voxel)
-    # A depth of the pictures was confirmed by two other views; one that was measured was not.
-    least_views = 2 if any(np.isfinite(keyframe.depth).any() for keyframe in keyframes) else 1
-    return DenseMap(depth_maps, cloud, fused_mesh(keyframes, depth_maps, intrinsics, voxel, least_views))
+    return DenseMap(tuple(keyframes), intrinsics, depth_maps, cloud, voxel)
 
 
 def _voxel(depth_maps: Sequence[DepthMap | None], intrinsics: np.ndarray) -> float:

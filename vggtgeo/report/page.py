@@ -93,7 +93,8 @@ def write_page(
     trajectory = frame_trajectory(slam)
     chosen = _spread(list(zip(slam.keyframes, depth_maps, strict=True)), SAMPLES)
     low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
-    text = _template().render(
+    text = template("vggtgeo.report", "page.html.j2").render(
+        style=style(),
         title=title,
         facts=_facts(slam, trajectory, cloud, summary),
         simulated=bool(summary.get("simulated")),
@@ -115,15 +116,23 @@ def write_page(
         settings=_flat(summary["settings"]),
         versions=summary["versions"],
         intrinsics=summary["intrinsics"],
-        truth_table=_truth_table(summary.get("truth")),
+        truth_table=_truth_table(summary.get("truth"), slam.metric),
+        scale=summary["scale"],
+        scale_basis=summary.get("scale_basis"),
     )
     write_text(path, text)
 
 
-def _template() -> jinja2.Template:
-    text = (files("vggtgeo.report") / "page.html.j2").read_text(encoding="utf-8")
+def template(package: str, name: str) -> jinja2.Template:
+    """The template of a page, a file of `package`; what is put into it is escaped."""
+    text = (files(package) / name).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(text)
+
+
+def style() -> str:
+    """The style sheet of all pages: light and dark, desk and phone."""
+    return (files("vggtgeo.report") / "style.css").read_text(encoding="utf-8")
 
 
 def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[Fact]:
@@ -159,14 +168,15 @@ def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
     ]
 
 
-def _truth_table(truth: Mapping[str, Any] | None) -> list[tuple[str, list[str]]]:
-    """Rows of errors: RMSE, mean, median, largest."""
+def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[str, list[str]]]:
+    """Rows of errors: RMSE, mean, median, largest; of a free scale those after a Sim(3) alignment only."""
     if truth is None:
         return []
+    translation = "rpe_translation_m" if metric else "rpe_translation_sim3_m"
     rows = (
-        ("ATE, SE(3) [cm]", truth["ate_se3_m"], 100.0),
+        *([("ATE, SE(3) [cm]", truth["ate_se3_m"], 100.0)] if metric else []),
         ("ATE, Sim(3) [cm]", truth["ate_sim3_m"], 100.0),
-        ("RPE translation [cm]", truth["rpe_translation_m"], 100.0),
+        (f"RPE translation{'' if metric else ', Sim(3)'} [cm]", truth[translation], 100.0),
         ("RPE rotation [deg]", truth["rpe_rotation_deg"], 1.0),
     )
     names = ("rmse", "mean", "median", "maximum")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,11 +16,12 @@ from vggtgeo.figures.result_figure import result_figure
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
 from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
 from vggtgeo.results.files import write_depth, write_settings
+from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -34,8 +36,9 @@ from vggtgeo.slam.window_recorder import WindowRecord
 class RunRecord:
     """What a result is made of, as long as it is in memory; the page and the depth images are drawn from it.
 
-    slam: the last state. dense: the dense map after adjustment. windows: one an adjustment of the window. truth:
-    camera -> world, where it is known. warnings: about the input, and about the weights of networks. title: of the run.
+    slam: the last state. dense: the dense map after adjustment.
+    windows: one an adjustment of the window. truth: camera -> world, where it is known. warnings: about the input, and
+    about the weights of networks. title: of the run.
     """
 
     slam: Slam
@@ -54,12 +57,12 @@ class Result:
         trajectory: camera -> world of every frame that has a pose.
         keyframes: those of the keyframes.
         cloud: the map, world frame.
-        mesh: the map's surface, world frame; None where there is no dense depth.
         intrinsics: fx, fy, cx, cy, pixels, as adjusted.
         metric: whether lengths are metres; without metric depth they have no unit.
         verdict: how far all this can be trusted, by segment of time.
         summary: counts, times and settings, as `summary.json` has them.
         record: what it was made of; None for a result that was read from a folder.
+        saved_mesh: the surface that was read from a folder, if there was one.
 
     Example:
         >>> import vggtgeo as vg
@@ -77,7 +80,12 @@ class Result:
     verdict: Verdict
     summary: Mapping[str, Any] = field(default_factory=dict)
     record: RunRecord | None = None
-    mesh: Mesh | None = None
+    saved_mesh: Mesh | None = None
+
+    @property
+    def mesh(self) -> Mesh | None:
+        """The map's surface, world frame; None where there is no dense depth. It is made when first asked for."""
+        return self.saved_mesh if self.record is None else self.record.dense.mesh
 
     @classmethod
     def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
@@ -97,19 +105,22 @@ class Result:
         slam = record.slam
         fx, fy, cx, cy = (float(value) for value in slam.intrinsics)
         poses = frame_trajectory(slam), keyframe_trajectory(slam)
-        mesh = record.dense.mesh if len(record.dense.mesh.faces) else None
-        return cls(*poses, record.dense.cloud, (fx, fy, cx, cy), verdict.metric, verdict, summary, record, mesh)
+        cloud = record.dense.cloud
+        return cls(*poses, cloud, (fx, fy, cx, cy), verdict.metric, verdict, summary, record)
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Self:
         """Reads the folder that `Result.save` or `vggtgeo run` wrote; InputError where a file of it is missing."""
         place = Path(folder)
+        unfinished = check_finished(place)
+        if unfinished:
+            warnings.warn(unfinished, InputWarning, stacklevel=2)
         try:
             summary = json.loads((place / "summary.json").read_text(encoding="utf-8"))
             fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
             metric = summary["scale"] == "metric"
             verdict = Verdict.from_dict(summary["verdict"], metric)
-        except (OSError, json.JSONDecodeError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             message = f"`{place}` has no usable `summary.json` ({error}); give a folder that `vggtgeo run` wrote"
             raise InputError(message) from None
         return cls(
@@ -120,7 +131,7 @@ class Result:
             metric,
             verdict,
             summary,
-            mesh=Mesh.load_ply(place / "mesh.ply") if (place / "mesh.ply").is_file() else None,
+            saved_mesh=Mesh.load_ply(place / "mesh.ply") if (place / "mesh.ply").is_file() else None,
         )
 
     def save(
@@ -131,8 +142,9 @@ class Result:
         settings: Mapping[str, Any] | None = None,
     ) -> None:
         """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (where there is dense
-        depth), `trajectory.png`, `report.html`, `summary.json` and `settings.toml`, each atomically; `vggtgeo.read`
-        reads it.
+        depth), `images/`, `scene.npz`, `trajectory.png`, `report.html`, `summary.json` and `settings.toml`;
+        `vggtgeo.read` reads it. They are written beside and take their places
+        together; what an earlier run left there is replaced as a whole.
 
         A result that was read from a folder has neither images nor windows, so it is saved without page and depth.
 
@@ -142,13 +154,19 @@ class Result:
             settings: flags of the command line that tell how the run was made, beside the pipeline's own settings.
 
         Raises:
-            InputError: `depth` is asked of a result that was read from a folder.
+            InputError: `depth` is asked of a result that was read from a folder, or the folder cannot be written, is
+                in use by a run, or holds a sequence of images.
 
         """
-        place = Path(folder)
+        with taken(folder) as place:
+            self.save_into(place, depth=depth, settings=settings)
+
+    def save_into(self, run: RunFolder, *, depth: bool = False, settings: Mapping[str, Any] | None = None) -> None:
+        """The same, into a folder that is taken already."""
+        place = run.stage
         if depth and self.record is None:
             raise InputError("`depth` needs a result that is still in memory; this one was read from a folder")
-        place.mkdir(parents=True, exist_ok=True)
+        run.release_reserve()
         used = {**(settings or {}), **self.summary.get("settings", {})}
         flags = {name.replace("_", "-"): value for name, value in used.items()}
         plain = {**self.summary, "settings": {name.replace("-", "_"): value for name, value in used.items()}}
@@ -159,13 +177,14 @@ class Result:
         if self.mesh is not None:
             self.mesh.save_ply(place / "mesh.ply")
         write_json(place / "summary.json", plain)
-        self._draw(place, {**plain, "settings": flags})
+        self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
         if self.record is not None:
             write_scene(place, self.record.slam)
         if depth and self.record is not None:
-            write_depth(place, self.record.slam.keyframes, self.record.dense.depth_maps)
+            write_depth(place, self.record.slam.keyframes, self.record.dense.depth_maps, self.record.slam.metric)
+        run.publish()
 
-    def _draw(self, place: Path, summary: Mapping[str, Any]) -> None:
+    def _draw(self, place: Path, name: str, summary: Mapping[str, Any]) -> None:
         record = self.record
         if len(self.trajectory):
             plot_trajectory(
@@ -174,7 +193,7 @@ class Result:
                 record.truth if record else None,
                 self.keyframes,
                 with_scale=not (record.slam.metric if record else self.metric),
-                title=record.title if record else place.resolve().name,
+                title=record.title if record else name,
             )
         if record is not None:
             write_page(

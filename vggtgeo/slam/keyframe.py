@@ -8,7 +8,7 @@ import numpy as np
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
-from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures
+from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
 from vggtgeo.slam.settings import Roles, SlamSettings
 
 
@@ -65,11 +65,15 @@ def make_keyframe(
     roles: Roles,
     settings: SlamSettings,
     intrinsics: np.ndarray,
+    lines: LineFeatures | None = None,
 ) -> Keyframe:
-    """Run the roles that only keyframes need, and read depth and confidence at key points and line samples."""
+    """Run the roles that only keyframes need, and read depth and confidence at key points and line samples.
+
+    lines: the frame's segments, where tracking has found them already.
+    """
     depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
     confidence = roles.confidence.confidence(frame.image)
-    lines = _detect_lines(frame, roles, settings)
+    lines = find_lines(frame.image, roles, settings) if lines is None else lines
     ends = lines.segments.endpoints
     line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
     segment, pixels, fraction = sample_segments(ends, settings.line.line_spacing)
@@ -95,11 +99,11 @@ def make_keyframe(
     )
 
 
-def _detect_lines(frame: Frame, roles: Roles, settings: SlamSettings) -> LineFeatures:
-    segments = roles.lines.detect(frame.image)
+def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineFeatures:
+    """The described segments of an image; none where the settings leave lines out."""
     if not settings.line.use_lines:
-        segments = type(segments)(segments.endpoints[:0], segments.scores[:0])
-    return roles.line_matches.describe(frame.image, segments)
+        return roles.line_matches.describe(image, Segments(np.zeros((0, 2, 2)), np.zeros(0)))
+    return roles.line_matches.describe(image, roles.lines.detect(image))
 
 
 def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) -> Slots:

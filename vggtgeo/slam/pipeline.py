@@ -13,7 +13,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.covisibility import without_matches
 from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.keyframe import Keyframe, make_keyframe
+from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pieces import join_pieces
 from vggtgeo.slam.precision import in_double_precision
@@ -21,7 +21,7 @@ from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, si
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking import Expectation, Sight, Track, tie_between, track
+from vggtgeo.slam.tracking import Expectation, Sight, Track, refined_by_map, tie_between, tie_to, track, track_by_map
 from vggtgeo.slam.window import adjust, enter
 
 LOST_PATIENCE = 10
@@ -83,7 +83,7 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
 
 def _follow(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
     with clock.measure("track"):
-        sight = sight_of(frame, features, slam, roles)
+        sight = _with_lines(sight_of(frame, features, slam, roles), roles, settings)
         found = _find(slam, sight, roles, settings)
     if not found.accepted and slam.lost:
         with clock.measure("relocalise"):
@@ -115,7 +115,21 @@ def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Tra
         if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
             break
     assert best is not None
-    return best
+    if not settings.tracking.search_map:
+        return best
+    piece = slam.keyframes[slam.origins[-1] :]
+    if not best.accepted:
+        source = view_of(best.keyframe, slam, roles)
+        joint = track_by_map(sight, piece, best.keyframe, source, expected, slam.intrinsics, roles)
+        return joint if joint.accepted else best
+    return refined_by_map(best, sight, piece, expected, slam.intrinsics)
+
+
+def _with_lines(sight: Sight, roles: Roles, settings: SlamSettings) -> Sight:
+    """The sight with a way to its segments, where lines take part in tracking."""
+    if not settings.line.in_tracking:
+        return sight
+    return replace(sight, find_lines=lambda: find_lines(sight.frame.image, roles, settings))
 
 
 def _rank(found: Track) -> tuple[bool, int]:
@@ -133,9 +147,11 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         return replace(slam, frames=(*slam.frames, record_of(frame, found)))
     number = len(slam.keyframes)
     with clock.measure("keyframe"):
-        keyframe = make_keyframe(number, frame, found.pose, sight.features, roles, settings, slam.intrinsics)
+        keyframe = make_keyframe(
+            number, frame, found.pose, sight.features, roles, settings, slam.intrinsics, sight.found_lines
+        )
     with clock.measure("match keyframes"):
-        tie = MeasuredRelativePose(found.keyframe.number, number, found.relative, found.information)
+        tie = tie_to(found, number)
         if found.keyframe.number not in slam.window:
             slam = _window_around(slam, found.keyframe.number, settings)
         slam = enter(slam, keyframe, roles, settings)

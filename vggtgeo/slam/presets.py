@@ -12,14 +12,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.io.network_files import networks_folder
+from vggtgeo.models.classical import ConstantVelocity, NoDepth, OrbMatcher, SiftMatcher
+from vggtgeo.models.onnx.bounds import (
+    BoundedConfidence,
+    BoundedDepth,
+    BoundedLineMatcher,
+    BoundedLines,
+    BoundedPoints,
+    BoundedWindow,
+    Refusals,
+)
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
 from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
@@ -31,6 +41,7 @@ from vggtgeo.models.onnx.moge2 import MogeDepth
 from vggtgeo.models.onnx.registry import NETWORKS
 from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
+from vggtgeo.models.roles import PointMatcher
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.slam.settings import Roles
 
@@ -60,19 +71,33 @@ CHOICES: dict[str, tuple[str, ...]] = {
 """Who may play a role apart from its preset, beside the roles that the caller has (`classical`)."""
 _FILES = {"mast3r": ("mast3r_encoder", "mast3r_decoder")}
 """The registry's names of what is more than one file."""
-NEEDED = {
-    preset: tuple(dict.fromkeys(file for name in roles.values() for file in _FILES.get(name, (name,))))
-    for preset, roles in PRESETS.items()
+_BOUNDED: dict[str, Callable[[Any], Any]] = {
+    "points": BoundedPoints,
+    "lines": BoundedLines,
+    "line_matches": BoundedLineMatcher,
+    "depth": BoundedDepth,
+    "confidence": BoundedConfidence,
 }
+"""What checks the answers of a network in each role."""
+
+
+def _files(roles: Mapping[str, str]) -> tuple[str, ...]:
+    """The registry's names of the networks of some roles, each once."""
+    return tuple(dict.fromkeys(file for name in roles.values() for file in _FILES.get(name, (name,))))
+
+
+NEEDED = {preset: _files(roles) for preset, roles in PRESETS.items()}
 """The networks of each preset, by their names in the registry."""
+_FEATURES: dict[str, Callable[[], PointMatcher]] = {"sift": SiftMatcher, "orb": OrbMatcher}
 
 
 @dataclass(frozen=True, eq=False)
 class Perception:
-    """Role objects and the networks behind them, by their names in the registry."""
+    """Role objects and the networks behind them, by their names in the registry; what was refused, by role."""
 
     roles: Roles
     networks: Mapping[str, Session]
+    refusals: Mapping[str, Refusals] = field(default_factory=dict)
 
     @property
     def random(self) -> list[str]:
@@ -95,11 +120,30 @@ class Perception:
             for name, session in self.networks.items()
         }
         warning = {"meaningless": self.warning()} if self.random else {}
-        return {"networks": described, **warning}
+        refused = {role: asdict(counts) for role, counts in self.refusals.items()}
+        return {"networks": described, "refused": refused, **warning}
 
     def warning(self) -> str:
         """What a user must know before reading any result of random weights."""
         return f"the weights of {', '.join(self.random)} are random: this result means nothing"
+
+
+def classical_roles(has_depth: bool = True, start: str = "pnp", features: str = "sift") -> Roles:
+    """The classical role objects, for a sequence with or without depth.
+
+    start: how a new frame's pose starts, "pnp" or "constant-velocity". features: "sift" or "orb". InputError for
+    others.
+    """
+    if features not in _FEATURES or start not in ("pnp", "constant-velocity"):
+        raise InputError(
+            f"`features` is {features!r} and `start` {start!r}; they must be one of {', '.join(_FEATURES)}, and of "
+            "pnp, constant-velocity"
+        )
+    roles = Roles(points=_FEATURES[features]())
+    if start == "constant-velocity":
+        # The ablation is a start by motion alone: nothing else may mend the pose before the window does.
+        roles = replace(roles, geometry=ConstantVelocity(), alignment=None)
+    return roles if has_depth else replace(roles, depth=NoDepth())
 
 
 def perception(
@@ -135,8 +179,7 @@ def perception(
     parts = _parts(preset, mixed or {})
     if not parts:
         return Perception(classical, {})
-    needed = tuple(dict.fromkeys(file for name in parts.values() for file in _FILES.get(name, (name,))))
-    place = networks_folder(folder)
+    needed, place = _files(parts), networks_folder(folder)
     _check_present(needed, place)
     with as_input_errors():
         for name in needed:
@@ -150,10 +193,10 @@ def perception(
             )
             for name in needed
         }
-        roles = replace(classical, **_players(parts, classical, networks, cache))
+        players, refusals = _players(parts, classical, networks, cache)
         for session in networks.values():
             session.warm_up()
-    return Perception(roles, networks)
+    return Perception(replace(classical, **players), networks, refusals)
 
 
 def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
@@ -170,8 +213,8 @@ def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
 
 def _players(
     parts: Mapping[str, str], classical: Roles, networks: Mapping[str, Session], cache: Path | None
-) -> dict[str, Any]:
-    """The role objects of the networks. One network in two roles is one object: it answers both from one call."""
+) -> tuple[dict[str, Any], dict[str, Refusals]]:
+    """The role objects of the networks, and what each refuses. One network in two roles answers both from one call."""
     features = {
         name: DinoFeatures(networks[name], _cache(cache)) for name in parts.values() if name.startswith("dinov3")
     }
@@ -181,14 +224,17 @@ def _players(
             return DenseLineMatcher(features[name]) if role == "line_matches" else features[name]
         if name == "mast3r":
             return Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache))
-        if name == "vggt":
-            window = _check_views(VggtWindow(networks[name], _cache(cache)))
-            return WindowLocator(window, classical.geometry, views=window.views)
-        return {"lines": {"mlsd": MlsdDetector, "letr": LetrDetector}.get(name), "depth": MogeDepth}[role](
-            networks[name], _cache(cache)
-        )
+        kind: Any = {"mlsd": MlsdDetector, "letr": LetrDetector}.get(name, MogeDepth)
+        return kind(networks[name], _cache(cache))
 
-    return {role: player(role, name) for role, name in parts.items()}
+    bounded = {role: _BOUNDED[role](player(role, name)) for role, name in parts.items() if role in _BOUNDED}
+    refusals = {role: part.refusals for role, part in bounded.items()}
+    if "geometry" in parts:
+        model = _check_views(VggtWindow(networks[parts["geometry"]], _cache(cache)))
+        window = BoundedWindow(model)
+        bounded["geometry"] = WindowLocator(window, classical.geometry, views=model.views)
+        refusals["geometry"] = window.refusals
+    return bounded, refusals
 
 
 def _cache(folder: Path | None) -> OutputCache:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.slam.rgbd_view import LEVELS, RgbdView
 
@@ -73,7 +74,7 @@ class RgbdAlignment:
                 if rows is None:
                     return None
                 change = _solve(*rows[:2])
-                motion = _exponential(change) @ motion
+                motion = rigid.exponential(change) @ motion
                 if np.abs(change).max() < (1e-5 if level == 0 else 1e-4):
                     break
         rows = self._rows(source, target, 0, source.samples, motion)
@@ -174,11 +175,3 @@ def _solve(hessian: np.ndarray, gradient: np.ndarray) -> np.ndarray:
 
 def _biweight(residual: np.ndarray) -> np.ndarray:
     return np.maximum(1 - (residual / TUKEY) ** 2, 0.0) ** 2
-
-
-def _exponential(tangent: np.ndarray) -> np.ndarray:
-    """Exp on SO(3) x R^3: to first order the exponential of SE(3), and as good a retraction."""
-    motion = np.eye(4)
-    motion[:3, :3] = cv2.Rodrigues(tangent[3:])[0]
-    motion[:3, 3] = tangent[:3]
-    return motion

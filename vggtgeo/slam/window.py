@@ -19,6 +19,7 @@ from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.line_triangulation import with_segment_depths
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
@@ -102,6 +103,7 @@ def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings) 
 
 def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
+    slam = slam if slam.metric else _with_line_depths(slam)
     members = [slam.keyframes[number] for number in slam.window]
     adjustment = window_problem(slam, members, settings)
     solution = solve_jit(adjustment.problem, adjustment.initial, solver=window_solver(settings))
@@ -120,6 +122,18 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
         energies=history[np.isfinite(history)],
         iterations=solution.record,
     )
+
+
+def _with_line_depths(slam: Slam) -> Slam:
+    """The state with the depths of segments that the window's views tell.
+
+    Not beside measured depth: what that leaves out is glass, mirrors and what is far away.
+    """
+    inside = {number: slam.keyframes[number] for number in slam.window}
+    keyframes = list(slam.keyframes)
+    for number, keyframe in with_segment_depths(inside, window_edges(slam), slam.intrinsics).items():
+        keyframes[number] = keyframe
+    return replace(slam, keyframes=tuple(keyframes))
 
 
 def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> Adjustment:
