@@ -170,7 +170,7 @@ def test_paths_and_clouds_as_text_and_ply(folder: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
-    # Proves the errors of an empty folder, an unknown format, and a scene of another layout.
+    # Proves the errors of an empty folder, an unknown format, and a scene of another layout, or damaged.
     with pytest.raises(vg.InputError, match="holds no run"):
         export(tmp_path, "colmap")
     with pytest.raises(vg.InputError, match="`to` is 'obj'; it must be one of colmap"):
@@ -178,4 +178,13 @@ def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
     assert set(FORMATS) == {"colmap", "nerfstudio", "ply", "glb", "las", "tum", "kitti"}
     np.savez(tmp_path / "scene.npz", version=99)
     with pytest.raises(vg.InputError, match="is of layout 99"):
+        Scene.load(tmp_path)
+    with np.load(folder / "scene.npz") as data:
+        values = dict(data)
+    for name, wrong in (("track_view", values["track_view"] + 1000), ("poses", np.zeros(3)), ("frames", np.array(3.0))):
+        np.savez(tmp_path / "scene.npz", **{**values, name: wrong})
+        with pytest.raises(vg.InputError, match="cannot be read"):
+            Scene.load(tmp_path)
+    (tmp_path / "scene.npz").write_bytes((folder / "scene.npz").read_bytes()[:100])
+    with pytest.raises(vg.InputError, match="cannot be read"):
         Scene.load(tmp_path)

@@ -7,6 +7,8 @@ Nothing in the file is code: it is read without pickles. `version` is that of it
 from __future__ import annotations
 
 import os
+import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +16,14 @@ import cv2
 import numpy as np
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import atomic_open, atomic_path
+from vggtgeo.io.files import atomic_open
 from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.slam.state import Slam
 
 VERSION = 1
 QUALITY = 95
 """Of the JPEG pictures."""
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,30 +67,35 @@ class Scene:
         try:
             with np.load(path, allow_pickle=False) as data:
                 values = {name: data[name] for name in data.files}
-        except (OSError, ValueError) as error:
+            if int(values.get("version", 0)) != VERSION:
+                raise InputError(f"`{path}` is of layout {values.get('version', 0)}, expected {VERSION}; run again")
+            return cls._of(values)
+        except _UNREADABLE as error:
             raise InputError(f"`{path}` cannot be read ({error}); give a folder that `vggtgeo run` wrote") from None
-        if int(values.get("version", 0)) != VERSION:
-            raise InputError(f"`{path}` is of layout {values.get('version', 0)}, expected {VERSION}; run again")
+
+    @classmethod
+    def _of(cls, values: Mapping[str, np.ndarray]) -> Scene:
+        count = len(values["frames"])
+        poses, (width, height) = values["poses"].reshape(count, 4, 4), values["size"]
         tracks = Tracks(*(values[f"track_{name}"] for name in ("points", "colours", "point", "view", "pixel")))
-        width, height = (int(value) for value in values["size"])
-        return cls(
-            values["frames"],
-            values["timestamps"],
-            values["poses"],
-            values["intrinsics"],
-            (width, height),
-            tracks,
-            bool(values["metric"]),
-        )
+        if not (len(tracks.point) == len(tracks.view) == len(tracks.pixel)):
+            raise ValueError("its tracks have observations of unequal number")
+        if len(tracks.point) and not (0 <= tracks.view.min() <= tracks.view.max() < count):
+            raise ValueError("its tracks name keyframes that are not there")
+        if len(tracks.point) and not (0 <= tracks.point.min() <= tracks.point.max() < len(tracks)):
+            raise ValueError("its tracks name points that are not there")
+        size, intrinsics = (int(width), int(height)), values["intrinsics"].reshape(4)
+        return cls(values["frames"], values["timestamps"], poses, intrinsics, size, tracks, bool(values["metric"]))
 
 
 def write_scene(folder: Path, slam: Slam) -> None:
     """`scene.npz` and a picture of each keyframe in `images/`, undistorted, each written atomically."""
     scene = Scene.of(slam)
     for view, keyframe in enumerate(slam.keyframes):
-        with atomic_path(folder / "images" / scene.image_name(view)) as temporary:
-            bgr = np.ascontiguousarray(keyframe.image[..., ::-1])
-            cv2.imwrite(os.fspath(temporary), bgr, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
+        bgr = np.ascontiguousarray(keyframe.image[..., ::-1])
+        # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
+        with atomic_open(folder / "images" / scene.image_name(view), "wb") as handle:
+            handle.write(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes())
     tracks = scene.tracks
     with atomic_open(folder / "scene.npz", "wb") as handle:
         np.savez_compressed(
