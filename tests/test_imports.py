@@ -18,6 +18,7 @@ STAIR = (
     ("geometry",),
     ("bundle", "datasets", "evaluation"),
     ("simulation", "slam"),
+    ("mapping",),
     ("figures",),
     ("report",),
     ("results",),

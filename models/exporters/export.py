@@ -2,7 +2,7 @@
 
 In this order, each step an oracle of the next: the changed module gives what the published code gave (both in
 PyTorch); the file passes onnx's full checker; onnxruntime loads it; and gives what PyTorch gave for the same random
-input. The file appears under its name only after that, with `FILE.onnx.data` (its weights, if large) and
+input. The file appears under its name only after that, with `FILE.onnx.data` (large weights) and
 `FILE.onnx.parity.npz` (that input, and what PyTorch gave) beside it.
 
 Difference = max |a - b| / max |b|, the largest over the outputs.
@@ -37,7 +37,7 @@ OPSET = 20
 TOLERANCE = 1e-3
 """Largest difference of a file in float32."""
 EMBEDDED = 64e6
-"""Bytes of weights up to which they are in the ONNX file itself; a protobuf holds 2 GB at most."""
+"""Bytes of weights up to which they are in the ONNX file itself."""
 HALF_TOLERANCE = 3e-2
 """Largest difference of a file in half precision: some three digits, through tens of blocks."""
 

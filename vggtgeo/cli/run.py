@@ -88,7 +88,7 @@ def run(
         sequence,
         perceived,
         slam_settings,
-        Output(output, flags, rerun, save_depth, quiet, as_json, source=path),
+        Output(output, flags, rerun, save_depth, quiet, as_json, source=Path(path)),
         (start, end, stride),
         seed=seed,
         dense=dense,

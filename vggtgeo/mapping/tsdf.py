@@ -175,7 +175,7 @@ def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -
     if not ((distance[known] < 0).any() and (distance[known] > 0).any()):
         return None
     try:
-        places, faces, normals, _ = marching_cubes(distance, 0.0, mask=known, allow_degenerate=False)
+        places, faces, normals, _ = marching_cubes(distance, 0.0, mask=known)
     except (ValueError, RuntimeError):  # skimage's way to say that no cube is known at all its corners
         return None
     faces = faces[_in_known_cubes(places[faces].mean(axis=1), known)]

@@ -75,9 +75,7 @@ def reconstruct(
         end: frame to stop before.
         stride: take every n-th frame.
         seed: of OpenCV's random choices, a global setting of that package.
-        dense: whose depth the map is made of. "auto": what a sensor or a network measured; where nothing did, the
-            pictures by multi-view stereo. "mvs": the pictures, also in the holes of what was measured. "sensor" or
-            "network": what was measured alone. "none": the map is the adjusted points.
+        dense: whose depth the map is made of: auto, mvs, sensor, network or none (`vggtgeo/mapping/dense.py`).
         title: of the report; by default the name of the sequence.
         callbacks: called with every frame.
         facts: what the summary shall say besides.

@@ -65,7 +65,7 @@ class Scene:
         """Reads `scene.npz` of a run's folder; InputError where there is none, or one of another layout."""
         path = Path(folder) / "scene.npz"
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open("rb") as handle, np.load(handle, allow_pickle=False) as data:
                 values = {name: data[name] for name in data.files}
             if int(values.get("version", 0)) != VERSION:
                 raise InputError(f"`{path}` is of layout {values.get('version', 0)}, expected {VERSION}; run again")
