@@ -18,6 +18,7 @@ from vggtgeo.mapping.plane_sweep import Photo, plane_homography
 from vggtgeo.mapping.semi_global import EDGE, semi_global
 from vggtgeo.mapping.stereo import StereoSettings, stereo_depths
 from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.keyframe_images import KeyframeImages
 
 SIZE = (200, 150)
 SMOOTH, JUMP = 0.04, 0.5
@@ -35,13 +36,15 @@ def keyframe_of(number: int, image: np.ndarray, pose: np.ndarray, points: Slots,
         frame=number,
         timestamp=float(number),
         pose=pose,
-        image=image,
+        images=KeyframeImages(
+            image,
+            depth.astype(np.float16),
+            np.full(depth.shape, 0.01, np.float16),
+            np.where(np.isfinite(depth), 255, 0).astype(np.uint8),
+        ),
         features=Features(points.pixels, np.ones(len(points.pixels))),
         lines=LineFeatures(Segments(np.zeros((0, 2, 2)), none)),
         line_depths=np.zeros((0, 2)),
-        depth=depth.astype(np.float16),
-        depth_sigma=np.full(depth.shape, 0.01, np.float16),
-        depth_confidence=np.where(np.isfinite(depth), 255, 0).astype(np.uint8),
         points=points,
         samples=slots_of(np.zeros((0, 2)), none),
         sample_segment=np.zeros(0, int),

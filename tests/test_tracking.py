@@ -17,10 +17,12 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
+from vggtgeo.slam import relocalisation
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.pieces import join_pieces, scaled_piece
+from vggtgeo.slam.pipeline import step
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
@@ -296,6 +298,33 @@ def test_a_place_is_recognised(room: Room) -> None:
 
 
 @pytest.mark.long
+def test_a_place_that_drift_has_moved_is_used_again(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Old keyframes 40 cm off, as drift would have them: on the way back the camera is tracked against one of them
+    again, and a motion ties the old to the new. Oracle: the renderer's poses, relative to the old keyframe.
+    """
+    monkeypatch.setattr(relocalisation, "MOST_DRIFT", 1.0)  # the room is small for so much drift
+    frames, camera, truth = room
+    slam, old = _run(frames, camera), 3
+    assert min(slam.window) > old - 1
+    drift = np.eye(4)
+    drift[:3, 3] = 0.3, 0.0, 0.26
+    moved = (replace(k, pose=k.pose @ drift) if k.number < old else k for k in slam.keyframes)
+    slam = replace(slam, keyframes=tuple(moved))
+    played, known = [*range(29, -1, -1)], len(slam.ties)
+    for index, row in enumerate(played, start=len(frames)):
+        frame = replace(frames[row], index=index, timestamp=index / 10)
+        slam = step(slam, frame, ROLES.points.describe(frame.image), ROLES, SETTINGS)
+    back = [record for record in slam.frames[len(frames) :] if record.tracked and record.reference < old]
+    assert back, "no frame of the way back hangs on an old keyframe"
+    assert any(min(tie.keyframes) < old <= max(tie.keyframes) for tie in slam.ties[known:])
+    true = rigid.invert(truth.poses)
+    for record in back:
+        reference = slam.keyframes[record.reference].frame
+        expected = true[played[record.frame - len(frames)]] @ rigid.invert(true[reference])
+        off = np.linalg.norm(rigid.centre(record.relative) - rigid.centre(expected))
+        assert off < 0.03, f"frame {record.frame} is {100 * off:.1f} cm off"
+
+
 def test_pieces_join_where_they_meet(room: Room) -> None:
     """Two parts of a room, the second begun without knowing the first, become one map when the camera comes back.
 
@@ -326,7 +355,14 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
     seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:16], *frames[14:4:-1]))]
     whole = replace(_run(seen, camera), metric=False)
     origin = len(whole.keyframes) // 2
-    apart = scaled_piece(replace(whole, origins=(0, origin)), 1.6)
+    own = lambda ends: len({number < origin for number in ends}) == 1
+    torn_apart = replace(
+        whole,
+        origins=(0, origin),
+        pairs=tuple(pair for pair in whole.pairs if own(pair.key)),
+        factors=tuple(factor for factor in whole.factors if own(factor.keyframes)),
+    )
+    apart = scaled_piece(torn_apart, 1.6)
     moved = np.eye(4)
     moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
     moved[:3, 3] = [0.5, -1.0, 2.0]

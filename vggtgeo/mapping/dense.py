@@ -17,7 +17,9 @@ from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
 from vggtgeo.mapping.tsdf import fused_mesh
+from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.state import Slam
 
 DenseMode = Literal["auto", "mvs", "sensor", "network", "none"]
 """Where dense depth comes from. "auto": what was measured, by a sensor or a network; where nothing was, the pictures.
@@ -32,14 +34,15 @@ VOXEL_PIXELS = 2.5
 
 @dataclass(frozen=True, eq=False)
 class DenseMap:
-    """Fields: keyframes and intrinsics that the map is made of; depth_maps, one a keyframe, None where there is none;
-    cloud in the world frame, metres (the map's unit where the scale is free); voxel, the edge of a cell of cloud and
-    mesh.
+    """Fields: depth_maps, one a keyframe of the run, None where there is none; keyframes, those that the map shows, and
+    own_maps, their depth; intrinsics; cloud in the world frame, metres (the map's unit where the scale is free); voxel,
+    the edge of a cell of cloud and mesh.
     """
 
-    keyframes: tuple[Keyframe, ...]
-    intrinsics: np.ndarray
     depth_maps: tuple[DepthMap | None, ...]
+    keyframes: tuple[Keyframe, ...]
+    own_maps: tuple[DepthMap | None, ...]
+    intrinsics: np.ndarray
     cloud: PointCloud
     voxel: float
 
@@ -48,7 +51,7 @@ class DenseMap:
         """The surface, world frame, made when it is first asked for; None where there is none."""
         # A depth of the pictures was confirmed by two other views; one that was measured was not.
         measured = any(np.isfinite(keyframe.depth).any() for keyframe in self.keyframes)
-        found = fused_mesh(self.keyframes, self.depth_maps, self.intrinsics, self.voxel, 2 if measured else 1)
+        found = fused_mesh(self.keyframes, self.own_maps, self.intrinsics, self.voxel, 2 if measured else 1)
         return found if len(found.faces) else None
 
 
@@ -60,25 +63,38 @@ def check_dense(mode: str, measured: bool) -> None:
         raise InputError(f"`dense` is {mode!r}, but no depth was measured; give frames with depth, or take `mvs`")
 
 
-def dense_map(
-    keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: str = "auto", metric: bool = True
-) -> DenseMap:
-    """Depth and cloud of adjusted keyframes, and, when it is asked for, the mesh.
+def dense_map(slam: Slam, mode: str = "auto") -> DenseMap:
+    """Depth of all keyframes, and the cloud of the piece of map that most frames hang on.
+
+    Pieces that nothing ties to each other have each a place of their own: their pictures are not compared.
 
     Args:
-        keyframes: poses world -> camera.
-        intrinsics: float64 [4], pixels.
+        slam: after the last adjustment.
         mode: a `DenseMode`.
-        metric: whether lengths are metres; else the voxels' size follows from the pixels'.
 
     Raises:
         InputError: see `check_dense`.
 
     """
-    depth_maps = tuple(dense_depths(keyframes, intrinsics, mode))
-    voxel = VOXEL if metric else _voxel(depth_maps, intrinsics)
-    cloud = map_points(keyframes, intrinsics, depth_maps, voxel=voxel)
-    return DenseMap(tuple(keyframes), intrinsics, depth_maps, cloud, voxel)
+    check_dense(mode, any(np.isfinite(keyframe.depth).any() for keyframe in slam.keyframes))
+    depth_maps: dict[int, DepthMap | None] = {}
+    pieces = pieces_by_size(slam)
+    for piece in pieces:
+        own = [slam.keyframes[number] for number in piece]
+        depth_maps |= dict(zip(piece, dense_depths(own, slam.intrinsics, _possible(mode, own)), strict=True))
+    shown = pieces[0] if pieces else ()
+    keyframes = tuple(slam.keyframes[number] for number in shown)
+    own_maps = tuple(depth_maps[number] for number in shown)
+    voxel = VOXEL if slam.metric else _voxel(own_maps, slam.intrinsics)
+    cloud = map_points(keyframes, slam.intrinsics, own_maps, voxel=voxel)
+    every = tuple(depth_maps.get(number) for number in range(len(slam.keyframes)))
+    return DenseMap(every, keyframes, own_maps, slam.intrinsics, cloud, voxel)
+
+
+def _possible(mode: str, keyframes: Sequence[Keyframe]) -> str:
+    """The mode for one piece of the map: one that has no measured depth at all cannot be asked for it."""
+    measured = any(np.isfinite(keyframe.depth).any() for keyframe in keyframes)
+    return mode if measured or mode not in ("sensor", "network") else "none"
 
 
 def _voxel(depth_maps: Sequence[DepthMap | None], intrinsics: np.ndarray) -> float:

@@ -90,7 +90,7 @@ def stereo_depths(
     for i, own in enumerate(found):
         others = [other for j in views[i] if (other := found[j]) is not None]
         confirmed = None if own is None else confirm(own, others, settings.least_views)
-        result.append(None if confirmed is None or confirmed.empty else enlarged(confirmed, keyframes[i].image.shape))
+        result.append(None if confirmed is None or confirmed.empty else enlarged(confirmed, keyframes[i].size))
     return result
 
 
@@ -139,7 +139,7 @@ def _planes(points: np.ndarray, photo: Photo, count: int) -> np.ndarray | None:
 
 
 def enlarged(depth_map: DepthMap, shape: Sequence[int]) -> DepthMap:
-    """The depth map at the size of an image [H, W, ...]: interpolated on one surface, else the nearest."""
+    """The depth map at the size of an image (height, width): interpolated on one surface, else the nearest."""
     size = (shape[1], shape[0])
     linear = cv2.resize(1.0 / depth_map.depth, size, interpolation=cv2.INTER_LINEAR)
     nearest, sigma, confidence = (

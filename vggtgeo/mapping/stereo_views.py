@@ -54,7 +54,7 @@ def choose_views(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, most: in
 
 def _score(points: np.ndarray, centre: np.ndarray, other: Keyframe, intrinsics: np.ndarray) -> float:
     local = points @ other.pose[:3, :3].T + other.pose[:3, 3]
-    inside, _, _ = pinhole.visible(local, intrinsics, (other.image.shape[0], other.image.shape[1]))
+    inside, _, _ = pinhole.visible(local, intrinsics, other.size)
     first, second = points - centre, points - rigid.centre(other.pose)
     cosine = (first * second).sum(1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1))
     angle = np.arccos(np.clip(cosine, -1, 1))

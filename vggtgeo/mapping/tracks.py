@@ -70,7 +70,7 @@ def make_tracks(keyframes: Sequence[Keyframe], pairs: Sequence[Pair], intrinsics
     kept, first, row = np.unique(track, return_index=True, return_inverse=True)
     many = np.bincount(row, minlength=len(kept)) > 1 if len(kept) else np.zeros(0, bool)
     stays = many[row] if len(kept) else np.zeros(0, bool)
-    colours = np.array([_colour(keyframes[view[k]].image, pixel[k]) for k in first[many]], np.uint8).reshape(-1, 3)
+    colours = _colours(keyframes, view[first[many]], pixel[first[many]]) if len(kept) else np.zeros((0, 3), np.uint8)
     renumbered = np.cumsum(many) - 1
     return Tracks(points[kept[many]], colours, renumbered[row[stays]], view[stays], pixel[stays])
 
@@ -162,8 +162,12 @@ def _wide(track: np.ndarray, view: np.ndarray, poses: np.ndarray, points: np.nda
     return widest > FAR
 
 
-def _colour(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    height, width = image.shape[:2]
-    x, y = np.rint(pixel).astype(int)
-    colour: np.ndarray = image[min(max(y, 0), height - 1), min(max(x, 0), width - 1)]
-    return colour
+def _colours(keyframes: Sequence[Keyframe], view: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """The colour of each pixel [n, 2], uint8 [n, 3], in the picture of its view [n]; each picture is opened once."""
+    colours = np.zeros((len(view), 3), np.uint8)
+    for number in np.unique(view):
+        here = view == number
+        image = keyframes[number].image
+        columns, rows = np.rint(pixel[here]).astype(int).T
+        colours[here] = image[rows.clip(0, image.shape[0] - 1), columns.clip(0, image.shape[1] - 1)]
+    return colours

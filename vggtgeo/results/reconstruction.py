@@ -141,7 +141,7 @@ def _concluded(
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
     with clock.measure("dense map"):
-        built = dense_map(slam.keyframes, slam.intrinsics, run.dense, slam.metric)
+        built = dense_map(slam, run.dense)
     hooks.each("on_finish", slam, built.cloud)
     with clock.measure("verdict"):
         left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)

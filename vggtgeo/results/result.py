@@ -20,7 +20,7 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
 from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
-from vggtgeo.results.files import write_depth, write_settings
+from vggtgeo.results.files import write_depth, write_settings, write_trajectories
 from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise
@@ -94,7 +94,7 @@ class Result:
         evidence: what an `EvidenceRecorder` noted of all frames; without it the verdict rests on the run's own record.
         truth: camera -> world, where it is known. dense: whose depth the map is made of, as of `vggtgeo.reconstruct`.
         """
-        verdict, built = judge(slam, evidence), dense_map(slam.keyframes, slam.intrinsics, dense, slam.metric)
+        verdict, built = judge(slam, evidence), dense_map(slam, dense)
         count = len(built.cloud)
         summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=count)
         return cls.assemble(RunRecord(slam, built, truth=truth), verdict, summary)
@@ -171,8 +171,11 @@ class Result:
         flags = {name.replace("_", "-"): value for name, value in used.items()}
         plain = {**self.summary, "settings": {name.replace("-", "_"): value for name, value in used.items()}}
         write_settings(place / "settings.toml", flags)
-        self.trajectory.save_tum(place / "trajectory.txt")
-        self.keyframes.save_tum(place / "keyframes.txt")
+        if self.record is not None:
+            write_trajectories(place, self.record.slam)
+        else:
+            self.trajectory.save_tum(place / "trajectory.txt")
+            self.keyframes.save_tum(place / "keyframes.txt")
         self.cloud.save_ply(place / "map.ply")
         if self.mesh is not None:
             self.mesh.save_ply(place / "mesh.ply")

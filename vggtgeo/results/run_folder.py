@@ -9,12 +9,14 @@ folder holds files of one run only, without a summary, and `unfinished/` says so
 from __future__ import annotations
 
 import errno
+import glob
 import os
 import shutil
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
@@ -30,7 +32,9 @@ NAMES = (
     SUMMARY,
     "settings.toml",
     "trajectory.txt",
+    "trajectory-[0-9]*.txt",
     "keyframes.txt",
+    "keyframes-[0-9]*.txt",
     "map.ply",
     "mesh.ply",
     "scene.npz",
@@ -41,7 +45,7 @@ NAMES = (
     "run.rrd",
     "view.rrd",
 )
-"""All that a run may leave, in the order in which what is old is taken away."""
+"""All that a run may leave, as patterns, in the order in which what is old is taken away."""
 RESERVE = 96 * 2**20
 """Bytes that must be free before the first frame, and are held until the results are written: a map of 500,000 points
 (14 MB), a mesh of a million faces (30 MB), 200 pictures (20 MB), page and trajectories of 10,000 frames (10 MB)."""
@@ -73,13 +77,14 @@ class RunFolder:
             self.release_reserve()
             (self.stage / _NOTE).unlink(missing_ok=True)
             new = sorted(self.stage.iterdir(), key=lambda path: path.name == SUMMARY)
-            strange = [path.name for path in new if path.name not in NAMES and path.suffix != ".rrd"]
+            strange = [path.name for path in new if not _is_known(path.name)]
             if strange:
                 raise ValueError(
                     f"`NAMES` lacks {strange}: what a run leaves must be known, to be replaced by the next"
                 )
-            for name in dict.fromkeys((*NAMES, *_old_recording(self.folder))):
-                _remove(self.folder / name)
+            for pattern in (*NAMES, *map(glob.escape, _old_recording(self.folder))):
+                for path in sorted(self.folder.glob(pattern)):
+                    _remove(path)
             for path in new:
                 os.replace(path, self.folder / path.name)
 
@@ -175,10 +180,14 @@ def _refuse_input(place: Path, source: Path | None) -> None:
     if not place.is_dir() or (place / SUMMARY).is_file():
         return
     for path in place.iterdir():
-        if path.name in _MARKS or (path.suffix.lower() in IMAGE_SUFFIXES and path.name not in NAMES):
+        if path.name in _MARKS or (path.suffix.lower() in IMAGE_SUFFIXES and not _is_known(path.name)):
             raise InputError(
                 f"`{place}` holds images or a sequence (`{path.name}`); give another folder for the results with `-o`"
             )
+
+
+def _is_known(name: str) -> bool:
+    return name.endswith(".rrd") or any(fnmatchcase(name, pattern) for pattern in NAMES)
 
 
 def _not_written(place: Path, error: OSError, reserve: int = 0) -> InputError:

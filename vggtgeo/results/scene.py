@@ -45,7 +45,7 @@ class Scene:
     def of(cls, slam: Slam) -> Scene:
         """The scene of a state with at least one keyframe."""
         keyframes = slam.keyframes
-        height, width = keyframes[0].image.shape[:2]
+        height, width = keyframes[0].size
         return cls(
             np.array([keyframe.frame for keyframe in keyframes]),
             np.array([keyframe.timestamp for keyframe in keyframes]),

@@ -57,7 +57,7 @@ def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> f
     """Share of world points that fall into the image of `keyframe`."""
     if not len(points):
         return 0.0
-    height, width = keyframe.image.shape[:2]
+    height, width = keyframe.size
     with np.errstate(invalid="ignore"):
         x, y = rigid.project(points, keyframe.pose, intrinsics).T
         inside = (x > 0) & (x < width) & (y > 0) & (y < height)

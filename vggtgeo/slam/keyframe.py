@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
+from vggtgeo.slam.keyframe_images import KeyframeImages, array_of
 from vggtgeo.slam.settings import Roles, SlamSettings
 
 
@@ -31,30 +32,59 @@ class Slots:
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; what the
-    roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each sample); and
-    place, what it looks like as a whole, float32 [n] of unit length, None = not known.
+    """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; its images;
+    what the roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each
+    sample); and place, what it looks like as a whole, float32 [n] of unit length, None = not known.
 
-    depth: float16 [H, W] metres, NaN = none (its rounding, 0.5 mm at 1 m, is below any sensor's noise); depth_sigma:
-    float16 [H, W], its relative standard deviation as the role states it; depth_confidence: uint8 [H, W], 255 is 1. A
-    map lives as long as the run, so what it holds is small.
+    A map lives as long as the run, so what it holds is small: see `KeyframeImages`.
     """
 
     number: int
     frame: int
     timestamp: float
     pose: np.ndarray
-    image: np.ndarray
+    images: KeyframeImages
     features: Features
     lines: LineFeatures
     line_depths: np.ndarray
-    depth: np.ndarray
-    depth_sigma: np.ndarray
-    depth_confidence: np.ndarray
     points: Slots
     samples: Slots
     sample_segment: np.ndarray
     place: np.ndarray | None = None
+
+    @property
+    def image(self) -> np.ndarray:
+        """uint8 [H, W, 3] RGB."""
+        return array_of(self.images.colour)
+
+    @property
+    def depth(self) -> np.ndarray:
+        """float16 [H, W], metres, NaN = none."""
+        return array_of(self.images.depth)
+
+    @property
+    def depth_sigma(self) -> np.ndarray:
+        """float16 [H, W], relative standard deviation of the depth."""
+        return array_of(self.images.depth_sigma)
+
+    @property
+    def depth_confidence(self) -> np.ndarray:
+        """uint8 [H, W], 255 is 1."""
+        return array_of(self.images.depth_confidence)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the image, pixels."""
+        height, width = self.images.colour.shape[:2]
+        return height, width
+
+    def compressed(self) -> Keyframe:
+        """The keyframe with its images compressed."""
+        return self if self.images.small else replace(self, images=self.images.compressed())
+
+    def expanded(self) -> Keyframe:
+        """The keyframe with its images as arrays, to be looked at often."""
+        return replace(self, images=self.images.expanded()) if self.images.small else self
 
 
 def make_keyframe(
@@ -85,13 +115,15 @@ def make_keyframe(
         frame=frame.index,
         timestamp=frame.timestamp,
         pose=pose,
-        image=frame.image,
+        images=KeyframeImages(
+            frame.image,
+            depth.depth.astype(np.float16),
+            depth.sigma_rel.astype(np.float16),
+            np.rint(255 * depth.confidence).astype(np.uint8),
+        ),
         features=features,
         lines=lines,
         line_depths=line_depths,
-        depth=depth.depth.astype(np.float16),
-        depth_sigma=depth.sigma_rel.astype(np.float16),
-        depth_confidence=np.rint(255 * depth.confidence).astype(np.uint8),
         points=points,
         samples=_with_line_depth(samples, on_line),
         sample_segment=segment,

@@ -17,7 +17,7 @@ from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pieces import join_pieces
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, sight_of, view_of, wait
+from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, revisit, sight_of, view_of, wait
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
@@ -154,7 +154,7 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         tie = tie_to(found, number)
         if found.keyframe.number not in slam.window:
             slam = _window_around(slam, found.keyframe.number, settings)
-        slam = enter(slam, keyframe, roles, settings)
+        slam = enter(slam, keyframe, roles, settings, tied_to=found.keyframe.number)
         slam = replace(slam, factors=(*slam.factors, tie), reference=(number, sight.view))
         slam = _with_pair(slam, tie)
         slam = constrain_rotation(slam, settings)
@@ -230,12 +230,17 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     What the two keyframes know of each other by this frame ties them.
     """
     near = _nearest(slam, found, settings)
-    if near is None:
+    again = None
+    if near is not None:
+        expected = Expectation(found.pose, slam.velocity)
+        again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
+        if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
+            again = None  # drift may have put another keyframe there
+    if again is None:
+        again = revisit(slam, sight, found.pose, roles)
+    if again is None or _needs_keyframe(again, settings):
         return slam, found
-    expected = Expectation(found.pose, slam.velocity)
-    again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
-    if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
-        return slam, found
+    near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
         return slam, again
     return replace(slam, factors=(*slam.factors, tie_between(found, again))), again

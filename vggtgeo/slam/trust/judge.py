@@ -35,7 +35,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     if estimate.started and estimate.metric:
         found += check_surfaces(slam.keyframes, estimate.intrinsics)
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
-        height, width = slam.keyframes[0].image.shape[:2]
+        height, width = slam.keyframes[0].size
         found += _images(estimate, aligned, (width, height))
     return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)
 
