@@ -22,13 +22,13 @@ from vggtgeo.models import pinhole
 
 import vggtgeo as vg
 from vggtgeo.datasets import Frame, Sequence, without_depth
-from vggtgeo.evaluation import cloud_error, evaluate_trajectory
+from vggtgeo.evaluation import cloud_error, evaluate_trajectory, surface_points
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation import SyntheticSequence
 
 CELL = 0.02
 """Metres between the points of the truth."""
-SAMPLES = 200_000
+SPACING = 0.02
 FARTHEST = 5.0
 """Metres: the noise of a Kinect's depth is above 4 cm from here on."""
 
@@ -58,11 +58,11 @@ def row(name: str, arguments: argparse.Namespace) -> str:
     result.save(arguments.out / name, depth=True)
     report = evaluate_trajectory(result.trajectory, sequence.ground_truth())
     aligned = (report.se3 if result.record.slam.metric else report.sim3).alignment
-    to_world = lambda points: aligned.scale * (points @ np.asarray(aligned.rotation).T) + aligned.translation
     seen = _exact(sequence) if simulated else _measured(sequence)
     truth = _thinned(np.concatenate(list(seen)))
-    surface = cloud_error(to_world(result.mesh.sample(SAMPLES)), truth, 0.05)
-    cloud = cloud_error(to_world(result.cloud.points), truth, 0.05)
+    vertices = aligned.points(result.mesh.vertices.astype(np.float64))
+    surface = cloud_error(surface_points((vertices, result.mesh.faces), SPACING), truth, 0.05)
+    cloud = cloud_error(aligned.points(result.cloud.points), truth, 0.05)
     nees = f"{_nees(result, sequence, aligned.scale):.2f}" if simulated else ""
     return (
         f"| {name} | {len(result.cloud)} | {surface.f_score:.3f} | {surface.precision:.3f} | {surface.recall:.3f} | "

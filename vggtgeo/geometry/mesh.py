@@ -38,21 +38,6 @@ class Mesh:
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
 
-    def sample(self, count: int, seed: int = 0) -> np.ndarray:
-        """Points float64 [count, 3] spread evenly over the surface; InputError where there is no face."""
-        if not len(self.faces):
-            raise InputError("`mesh` has no face; there is nothing to sample")
-        corners = self.vertices[self.faces].astype(np.float64)
-        edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        area = np.linalg.norm(np.cross(*edges), axis=1)
-        rng = np.random.default_rng(seed)
-        face = rng.choice(len(area), count, p=area / area.sum())
-        a, b = rng.random((2, count, 1))
-        flip = a + b > 1  # the far half of the parallelogram, folded back onto the triangle
-        a, b = np.where(flip, 1 - a, a), np.where(flip, 1 - b, b)
-        points: np.ndarray = corners[face, 0] + a * edges[0][face] + b * edges[1][face]
-        return points
-
     def save_ply(self, path: str | os.PathLike[str]) -> None:
         """Writes binary little-endian PLY, atomically: float32 x y z nx ny nz, uint8 RGB, and the faces."""
         names = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
