@@ -17,6 +17,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
@@ -274,7 +275,7 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
     moved[:3, 3] = [0.5, -1.0, 2.0]
     torn = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
     newest = whole.keyframes[-1]
-    sight = Sight(seen[newest.frame], newest.features, None)
+    sight = Sight(seen[newest.frame], Description.of(newest.features), None)
     joined = join_pieces(replace(apart, keyframes=torn), sight, roles, SETTINGS)
     assert joined.origins == (0,), joined.notes
     for before, after in zip(whole.keyframes[origin:], joined.keyframes[origin:], strict=True):

@@ -1,6 +1,7 @@
 """Classical implementations of the five perception roles: OpenCV and numpy, no weights."""
 
 from vggtgeo.models.classical.depth import NoDepth, SensorDepth
+from vggtgeo.models.classical.flow import PatchFlow
 from vggtgeo.models.classical.line_detector import LsdDetector
 from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
 from vggtgeo.models.classical.line_matcher import BandLineMatcher
@@ -25,6 +26,7 @@ __all__ = [
     "NoDepth",
     "OrbMatcher",
     "PatchAlignment",
+    "PatchFlow",
     "PnpGeometry",
     "SensorDepth",
     "SiftMatcher",

@@ -19,6 +19,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.slam.factors import surface_term
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.threads import map_in_threads
 
 CELL = 4
 """Pixels a side of the blocks whose median depth makes one surface point."""
@@ -99,10 +100,10 @@ def align_pairs(
     """All pairs' alignments at the current poses, as one term; pairs that do not overlap have no weight."""
     relative = np.array([keyframes[j].pose @ rigid.invert(keyframes[i].pose) for i, j in pairs]).reshape(-1, 4, 4)
     hessians, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
-    for row, (i, j) in enumerate(pairs):
-        found = align(i, j, surfaces, relative[row], effective)
-        if found is not None:
-            hessians[row], gradients[row] = found.hessian, found.gradient
+    found = map_in_threads(lambda row: align(*pairs[row], surfaces, relative[row], effective), range(len(pairs)))
+    for row, alignment in enumerate(found):
+        if alignment is not None:
+            hessians[row], gradients[row] = alignment.hessian, alignment.gradient
     return surface_term(pairs, relative, hessians, gradients)
 
 

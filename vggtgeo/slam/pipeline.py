@@ -12,6 +12,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.covisibility import without_matches
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
@@ -40,19 +41,20 @@ def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
 
 @in_double_precision
 def step(
-    slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock | None = None
+    slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock | None = None
 ) -> Slam:
-    """Take one frame (undistorted) with its described key points into the state."""
+    """Take one frame (undistorted) into the state; its key points are found if they are needed."""
     clock = clock or Clock()
     if not slam.metric:
         roles = without_depth(roles)
     if not slam.keyframes:
-        return _first(slam, frame, features, roles, settings)
+        return _first(slam, frame, description.features, roles, settings)
     if not _started(slam):
         with clock.measure("start"):
+            features = description.features
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
             return begun or start_without_depth(slam, frame, features, roles, settings)
-    return _follow(slam, frame, features, roles, settings, clock)
+    return _follow(slam, frame, description, roles, settings, clock)
 
 
 def _started(slam: Slam) -> bool:
@@ -81,9 +83,11 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
     )
 
 
-def _follow(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
+def _follow(
+    slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock
+) -> Slam:
     with clock.measure("track"):
-        sight = sight_of(frame, features, slam, roles)
+        sight = sight_of(frame, description, slam, roles)
         found = _find(slam, sight, roles, settings)
     if not found.accepted and slam.lost:
         with clock.measure("relocalise"):

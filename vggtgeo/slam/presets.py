@@ -151,6 +151,7 @@ def _paper(classical: Roles, networks: Mapping[str, Session], cache: Path | None
         depth=MogeDepth(networks["moge2"], _cache(cache)),
         confidence=features,
         geometry=WindowLocator(window, classical.geometry, views=window.views),
+        flow=None,
     )
 
 

@@ -13,8 +13,10 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import pose_information
 from vggtgeo.models.roles import Features, GeometryResult, PointMatcher, PointMatches, PoseGuess, PoseQuery
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, tangent, worst_sigma
 from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.following import Located, located_by_flow
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.rgbd_alignment import Aligned
 from vggtgeo.slam.rgbd_view import RgbdView
@@ -39,8 +41,13 @@ class Sight:
     """A frame as it is tracked. view: None where the map is tracked by points alone."""
 
     frame: Frame
-    features: Features
+    description: Description
     view: RgbdView | None
+
+    @property
+    def features(self) -> Features:
+        """Its key points, found when they are first asked for."""
+        return self.description.features
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +101,13 @@ def track(
     """
     views = None if source is None or sight.view is None else (source, sight.view)
     aligner = roles.alignment if views is not None else None
-    matcher = roles.points if aligner is None else roles.coarse_points
-    guess, matches, points = _by_points(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
+    located = None
+    if aligner is not None and expected is not None and roles.flow is not None and roles.follows:
+        located = located_by_flow(sight.frame.image, keyframe, expected.pose, intrinsics, roles.flow, roles.geometry)
+    if located is None:
+        matcher = roles.points if aligner is None else roles.coarse_points
+        located = _by_descriptors(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
+    guess, matches, points = located.guess, located.matches, located.points
     known = guess.result is GeometryResult.SUCCESS
     dense = None
     if aligner is not None and views is not None and (known or expected):
@@ -116,7 +128,7 @@ def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
     )
 
 
-def _by_points(
+def _by_descriptors(
     sight: Sight,
     keyframe: Keyframe,
     expected: Expectation | None,
@@ -124,8 +136,8 @@ def _by_points(
     matcher: PointMatcher,
     roles: Roles,
     window: tuple[Keyframe, ...],
-) -> tuple[PoseGuess, PointMatches, np.ndarray]:
-    """The pose by key points; their matches whose depth is known, and those points in the world."""
+) -> Located:
+    """The pose by key points that match in their descriptors, as far as their depth is known."""
     matches = matcher.match(keyframe.features, sight.features)
     inverse_depth = keyframe.points.inverse_depth[matches.index_i]
     known = np.isfinite(inverse_depth)
@@ -142,7 +154,7 @@ def _by_points(
         window_poses=tuple(member.pose for member in window),
         window_depths=tuple(member.depth for member in window) if roles.metric else (),
     )
-    return roles.geometry.locate(query), matches, points
+    return Located(roles.geometry.locate(query), matches, points)
 
 
 def _fused(

@@ -22,6 +22,7 @@ from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
@@ -88,9 +89,9 @@ def make_room(slam: Slam, settings: SlamSettings) -> Slam:
 def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings) -> Slam:
     """Add a keyframe to the window and match it to the others."""
     slam = make_room(slam, settings)
-    matched = [
-        match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics) for number in slam.window
-    ]
+    matched = map_in_threads(
+        lambda number: match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics), slam.window
+    )
     pairs = tuple(pair for pair in matched if pair is not None)
     return replace(
         slam,
