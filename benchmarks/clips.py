@@ -59,7 +59,7 @@ class Row:
             _cm(truth.get("ate_sim3_m")),
             "" if self.reference_cm is None else f"{self.reference_cm:.2f}",
             f"{self.summary['frames_per_second']:.1f}",
-            f"{self.summary['frames'] / self.summary['seconds_by_stage']['all']:.1f}",
+            f"{self.summary['frames_per_second_whole_run']:.1f}",
             f"{self.memory_gb:.2f}",
             self.summary["verdict"]["level"],
         ]

@@ -7,8 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from vggtgeo.models.classical import NoDepth, PnpGeometry, SiftMatcher, place_vector
-from vggtgeo.models.roles import DepthEstimate, GeometryResult, PoseGuess, PoseQuery
+from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
+from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
@@ -134,6 +134,37 @@ def test_alignment_of_different_places_says_that_they_differ(room: Room) -> None
     views = [_view(frame, intrinsics) for frame in (frames[0], other)]
     found = RgbdAlignment().align(*views, np.eye(4))
     assert found is None or found.correlation < 0.3
+
+
+class _Counting(SiftMatcher):
+    """Counts the images that it describes."""
+
+    described = 0
+
+    def describe(self, image: np.ndarray) -> Features:
+        _Counting.described += 1
+        return super().describe(image)
+
+
+def test_frames_are_described_where_flow_fails(room: Room) -> None:
+    """By flow most frames need no descriptors, and none where it has nothing to follow; both ways end near the truth.
+
+    Oracles: the number of descriptions, and the renderer's poses, from which the run by descriptors is the reference.
+    """
+    frames, camera, truth = room
+    errors = []
+    for flow, least, most in (
+        (PatchFlow(), 1, len(frames) // 2),
+        (PatchFlow(similarity=0.999), 30, 30),
+        (None, 30, 30),
+    ):
+        _Counting.described = 0
+        slam = _run(frames, camera, replace(ROLES, points=_Counting(count=500), flow=flow))
+        assert least <= _Counting.described <= most, f"{_Counting.described} descriptions with {flow}"
+        assert all(record.tracked for record in slam.frames)
+        errors.append(_error(slam, truth))
+    assert errors[1] == errors[2]
+    assert errors[0] < max(1.5 * errors[2], 0.01), f"{100 * errors[0]:.2f} cm by flow, {100 * errors[2]:.2f} without"
 
 
 class _Mirage:

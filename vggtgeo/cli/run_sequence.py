@@ -82,8 +82,9 @@ def run_and_write(
             facts=facts,
             warned=warned,
         )
-    result.save(output.folder, depth=output.save_depth, settings=output.flags)
-    print_result(console, result, output.folder)
+        bar.on_stage("writing")
+        summary = result.save(output.folder, depth=output.save_depth, settings=output.flags)
+    print_result(console, result, summary, output.folder)
     if output.as_json:
         typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
     if output.rerun == "serve":

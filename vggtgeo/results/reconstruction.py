@@ -122,10 +122,12 @@ def _concluded(
 ) -> Result:
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
+    hooks.each("on_stage", "dense map")
     with clock.measure("dense map"):
         depths = tuple(fused_depths(slam.keyframes, slam.intrinsics))
         cloud = map_points(slam.keyframes, slam.intrinsics, depths)
     hooks.each("on_finish", slam, cloud)
+    hooks.each("on_stage", "verdict")
     with clock.measure("verdict"):
         verdict = judge(slam, evidence.frames, check_input(run.warned, len(slam.frames)))
     summary = summarise(
@@ -200,6 +202,7 @@ class _Callbacks:
 
     def warm_up(self, settings: SlamSettings, roles: Roles) -> None:
         """Compile what every window needs, and what the callbacks make of windows."""
+        self.each("on_stage", "compiling")
         compiled = warm_up(settings, roles.metric)
         for member in self.members:
             member.on_warm_up(*compiled)
@@ -249,6 +252,7 @@ def _adjust(tracked: _Tracked, roles: Roles, settings: SlamSettings, hooks: _Cal
     hooks.each("on_adjust", tracked.slam)
     if tracked.interrupted:
         return tracked.slam, True
+    hooks.each("on_stage", "last adjustment")
     try:
         return finish(tracked.slam, roles, settings, hooks.clock), False
     except KeyboardInterrupt:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,7 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 from vggtgeo.report import write_page
 from vggtgeo.results.files import write_depth, write_settings
-from vggtgeo.results.summary import compare, summarise
+from vggtgeo.results.summary import compare, summarise, with_writing
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -127,7 +128,7 @@ class Result:
         *,
         depth: bool = False,
         settings: Mapping[str, Any] | None = None,
-    ) -> None:
+    ) -> dict[str, Any]:
         """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `trajectory.png`, `report.html`,
         `summary.json` and `settings.toml`, each atomically; `vggtgeo.read` reads it.
 
@@ -138,6 +139,9 @@ class Result:
             depth: write each keyframe's dense depth and confidence as well.
             settings: flags of the command line that tell how the run was made, beside the pipeline's own settings.
 
+        Returns:
+            What `summary.json` holds: the summary, and of a run how long it took with all its files.
+
         Raises:
             InputError: `depth` is asked of a result that was read from a folder.
 
@@ -145,6 +149,7 @@ class Result:
         place = Path(folder)
         if depth and self.record is None:
             raise InputError("`depth` needs a result that is still in memory; this one was read from a folder")
+        began = time.perf_counter()
         place.mkdir(parents=True, exist_ok=True)
         used = {**(settings or {}), **self.summary.get("settings", {})}
         flags = {name.replace("_", "-"): value for name, value in used.items()}
@@ -153,10 +158,13 @@ class Result:
         self.trajectory.save_tum(place / "trajectory.txt")
         self.keyframes.save_tum(place / "keyframes.txt")
         self.cloud.save_ply(place / "map.ply")
-        write_json(place / "summary.json", plain)
         self._draw(place, {**plain, "settings": flags})
         if depth and self.record is not None:
             write_depth(place, self.record.slam.keyframes, self.record.depths)
+        if self.record is not None:
+            plain = with_writing(plain, time.perf_counter() - began)
+        write_json(place / "summary.json", plain)
+        return plain
 
     def _draw(self, place: Path, summary: Mapping[str, Any]) -> None:
         record = self.record

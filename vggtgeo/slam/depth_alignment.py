@@ -96,15 +96,22 @@ def align_pairs(
     pairs: Sequence[tuple[int, int]],
     surfaces: Sequence[Surface],
     effective: float,
+    room: int | None = None,
 ) -> SurfaceAlignment:
-    """All pairs' alignments at the current poses, as one term; pairs that do not overlap have no weight."""
-    relative = np.array([keyframes[j].pose @ rigid.invert(keyframes[i].pose) for i, j in pairs]).reshape(-1, 4, 4)
-    hessians, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
+    """All pairs' alignments at the current poses, as one term; pairs that do not overlap have no weight.
+
+    room: observations of the term, by default one a pair.
+    """
+    room = len(pairs) if room is None else room
+    relative = np.tile(np.eye(4), (room, 1, 1))
+    for row, (i, j) in enumerate(pairs):
+        relative[row] = keyframes[j].pose @ rigid.invert(keyframes[i].pose)
+    hessians, gradients = np.zeros((room, 6, 6)), np.zeros((room, 6))
     found = map_in_threads(lambda row: align(*pairs[row], surfaces, relative[row], effective), range(len(pairs)))
     for row, alignment in enumerate(found):
         if alignment is not None:
             hessians[row], gradients[row] = alignment.hessian, alignment.gradient
-    return surface_term(pairs, relative, hessians, gradients)
+    return surface_term([*pairs, *[(0, 0)] * (room - len(pairs))], relative, hessians, gradients)
 
 
 def _block_medians(values: np.ndarray) -> np.ndarray:

@@ -4,10 +4,12 @@ adjustment of all keyframes.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.term import AbstractTerm
@@ -26,6 +28,8 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 MUCH = 0.01
 """Relative change of the camera beyond which the user is told."""
+MOST_PADDING = 2.0
+"""Stored edges for each that is there."""
 SURE, MOST_WARP = 5.0, 3.0
 """Standard deviations, and pixels in the corners of the image, beyond which a distortion is told."""
 
@@ -48,8 +52,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
     edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
     edges = _thin(edges, len(slam.keyframes), settings)
-    degree = max(np.bincount([edge.host for edge in edges]))
-    size = replace(window_size(settings), keyframes=len(slam.keyframes), degree=int(degree), edges=len(edges))
+    size = _padded_size(len(slam.keyframes), edges, settings)
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = _surfaces(slam)
     given = slam.given_intrinsics
@@ -81,6 +84,25 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             if not np.array_equal(before.intrinsics, slam.intrinsics):
                 given, surfaces = slam.intrinsics, _surfaces(slam)
     return slam
+
+
+def rounded_up(count: int) -> int:
+    """The smallest of 8, 12, 16, 24, 32, 48, ... that is not below `count`: maps of about one size share what was
+    compiled, which takes longer than the half that they are larger by at most.
+    """
+    power = 8
+    while power < count:
+        power *= 2
+    return 3 * power // 4 if 3 * power // 4 >= max(count, 8) else power
+
+
+def _padded_size(keyframes: int, edges: list[Directed], settings: SlamSettings) -> PaddedSize:
+    """One of few shapes; the exact one where most of it would be padding."""
+    degree = int(max(np.bincount([edge.host for edge in edges])))
+    few = replace(window_size(settings), keyframes=rounded_up(keyframes), degree=rounded_up(degree))
+    if few.keyframes * few.degree <= MOST_PADDING * len(edges):
+        return few
+    return replace(few, keyframes=keyframes, degree=degree, edges=len(edges))
 
 
 def _surfaces(slam: Slam) -> list[Surface]:
@@ -120,14 +142,14 @@ def _lens_note(found: Refinement, shape: tuple[int, ...]) -> list[str]:
 def _terms(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> tuple[AbstractTerm, ...]:
     """What is known about poses beyond matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
-    room: dict[type, int] = {}
-    for factor in slam.factors:
-        room[type(factor)] = room.get(type(factor), 0) + 1
+    counts = Counter(type(factor) for factor in slam.factors)
+    room: dict[type, int] = {kind: rounded_up(count) for kind, count in counts.items()}
     terms = factor_terms(slam.factors, places, room)
     if not surfaces or settings.depth.surface_points <= 0:
         return terms
     pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
-    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points))
+    room_for = rounded_up(len(pairs))
+    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points, room_for))
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:

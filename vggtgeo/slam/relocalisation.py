@@ -81,7 +81,8 @@ def sight_of(frame: Frame, description: Description, slam: Slam, roles: Roles) -
     """The frame as it is tracked."""
     view = None
     if roles.alignment is not None and slam.metric:
-        view = RgbdView.of(frame.image, roles.tracking_depth(frame.depth), slam.intrinsics)
+        view = description.view_by(slam.intrinsics)
+        view = view or RgbdView.of(frame.image, roles.tracking_depth(frame.depth), slam.intrinsics)
     return Sight(frame, description, view)
 
 

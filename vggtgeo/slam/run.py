@@ -22,6 +22,7 @@ from vggtgeo.slam.description import Description
 from vggtgeo.slam.global_adjustment import adjust_all, close_loops
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
@@ -162,7 +163,7 @@ def _described(
     """Undistorted frames, prepared in a thread of their own while earlier ones are tracked; where every frame needs its
     key points, with them.
     """
-    undistorter = camera.undistorter()
+    undistorter, intrinsics = camera.undistorter(), np.array(camera.intrinsics, np.float64)
 
     def describe(image: np.ndarray, stage: str) -> Features:
         with clock.measure(stage):
@@ -173,9 +174,13 @@ def _described(
         image = undistorter.image(frame.image)
         depth = None if frame.depth is None else undistorter.depth(frame.depth)
         frame = Frame(frame.index, frame.timestamp, image, depth, frame.name)
+        view = None
+        if roles.alignment is not None and roles.metric and camera.known:
+            with clock.measure("prepare (own thread)"):
+                view = RgbdView.of(image, roles.tracking_depth(depth), intrinsics)
         if roles.follows:
-            return frame, Description(lambda: describe(image, "describe"))
-        return frame, Description.of(describe(image, "describe (own thread)"))
+            return frame, Description(lambda: describe(image, "describe"), view, intrinsics)
+        return frame, Description.of(describe(image, "describe (own thread)"), view, intrinsics)
 
     def read_and_prepare() -> tuple[Frame, Description] | None:
         with clock.measure("read (own thread)"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import equinox as eqx
@@ -40,12 +41,31 @@ def window_size(settings: SlamSettings) -> PaddedSize:
     )
 
 
-@in_double_precision
 def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State]:
     """Compile what every window needs, on a problem of the right shape that holds one observation.
 
-    Returns that problem and its solution, for whoever has more to compile.
+    Both programs at once, on two cores. Returns that problem and where it starts, for whoever has more to compile.
     """
+    problem, initial = _smallest_window(settings, metric)
+    with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
+        marginalising = pool.submit(_compile_marginalisation, problem, initial)
+        _compile_solver(problem, initial, settings)
+        marginalising.result()
+    return problem, initial
+
+
+@in_double_precision
+def _compile_solver(problem: Problem, initial: State, settings: SlamSettings) -> None:
+    solve_jit(problem, initial, solver=window_solver(settings)).energy.block_until_ready()
+
+
+@in_double_precision
+def _compile_marginalisation(problem: Problem, initial: State) -> None:
+    marginalise_jit(problem, initial, jnp.asarray(0)).root.block_until_ready()
+
+
+@in_double_precision
+def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, State]:
     one = Observations(
         edges=np.array([[0, 1]]),
         host=np.zeros(1, int),
@@ -62,9 +82,7 @@ def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State
     problem, initial, _ = pack(
         one, poses, intrinsics, np.ones(1), size=window_size(settings), kernel=settings.window.kernel, terms=terms
     )
-    solution = solve_jit(problem, initial, solver=window_solver(settings))
-    marginalise_jit(problem, solution.state, jnp.asarray(0)).root.block_until_ready()
-    return problem, solution.state
+    return problem, initial
 
 
 def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
