@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -27,6 +28,15 @@ FARTHEST = 0.10
 """Metres between surfaces that can be one."""
 LEAST_COSINE = 0.8
 LEAST_POINTS = 300
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceRows:
+    """Cells in a row: points and unit normals float64 [3, m], camera frame, standard deviations of the depth [m]."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    sigma: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +59,18 @@ class Surface:
         points = pinhole.grid_rays(middle.shape, coarse) * middle[..., None]
         return cls(points, _normals(points), _block_medians(keyframe.depth_sigma) * middle, coarse)
 
+    @cached_property
+    def rows(self) -> SurfaceRows:
+        """All cells, row by row of the image."""
+        flat = (np.ascontiguousarray(grid.reshape(-1, 3).T) for grid in (self.points, self.normals))
+        return SurfaceRows(*flat, self.sigma.ravel())
+
+    @cached_property
+    def known(self) -> SurfaceRows:
+        """The cells that have a normal."""
+        good = np.flatnonzero(np.isfinite(self.rows.normals[0]))
+        return SurfaceRows(self.rows.points[:, good], self.rows.normals[:, good], self.rows.sigma[good])
+
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
@@ -68,27 +90,29 @@ def align(
 
     Neighbouring depths share their errors: however many points there are, they count as `effective` ones.
     """
-    source, target = surfaces[first], surfaces[second]
-    good = np.isfinite(source.normals[..., 0])
-    points = source.points[good] @ relative[:3, :3].T + relative[:3, 3]
-    normals = source.normals[good] @ relative[:3, :3].T
-    inside, rows, columns = pinhole.visible(points, target.intrinsics, target.normals.shape[:2])
-    points, normals = points[inside], normals[inside]
-    n, q = target.normals[rows, columns], target.points[rows, columns]
-    sigma = np.hypot(source.sigma[good][inside], target.sigma[rows, columns])
+    source, target = surfaces[first].known, surfaces[second]
+    turn = relative[:3, :3]
+    points = turn @ source.points + relative[:3, 3:]
+    inside, rows, columns = pinhole.visible(points.T, target.intrinsics, target.sigma.shape)
+    seen, cell = np.flatnonzero(inside), rows * target.sigma.shape[1] + columns
+    away, n = points.take(seen, 1) - target.rows.points.take(cell, 1), target.rows.normals.take(cell, 1)
+    facing = (n * (turn @ source.normals.take(seen, 1))).sum(0)
+    # A comparison with NaN, where the target has no surface, is false.
     with np.errstate(invalid="ignore"):
-        one = (np.linalg.norm(points - q, axis=1) < FARTHEST) & ((n * normals).sum(1) > LEAST_COSINE)
-    if np.count_nonzero(one) < LEAST_POINTS:
+        one = np.flatnonzero(((away * away).sum(0) < FARTHEST**2) & (facing > LEAST_COSINE))
+    if len(one) < LEAST_POINTS:
         return None
-    points, q, n, sigma = points[one], q[one], n[one], sigma[one]
-    residual = (n * (points - q)).sum(1)
+    seen, cell, away, n = seen.take(one), cell.take(one), away.take(one, 1), n.take(one, 1)
+    sigma = np.hypot(source.sigma.take(seen), target.rows.sigma.take(cell))
+    residual = (n * away).sum(0)
     # Tukey's biweight, wide enough for a pose that is off by a few standard deviations.
     scale = max(float(np.median(np.abs(residual / sigma))) * 4.7, 3.0)
     weight = np.maximum(1 - (residual / sigma / scale) ** 2, 0.0) ** 2 / sigma**2
-    weight *= min(effective / len(points), 1.0)
-    jacobian = np.concatenate([n, np.cross(points, n)], 1)
-    hessian = (jacobian * weight[:, None]).T @ jacobian
-    return Alignment(first, second, hessian, jacobian.T @ (weight * residual), len(points))
+    weight *= min(effective / len(one), 1.0)
+    (x, y, z), (a, b, c) = points.take(seen, 1), n
+    jacobian = np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
+    weighted = jacobian * weight
+    return Alignment(first, second, weighted @ jacobian.T, weighted @ residual, len(one))
 
 
 def align_pairs(
