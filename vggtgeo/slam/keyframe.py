@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.settings import Roles, SlamSettings
 
 
@@ -61,15 +63,18 @@ def make_keyframe(
     number: int,
     frame: Frame,
     pose: np.ndarray,
-    features: Features,
+    description: Description,
     roles: Roles,
     settings: SlamSettings,
     intrinsics: np.ndarray,
 ) -> Keyframe:
     """Run the roles that only keyframes need, and read depth and confidence at key points and line samples."""
-    depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
-    confidence = roles.confidence.confidence(frame.image)
-    lines = _detect_lines(frame, roles, settings)
+    with ThreadPoolExecutor(1, thread_name_prefix="describe") as pool:
+        described = pool.submit(lambda: description.features)  # beside the rest: it takes as long as all of that
+        depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
+        confidence = roles.confidence.confidence(frame.image)
+        lines = _detect_lines(frame, roles, settings)
+        features = described.result()
     ends = lines.segments.endpoints
     line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
     segment, pixels, fraction = sample_segments(ends, settings.line.line_spacing)

@@ -65,7 +65,7 @@ def _started(slam: Slam) -> bool:
 def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
     """Begin a map at this frame: at the world's origin, or where tracking was lost."""
     number = len(slam.keyframes)
-    keyframe = make_keyframe(number, frame, slam.last_pose, features, roles, settings, slam.intrinsics)
+    keyframe = make_keyframe(number, frame, slam.last_pose, Description.of(features), roles, settings, slam.intrinsics)
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, len(features))
     return replace(
         slam,
@@ -137,7 +137,7 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         return replace(slam, frames=(*slam.frames, record_of(frame, found)))
     number = len(slam.keyframes)
     with clock.measure("keyframe"):
-        keyframe = make_keyframe(number, frame, found.pose, sight.features, roles, settings, slam.intrinsics)
+        keyframe = make_keyframe(number, frame, found.pose, sight.description, roles, settings, slam.intrinsics)
     with clock.measure("match keyframes"):
         tie = MeasuredRelativePose(found.keyframe.number, number, found.relative, found.information)
         if found.keyframe.number not in slam.window:
