@@ -22,6 +22,7 @@ from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.compile_ahead import CompileAhead
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.presets import Perception
@@ -89,7 +90,7 @@ def reconstruct(
         source = _opened(frames, camera)
         perception = _perception(roles, source.has_depth)
         windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
-        hooks = _Callbacks((windows, evidence, *callbacks), clock)
+        hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"):
             hooks.warm_up(settings, perception.roles)
         tracked = _track(source, (start, end, stride), perception.roles, settings, hooks)

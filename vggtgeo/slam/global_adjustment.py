@@ -4,14 +4,11 @@ adjustment of all keyframes.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 
-from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import State
-from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
@@ -20,16 +17,14 @@ from vggtgeo.slam.calibration import Refinement, keyframe_pairs, try_camera
 from vggtgeo.slam.covisibility import Directed, Pair, directions, overlap, some_points
 from vggtgeo.slam.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.factors import factor_terms
+from vggtgeo.slam.global_shape import GlobalShape, global_solver, shape_of
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import solve_jit, window_size
-from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.slam.window import solve_jit
 
 MUCH = 0.01
 """Relative change of the camera beyond which the user is told."""
-MOST_PADDING = 2.0
-"""Stored edges for each that is there."""
 SURE, MOST_WARP = 5.0, 3.0
 """Standard deviations, and pixels in the corners of the image, beyond which a distortion is told."""
 
@@ -52,7 +47,8 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
     edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
     edges = _thin(edges, len(slam.keyframes), settings)
-    size = _padded_size(len(slam.keyframes), edges, settings)
+    degrees = np.bincount([edge.host for edge in edges])
+    shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.factors, len(slam.pairs), settings)
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = _surfaces(slam)
     given = slam.given_intrinsics
@@ -62,17 +58,13 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             edges,
             slam.intrinsics,
             settings,
-            size=size,
+            size=shape.size,
             given_intrinsics=given,
             intrinsics_sigma=slam.intrinsics_sigma,
             fixed_pose=fixed,
-            terms=_terms(slam, surfaces, settings),
+            terms=_terms(slam, surfaces, shape, settings),
         )
-        solver = SchurLevenbergMarquardt(
-            max_iterations=settings.refinement.global_iterations,
-            rtol=1e-5,
-            reduced_solver=choose_reduced_solver(adjustment.problem),
-        )
+        solver = global_solver(adjustment.problem, settings)
         solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
@@ -84,25 +76,6 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             if not np.array_equal(before.intrinsics, slam.intrinsics):
                 given, surfaces = slam.intrinsics, _surfaces(slam)
     return slam
-
-
-def rounded_up(count: int) -> int:
-    """The smallest of 8, 12, 16, 24, 32, 48, ... that is not below `count`: maps of about one size share what was
-    compiled, which takes longer than the half that they are larger by at most.
-    """
-    power = 8
-    while power < count:
-        power *= 2
-    return 3 * power // 4 if 3 * power // 4 >= max(count, 8) else power
-
-
-def _padded_size(keyframes: int, edges: list[Directed], settings: SlamSettings) -> PaddedSize:
-    """One of few shapes; the exact one where most of it would be padding."""
-    degree = int(max(np.bincount([edge.host for edge in edges])))
-    few = replace(window_size(settings), keyframes=rounded_up(keyframes), degree=rounded_up(degree))
-    if few.keyframes * few.degree <= MOST_PADDING * len(edges):
-        return few
-    return replace(few, keyframes=keyframes, degree=degree, edges=len(edges))
 
 
 def _surfaces(slam: Slam) -> list[Surface]:
@@ -139,17 +112,14 @@ def _lens_note(found: Refinement, shape: tuple[int, ...]) -> list[str]:
     return [f"the lens distorts, and the calibration does not say so: k1 about {k1:.3f}, {warp:.0f} px in the corners"]
 
 
-def _terms(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> tuple[AbstractTerm, ...]:
+def _terms(slam: Slam, surfaces: list[Surface], shape: GlobalShape, settings: SlamSettings) -> tuple[AbstractTerm, ...]:
     """What is known about poses beyond matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
-    counts = Counter(type(factor) for factor in slam.factors)
-    room: dict[type, int] = {kind: rounded_up(count) for kind, count in counts.items()}
-    terms = factor_terms(slam.factors, places, room)
+    terms = factor_terms(slam.factors, places, shape.room)
     if not surfaces or settings.depth.surface_points <= 0:
         return terms
     pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
-    room_for = rounded_up(len(pairs))
-    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points, room_for))
+    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points, shape.pairs))
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
@@ -66,6 +68,12 @@ def _compile_marginalisation(problem: Problem, initial: State) -> None:
 
 @in_double_precision
 def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, State]:
+    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric)))
+    return smallest_problem(window_size(settings), settings, terms)
+
+
+def smallest_problem(size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm]) -> tuple[Problem, State]:
+    """A problem of the given shape that holds one observation, and where it starts: to compile for that shape."""
     one = Observations(
         edges=np.array([[0, 1]]),
         host=np.zeros(1, int),
@@ -78,10 +86,8 @@ def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, Sta
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
     intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
-    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric)))
-    problem, initial, _ = pack(
-        one, poses, intrinsics, np.ones(1), size=window_size(settings), kernel=settings.window.kernel, terms=terms
-    )
+    kernel = settings.window.kernel
+    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=size, kernel=kernel, terms=terms)
     return problem, initial
 
 
