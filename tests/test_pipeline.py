@@ -139,13 +139,13 @@ def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: floa
 
 
 def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
-    """Compiled for a map of so many keyframes, the solver of the last adjustment is compiled no more, for one of another
-    size it is; oracle: the number of programs that JAX keeps of it.
+    """Compiled for a map of so many keyframes, the solver of the last adjustment is not compiled again; oracle: the
+    number of programs that JAX keeps of it.
     """
     settings = updated(
         SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 2, "global_rounds": 1}}
     )
-    kept = lambda: solve_jit._cached._cache_size()
+    kept = solve_jit._cached._cache_size
     before = kept()
     compile_global(shape_for(len(tracked.keyframes), settings), settings)
     compiled = kept()
