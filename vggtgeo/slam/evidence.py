@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
@@ -141,7 +141,7 @@ def step_information(step: np.ndarray) -> np.ndarray:
 
 def tangent(motion: np.ndarray) -> np.ndarray:
     """Translation and rotation vector of a rigid motion, float64 [6]: to first order its logarithm."""
-    return np.concatenate([motion[:3, 3], cv2.Rodrigues(motion[:3, :3])[0].ravel()])
+    return np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_rotvec()])
 
 
 def worst_sigma(information: np.ndarray) -> tuple[float, float]:
