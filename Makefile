@@ -6,7 +6,7 @@ READY   := $(VENV)/.ready
 OUT     ?= runs/demo
 WORKERS ?= 2
 
-.PHONY: help venv demo test test-slow lint types format lock clean
+.PHONY: help venv demo test test-long test-slow lint types format lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -25,6 +25,9 @@ demo: $(READY)  ## run the system in a synthetic office; OUT=runs/demo
 
 test: $(READY)  ## run the tests (a few minutes); ARGS="-k name" for some
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+
+test-long: $(READY)  ## run the tests that compile for long: derivatives, whole runs
+	$(BIN)/python -m pytest -m "long and not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: $(READY)  ## run the slow tests: real clips, long sequences
 	$(BIN)/python -m pytest -m slow $(ARGS)

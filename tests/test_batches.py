@@ -53,6 +53,7 @@ def solve_alone(problem: Problem, state: State):
     return solve(problem, state, solver=SOLVER)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("at_once", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_gradients_of_a_batch_are_those_of_its_windows(at_once: int) -> None:
     # Proves `grad` through `solve_batch`, mapped and vmapped. Oracle: `grad` through `solve`, window by window.

@@ -215,7 +215,11 @@ def test_second_derivatives_with_several_cameras() -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "truth"), [(vg.RadialTangential, BENT), pytest.param(vg.KannalaBrandt, FISHEYE, marks=pytest.mark.slow)]
+    ("model", "truth"),
+    [
+        pytest.param(vg.RadialTangential, BENT, marks=pytest.mark.long),
+        pytest.param(vg.KannalaBrandt, FISHEYE, marks=pytest.mark.slow),
+    ],
 )
 def test_a_distortion_is_found(model: type[vg.AbstractCamera], truth: np.ndarray) -> None:
     # Proves `pack(camera=...)`: from no distortion and a focal length 1 % off, exact matches give the camera that drew

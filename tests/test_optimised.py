@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scenes import make_scene
 
 from vggtgeo.bundle.problem import Problem
@@ -48,6 +49,7 @@ def test_a_gradient_through_the_optimum() -> None:
     assert abs(found - difference) < 1e-5 * abs(difference), (found, difference)
 
 
+@pytest.mark.long
 def test_the_core_is_right_as_users_compile_it() -> None:
     """The core's tests pass with XLA's own settings; oracle: that of each test."""
     environment = {**os.environ, "XLA_FLAGS": ""}

@@ -185,6 +185,7 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
     assert _keyframe_error(adjust_all(apart, settings), room[2]) > 0.015
 
 
+@pytest.mark.long
 def test_rgb_recovers_the_shape(room) -> None:
     """Without depth the trajectory is right up to scale, and the state says that lengths are not metres."""
     frames, camera, truth = room

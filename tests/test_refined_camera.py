@@ -61,6 +61,7 @@ def test_a_wrong_camera_is_mended(seed: int) -> None:
     assert found.change == pytest.approx(np.abs(found.wanted - wrong).max() / wrong[0], rel=1e-4)
 
 
+@pytest.mark.long
 def test_a_right_camera_is_left_alone() -> None:
     # Proves that noise alone does not pay: of six windows with the true camera, none moves it. Oracle: the truth.
     trials = [trial(window, window.intrinsics) for window in (vg.simulate_window(seed=s, **WINDOW) for s in range(6))]

@@ -36,7 +36,7 @@ ONLY_DENSE: dict[str, Leaf] = {
     "marginal intrinsics": lambda p: p.marginal.intrinsics,
 }
 LEAVES = ONLY_LANDMARKS | ONLY_DENSE
-QUICK = ("depth mean", "marginal poses")
+LONG = ("depth mean", "marginal poses")
 
 
 def made() -> tuple[Problem, State]:
@@ -58,7 +58,9 @@ def by_all() -> Problem:
     return eqx.filter_jit(eqx.filter_grad(loss))(problem, state)
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in LEAVES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.long if n in LONG else pytest.mark.slow) for n in LEAVES]
+)
 def test_one_leaf_alone(name: str, by_all: Problem) -> None:
     # Proves that a leaf which touches only landmarks, or only poses and camera, has its derivative too. Oracle: the
     # gradient by all leaves, which finite differences confirm (tests/test_gradients.py).
@@ -127,6 +129,7 @@ def test_a_landmark_at_its_bound_is_held() -> None:
     assert float(jnp.sum(gradient * along)) == pytest.approx(difference, rel=1e-5)
 
 
+@pytest.mark.long
 def test_the_solution_says_that_it_was_polished() -> None:
     # Proves that under differentiation the solution tells that its state is the polished optimum, and how far it was
     # from rest; and that a derivative at a point that is none can be refused. Oracle: the definition.

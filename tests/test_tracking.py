@@ -270,6 +270,7 @@ def test_a_place_is_recognised(room: Room) -> None:
     assert int(np.argmax(similarity)) == 0, similarity
 
 
+@pytest.mark.long
 def test_pieces_join_where_they_meet(room: Room) -> None:
     """Two parts of a room, the second begun without knowing the first, become one map when the camera comes back.
 

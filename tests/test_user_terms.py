@@ -114,6 +114,7 @@ def test_a_residual_that_is_written_is_the_residual_that_is_solved(own, solved) 
     assert off(eqx.filter_jit(vg.solve)(silent, initial, solver=SOLVER).state) > 2 * off(solved.state)
 
 
+@pytest.mark.long
 def test_second_derivatives_are_derived(own) -> None:
     # Proves gradient and exact Hessian with own terms of three kinds and an own kernel. Oracle: automatic
     # differentiation of the energy after a retraction.
