@@ -91,7 +91,7 @@ def failing(monkeypatch: pytest.MonkeyPatch):
     ("error", "code", "message"),
     [
         (InputError("`x` is 3; it must be 4"), 2, "error: `x` is 3; it must be 4"),
-        (PermissionError(13, "Permission denied", "/root/x"), 2, "error: [Errno 13] Permission denied: '/root/x'"),
+        (PermissionError(13, "Permission denied", "/root/x"), 2, "error: `/root/x`: Permission denied"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (ZeroDivisionError("by zero"), 1, "internal error: ZeroDivisionError: by zero (where: `vggtgeo --debug ...`)"),
         (typer.Exit(7), 7, ""),

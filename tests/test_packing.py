@@ -22,6 +22,25 @@ from vggtgeo.simulation import simulate_window
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)
 
 
+class Scaled(vg.AbstractKernel):
+    """The square with a constant and a slope, as somebody may write a kernel."""
+
+    offset: float = 0.0
+    slope: float = 1.0
+
+    def rho(self, s):
+        return self.slope * s + self.offset
+
+
+class Height(vg.PoseTerm):
+    """A known height of the camera's centre, metres."""
+
+    height: jax.Array
+
+    def residual(self, pose, camera):
+        return pose.inverse().translation()[1] - self.height
+
+
 UNCHECKED = inspect.unwrap(pack)
 """As a user calls it: in the tests a check of types comes before the words that are proved here."""
 
@@ -178,6 +197,12 @@ def test_a_size_that_is_too_small_is_refused(name: str) -> None:
         ({"fixed_intrinsics": [True, False]}, "expected True, False, or 4 of them"),
         ({"kernel": "huber"}, "`kernel` is 'huber'; expected a kernel object"),
         ({"kernel": Huber(jnp.asarray(0.0))}, "`kernel` has the width 0.0; it must be positive"),
+        ({"kernel": Scaled(offset=0.1)}, r"`kernel` of type `Scaled` has rho\(0\) = 0.1.* take the constant off"),
+        ({"kernel": Scaled(slope=2.0)}, r"rho'\(0\) = 2.0; they must be 0 and 1"),
+        (
+            {"terms": [Height(keyframe=[0], height=jnp.ones(1), weight=jnp.ones(1), kernel=Scaled(slope=2.0))]},
+            r"`height.kernel` of type `Scaled`",
+        ),
     ],
 )
 def test_wrong_options_are_refused_by_name(options: dict, message: str) -> None:

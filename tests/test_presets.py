@@ -157,7 +157,7 @@ def test_the_program_says_what_random_weights_are_worth(files: Path, tmp_path: P
     with pytest.warns(InputWarning, match=r"the weights of vggt, dinov3.* are random: this result means nothing"):
         result = _run(tmp_path, "--preset", "paper", "--models", files)
     assert result.exit_code == 0, result.output
-    assert isinstance(called["roles"].points, Mast3rMatcher)
+    assert isinstance(called["roles"].points.source, Mast3rMatcher)
     networks = called["facts"]["networks"]
     assert set(networks) == set(NEEDED["paper"])
     assert {network["weights"] for network in networks.values()} == {"random"}
@@ -177,7 +177,7 @@ def test_the_preset_builds_the_roles_it_documents(files: Path) -> None:
     assert light.geometry is classical.geometry
     assert light.metric
     paper = perception("paper", classical, files).roles
-    assert isinstance(paper.points, Mast3rMatcher)
+    assert isinstance(paper.points.source, Mast3rMatcher)
     assert isinstance(paper.geometry, WindowLocator)
     assert paper.geometry.views == 3
     assert paper.geometry.judge is classical.geometry

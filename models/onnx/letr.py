@@ -36,7 +36,10 @@ class LetrDetector:
         fit = Fit.of(image.shape[:2], (rows or wanted[0], columns or wanted[1]))
         outputs = self.cache.get((self.session,), ("lines",), (image,), lambda: self._run(image, fit))
         ends, scores = decode_lines(outputs["pred_logits"][0], outputs["pred_lines"][0], fit.network_size)
-        keep = scores >= self.score
+        size = np.array(fit.network_size[::-1], np.float64)
+        # Segments end a little outside of the image at most; what lies a whole image away is none.
+        near = ((ends > -size) & (ends < 2 * size)).all(axis=(1, 2))
+        keep = near & (scores >= self.score)
         return tidy(image, fit.to_image(ends[keep]), scores[keep], self.shortest, self.count)
 
     def _run(self, image: np.ndarray, fit: Fit) -> Outputs:

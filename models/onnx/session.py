@@ -56,6 +56,10 @@ class NetworkRunError(RuntimeError):
     """A network failed while it ran, or gave values that are not finite."""
 
 
+class NetworkValueError(NetworkRunError):
+    """A network ran and gave values that are not finite."""
+
+
 @dataclass(frozen=True)
 class DeviceArray:
     """An output that stays where it was computed; other libraries read it through DLPack without a copy."""
@@ -110,13 +114,13 @@ class Session:
     def run(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """The outputs `wanted` (all, if None) as arrays on the host; half precision comes back as float32.
 
-        Raises `NetworkRunError` where onnxruntime fails and for values that are not finite.
+        Raises `NetworkRunError` where onnxruntime fails, `NetworkValueError` for values that are not finite.
         """
         found = {name: array.numpy() for name, array in self.run_on_device(inputs, wanted).items()}
         for name, array in found.items():
             bad = int(np.count_nonzero(~np.isfinite(array)))
             if bad:
-                raise NetworkRunError(
+                raise NetworkValueError(
                     f"`{self.path}` gave {bad} of {array.size} values of `{name}` that are not finite; "
                     "look at it with `vggtgeo models verify`"
                 )
@@ -179,6 +183,10 @@ def open_session(
     check_looks_like_onnx(path)
     opened = _open(path, choose_provider(provider), memory_limit_gb, threads)
     used = "cuda" if _PROVIDERS["cuda"] in opened.get_providers() else "cpu"
+    if provider == "cuda" and used != "cuda":  # onnxruntime falls back without a word
+        raise NetworkFileError(
+            "`provider` is cuda, but onnxruntime could not start CUDA: is there a GPU and its driver?"
+        )
     _announce(used)
     inputs, outputs = (_signatures(nodes) for nodes in (opened.get_inputs(), opened.get_outputs()))
     check_signature(path, contract, inputs, outputs)

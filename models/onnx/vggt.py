@@ -14,6 +14,8 @@ from vggtgeo.models.onnx.fit import Fit, at_multiples
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import GeometryResult, WindowGuess
 
+FARTHEST = 1e6
+"""Scenes are of about unit size in the network's own scale; a camera beyond this is nowhere."""
 WIDTH = 518
 """The width at which the network was trained, pixels."""
 
@@ -33,8 +35,8 @@ class VggtWindow:
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
         """Poses, shared intrinsics, depth and confidence of `images`; see `WindowGeometry.window`.
 
-        Given intrinsics are handed back. A view whose quaternion has no length or whose translation is not finite is
-        not found.
+        Given intrinsics are handed back. A view whose quaternion has no length, or whose translation is not finite or
+        beyond all scenes, is not found.
         """
         self._check(images)
         fit = Fit.of(images[0].shape[:2], self._size(images[0].shape[:2]))
@@ -89,7 +91,9 @@ def decode_cameras(encoding: np.ndarray, size: tuple[int, int]) -> tuple[np.ndar
     the pose of the one before it.
     """
     values = np.asarray(encoding, np.float64)
-    found = np.isfinite(values).all(axis=1) & (np.linalg.norm(values[:, 3:7], axis=1) > 1e-6)
+    with np.errstate(invalid="ignore", over="ignore"):
+        found = np.isfinite(values).all(axis=1) & (np.linalg.norm(values[:, 3:7], axis=1) > 1e-6)
+        found &= (np.abs(values[:, :3]) < FARTHEST).all(axis=1)
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     for view in range(len(values)):
         if found[view]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
+
 import jax
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 
 def check_observed(problem: Problem) -> None:
@@ -27,3 +32,35 @@ def check_observed(problem: Problem) -> None:
         "nothing is observed: all weights of the terms on landmarks and poses are zero, so every state is an optimum; "
         "give at least one observation a positive weight"
     )
+
+
+def check_tied(observations: Observations, keyframes: int) -> None:
+    """Every keyframe is tied to the first by matches of positive weight, through others if need be: one that is not
+    would stay where it was put, or float with all that hangs on it. For problems without terms of their own.
+
+    Raises:
+        InputError: one that is not, by its number.
+
+    """
+    points, lines = np.asarray(observations.point_weight) > 0, np.asarray(observations.line_weight) > 0
+    used = np.concatenate([observations.point_edge[points], observations.line_edge[lines]]).astype(int)
+    pairs = observations.edges[np.unique(used)]
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(keyframes, keyframes))
+    _, piece = connected_components(graph, directed=False)
+    loose = np.flatnonzero(piece != piece[0])
+    if len(loose):
+        raise InputError(
+            f"keyframe {loose[0]} is tied to keyframe 0 by no match of positive weight ({len(loose)} of {keyframes} "
+            "are not); leave such keyframes out, or solve each connected piece alone"
+        )
+    seen = np.concatenate([observations.point_landmark[points], observations.line_landmark[lines]]).astype(int)
+    known = np.isin(np.arange(len(observations.host)), seen)
+    if observations.depth_weight is not None:
+        known |= np.asarray(observations.depth_weight) * observations.alpha > 0
+    if not known.all():
+        warnings.warn(
+            f"{int((~known).sum())} of {len(known)} landmarks have neither a match nor a depth prior of positive "
+            "weight: their inverse depth stays as it was given",
+            InputWarning,
+            stacklevel=3,
+        )

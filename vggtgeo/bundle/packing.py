@@ -103,7 +103,7 @@ def pack(
     dtype = jnp.result_type(float) if dtype is None else dtype
     observations, poses = _as_arrays(observations), as_poses(poses)
     intrinsics, inverse_depth = as_numbers("intrinsics", intrinsics), as_numbers("inverse_depth", inverse_depth)
-    check_kernel(kernel)
+    check_kernel("kernel", kernel)
     check_shapes(observations, poses)
     check_indices(observations, len(poses))
     check_edges(observations.edges)

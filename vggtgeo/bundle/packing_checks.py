@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
@@ -42,15 +44,22 @@ def as_numbers(name: str, given: Any) -> np.ndarray:
     return found
 
 
-def check_kernel(kernel: Any) -> None:
-    """A robust kernel with a width, not its name."""
-    if kernel is None:
+def check_kernel(name: str, kernel: Any) -> None:
+    """A robust kernel with a width, not its name, that is the plain square near zero: else padding would count."""
+    if kernel is None or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(kernel)):
         return
     if not isinstance(kernel, AbstractKernel):
-        raise InputError(f"`kernel` is {kernel!r}; expected a kernel object, as `vggtgeo.Huber(1.5)`, or None")
+        raise InputError(f"`{name}` is {kernel!r}; expected a kernel object, as `vggtgeo.Huber(1.5)`, or None")
     width = getattr(kernel, "delta", None)
     if width is not None and not np.all(np.asarray(width) > 0):
-        raise InputError(f"`kernel` has the width {width}; it must be positive")
+        raise InputError(f"`{name}` has the width {width}; it must be positive")
+    zero = jnp.zeros(())
+    value, slope = np.asarray(kernel.rho(zero)), np.asarray(kernel.weight(zero))
+    if not (np.allclose(value, 0, atol=UNIT) and np.allclose(slope, 1, atol=UNIT)):
+        raise InputError(
+            f"`{name}` of type `{type(kernel).__name__}` has rho(0) = {value} and rho'(0) = {slope}; they must be "
+            "0 and 1: take the constant off `rho`, and divide it by its slope"
+        )
 
 
 def check_fixed(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:

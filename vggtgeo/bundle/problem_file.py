@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,12 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.observed import check_tied
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.saved_modules import check_problem, describe, restore
+from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.solvers.kernels import Huber
@@ -37,6 +38,13 @@ LAYOUT: dict[str, tuple[str | int, ...]] = {
     **{"alpha": (), "huber": ()},
 }
 """Arrays of a problem and their shapes; the first array with a letter decides its size."""
+
+
+OPTIONAL: dict[str, tuple[str | int, ...]] = {"var_segment": ("D",)}
+"""Arrays that a problem may lack."""
+INDICES = ("edges", "var_kf", "pt_edge", "pt_var", "ln_edge", "ln_var", "var_segment")
+_SAVED = ("problem/", "state/", "index/")
+"""How the arrays of a saved problem begin."""
 
 
 def load_problem(
@@ -66,7 +74,6 @@ def load_problem(
     arrays = _read(Path(path))
     if DESCRIPTION in arrays:
         return _restored(Path(path), arrays, terms, dtype)
-    _check_flat(Path(path), arrays)
     observations = Observations(
         edges=arrays["edges"].astype(int),
         host=arrays["var_kf"].astype(int),
@@ -90,9 +97,11 @@ def load_problem(
     kernel = Huber(jnp.asarray(float(arrays["huber"]), dtype))
     start = arrays["T_init"], arrays["k_init"], arrays["d_init"]
     try:
-        return pack(observations, *start, intrinsics_sigma=arrays["k_prior_sigma"], kernel=kernel, dtype=dtype)
+        packed = pack(observations, *start, intrinsics_sigma=arrays["k_prior_sigma"], kernel=kernel, dtype=dtype)
+        check_tied(observations, len(arrays["T_init"]))
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
+    return packed
 
 
 def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -> None:
@@ -136,14 +145,21 @@ def save_solution(path: Path, state: State, index: SlotIndex) -> None:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise InputError(f"`{path}` is no file; give the .npz of a bundle-adjustment problem")
-    try:
-        with open(path, "rb") as handle, np.load(handle) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"`{path}` cannot be read as .npz: {error}") from error
-    return arrays
+    """The arrays of either layout, and no others."""
+    return read_archive(path, "a bundle-adjustment problem", _saved_or_flat)
+
+
+def _saved_or_flat(archive: Archive) -> dict[str, np.ndarray]:
+    if DESCRIPTION in archive:
+        found = [name for name in archive.members if name == DESCRIPTION or name.startswith(_SAVED)]
+        return archive.read(found, lambda headers: None)
+    missing = [name for name in LAYOUT if name not in archive]
+    if missing:
+        raise InputError(
+            f"`{archive.path}` lacks the arrays {', '.join(missing)}; the layout is in docs/problem-file.md"
+        )
+    optional = [name for name in OPTIONAL if name in archive]
+    return archive.read([*LAYOUT, *optional], lambda headers: _check_flat(archive.path, headers))
 
 
 def _restored(
@@ -160,25 +176,30 @@ def _restored(
         check_problem(problem, state, index)
     except InputError as error:
         raise InputError(f"`{path}` cannot be read as a problem: {error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
         raise InputError(f"`{path}` is no problem that `save_problem` wrote, or was changed since: {error}") from error
     return problem, state, index
 
 
-def _check_flat(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    missing = [name for name in LAYOUT if name not in arrays]
-    if missing:
-        raise InputError(f"`{path}` lacks the arrays {', '.join(missing)}; the layout is in docs/problem-file.md")
+def _check_flat(path: Path, found: Mapping[str, ArrayHeader]) -> None:
+    """Shapes and element types that the layout asks for, known before the arrays are read."""
     sizes: dict[str | int, int] = {}
-    for name, layout in LAYOUT.items():
-        found = arrays[name]
-        for axis, length in zip(layout, found.shape, strict=False):
+    for name, layout in {**LAYOUT, **OPTIONAL}.items():
+        if name not in found:
+            continue
+        header = found[name]
+        for axis, length in zip(layout, header.shape, strict=False):
             if isinstance(axis, str):
                 sizes.setdefault(axis, length)
         expected = tuple(sizes.get(axis, axis) for axis in layout)
-        if found.shape != expected:
+        if header.shape != expected:
             raise InputError(
-                f"array `{name}` of `{path}` has shape {found.shape}; expected {expected}, see docs/problem-file.md"
+                f"array `{name}` of `{path}` has shape {header.shape}; expected {expected}, see docs/problem-file.md"
             )
-        if not (np.issubdtype(found.dtype, np.number) or found.dtype == bool):
-            raise InputError(f"array `{name}` of `{path}` holds {found.dtype}; expected numbers")
+        kinds, words = ("iu", "whole numbers") if name in INDICES else ("iufb", "numbers")
+        if header.dtype.kind not in kinds:
+            raise InputError(f"array `{name}` of `{path}` holds {header.dtype}; expected {words}")
+    if not sizes["N"] or not sizes["D"]:
+        raise InputError(
+            f"`{path}` has {sizes['N']} keyframes and {sizes['D']} landmarks; expected at least one of each"
+        )

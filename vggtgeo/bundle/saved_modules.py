@@ -157,3 +157,12 @@ def check_problem(problem: Any, state: Any, index: Any) -> None:
     for term in problem.terms:
         if not isinstance(term, AbstractTerm):
             raise InputError(f"`problem/terms` holds a {type(term).__name__}; expected terms")
+        weight = getattr(term, "weight", None)
+        if weight is not None and not np.all(np.isfinite(weight) & (np.asarray(weight) >= 0)):
+            raise InputError(f"`{term.name}.weight` has values that are negative or not finite")
+    for name, values in (("source", problem.edges.source), ("target", problem.edges.target)):
+        if values.size and not 0 <= int(values.min()) <= int(values.max()) < keyframes:
+            raise InputError(f"array `problem/edges/{name}` names a keyframe that is not there; there are {keyframes}")
+    for name, values in (("poses", state.poses.wxyz_xyz), ("intrinsics", state.intrinsics)):
+        if not np.all(np.isfinite(values)):
+            raise InputError(f"array `state/{name}` has values that are not finite")

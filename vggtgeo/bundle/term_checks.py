@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
-from vggtgeo.bundle.packing_checks import as_numbers, check_matches, check_weight
+from vggtgeo.bundle.packing_checks import as_numbers, check_kernel, check_matches, check_weight
 from vggtgeo.bundle.padding import COUNTED
 from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
@@ -36,6 +36,8 @@ def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int
         names.append(term.name)
         if not isinstance(term.weight, jax.core.Tracer):
             check_weight(f"{term.name}.weight", term.weight)
+        kernel = term.fields.get("kernel") if isinstance(term, FlatTerm) else getattr(term, "kernel", None)
+        check_kernel(f"{term.name}.kernel", kernel)
         if isinstance(term, COUNTED) and np.ndim(term.weight) != 1:
             raise InputError(f"`{term.name}.weight` has shape {np.shape(term.weight)}; give one weight an observation")
         if isinstance(term, FlatTerm):

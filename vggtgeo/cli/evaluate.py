@@ -24,8 +24,8 @@ MAX_TIME_DIFFERENCE = 0.01
 def evaluate(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM format), or a run's output folder.")],
     truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM format), or a dataset folder.")],
-    max_dt: Annotated[float, typer.Option(help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
-    delta: Annotated[int, typer.Option(help="Poses between the two of a pair, for RPE.")] = 1,
+    max_dt: Annotated[float, typer.Option(min=0, help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
+    delta: Annotated[int, typer.Option(min=1, help="Poses between the two of a pair, for RPE.")] = 1,
     all_pairs: Annotated[
         bool, typer.Option("--all-pairs/--no-all-pairs", help="Overlapping pairs for RPE, not consecutive ones.")
     ] = False,
@@ -33,12 +33,15 @@ def evaluate(
 ) -> None:
     """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT."""
     from vggtgeo.evaluation import evaluate_trajectory
+    from vggtgeo.evaluation.resemblance import warn_of_strangers
 
-    report = evaluate_trajectory(load_estimate(estimate), load_truth(truth), max_dt, delta, all_pairs)
+    found, true, scale = load_estimate(estimate), load_truth(truth), load_scale(estimate)
+    report = evaluate_trajectory(found, true, max_dt, delta, all_pairs)
+    warn_of_strangers(found, true, max_dt)
     if as_json:
-        typer.echo(json.dumps(report.as_dict(), indent=2))
+        typer.echo(json.dumps({**report.as_dict(), **({} if scale is None else {"estimate_scale": scale})}, indent=2))
     else:
-        print_report(report)
+        print_report(report, scale)
 
 
 def load_estimate(path: Path) -> Trajectory:
@@ -46,6 +49,14 @@ def load_estimate(path: Path) -> Trajectory:
     from vggtgeo.geometry.trajectory import Trajectory
 
     return Trajectory.load_tum(path / "trajectory.txt" if path.is_dir() else path)
+
+
+def load_scale(path: Path) -> str | None:
+    """What the summary of a run says of its scale; None for a file, whose scale nobody knows."""
+    try:
+        return str(json.loads((path / "summary.json").read_text(encoding="utf-8"))["scale"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def load_truth(path: Path) -> Trajectory:
@@ -61,8 +72,10 @@ def load_truth(path: Path) -> Trajectory:
     return truth
 
 
-def print_report(report: TrajectoryReport) -> None:
-    """Prints the table that people read; `TrajectoryReport.as_dict` is what programs read."""
+def print_report(report: TrajectoryReport, scale: str | None = None) -> None:
+    """Prints the table that people read; `TrajectoryReport.as_dict` is what programs read. scale: of the estimate, as
+    its summary has it; where it is free, errors in metres mean something after a Sim(3) alignment only.
+    """
     import numpy as np
     from rich.console import Console
     from rich.table import Table
@@ -78,9 +91,14 @@ def print_report(report: TrajectoryReport) -> None:
     )
     table = Table("", "RMSE", "mean", "median", "max")
     angles = ErrorStatistics.of(np.degrees(report.relative.rotation))
-    _add_row(table, "ATE, SE(3)", report.se3.statistics, 100, "cm")
+    free = scale is not None and scale.startswith("free")
+    if scale is not None:
+        console.print(f"scale of the estimate: {scale}", soft_wrap=True)
+    if not free:
+        _add_row(table, "ATE, SE(3)", report.se3.statistics, 100, "cm")
     _add_row(table, "ATE, Sim(3)", report.sim3.statistics, 100, "cm")
-    _add_row(table, "RPE translation", report.relative.translation_statistics, 100, "cm")
+    if not free:
+        _add_row(table, "RPE translation", report.relative.translation_statistics, 100, "cm")
     _add_row(table, "RPE translation, Sim(3)", report.relative_sim3.translation_statistics, 100, "cm")
     _add_row(table, "RPE rotation", angles, 1, "deg")
     console.print(table)

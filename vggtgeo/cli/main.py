@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import sys
 import warnings
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from typer.core import TyperGroup
 from vggtgeo.cli.jax_flags import set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.interruption import end_on_signals
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1
@@ -165,6 +167,8 @@ def _leave(error: BaseException) -> NoReturn:
     """End the program with one line on stderr."""
     if isinstance(error, KeyboardInterrupt):
         message, code = "interrupted", EXIT_INTERRUPTED
+    elif isinstance(error, OSError) and error.filename is not None:
+        message, code = f"error: `{error.filename}`: {error.strerror}", EXIT_INPUT
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
     elif _is_usage_error(error):
@@ -181,6 +185,14 @@ def _usage_message(error: Any) -> str:
     message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
     command = error.ctx.command_path if error.ctx is not None else "vggtgeo"
     return f"{message} (see `{command} --help`)"
+
+
+def _version(asked: bool) -> bool:
+    """Print the version of the package, and end."""
+    if asked:
+        typer.echo(f"vggtgeo {importlib.metadata.version('vggtgeo')}")
+        raise typer.Exit
+    return asked
 
 
 def _stand_in() -> None:
@@ -200,6 +212,9 @@ def make_app() -> typer.Typer:
     @app.callback()
     def options(
         debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+        version: Annotated[
+            bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        ] = False,
     ) -> None:
         """Dense indoor SLAM with a functional, differentiable bundle adjustment."""
 
@@ -211,6 +226,7 @@ def make_app() -> typer.Typer:
 def main() -> None:
     """Entry point of the program."""
     set_jax_flags()
+    end_on_signals()
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
     make_app()(prog_name="vggtgeo")
 

@@ -88,7 +88,11 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
         lines.append(f"scale: metric, by {summary['scale_basis']}")
     if "truth" in summary:
         se3, sim3 = (summary["truth"][name]["rmse"] for name in ("ate_se3_m", "ate_sim3_m"))
-        lines.append(f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment")
+        free = summary["scale"].startswith("free")
+        exact = "" if free else f"{100 * se3:.2f} cm after SE(3), "
+        lines.append(
+            f"ATE {exact}{100 * sim3:.2f} cm after Sim(3) alignment" + (" (the scale is free)" if free else "")
+        )
     points = f"({len(result.cloud)} points)"
     lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply {points} report.html")
     lines += [f"- {reason}" for reason in verdict.reasons]

@@ -33,6 +33,7 @@ def run(
     start: options.StartOption = 0,
     end: options.EndOption = None,
     stride: options.StrideOption = 1,
+    fps: options.RateOption = None,
     intrinsics: options.IntrinsicsOption = None,
     rgb_only: options.RgbOnlyOption = False,
     lines: options.LinesOption = True,
@@ -62,7 +63,8 @@ def run(
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
-    check_flags(preset, features, memory_limit_gb)
+    check_flags(preset, features, memory_limit_gb, fps)
+    check_provider(preset, provider)
     switches: Switches = {
         "lines": {"line": {"use_lines": lines}},
         "confidence": {"weights": {"use_confidence": confidence}},
@@ -72,33 +74,50 @@ def run(
     }
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:
-        sequence = open_input(path, kind, intrinsics, rgb_only)
+        sequence = open_input(path, kind, intrinsics, rgb_only, fps)
     perceived = make_perception(preset, make_roles(sequence, init, features), models, cache, provider, memory_limit_gb)
     flags = settings.values() if settings else {}
     run_and_write(
         sequence,
         perceived,
         slam_settings,
-        Output(output, flags, rerun, save_depth, quiet, as_json),
+        Output(output, flags, rerun, save_depth, quiet, as_json, source=path),
         (start, end, stride),
         seed=seed,
         warned=warned,
     )
 
 
-def check_flags(preset: str, features: str, memory_limit_gb: float | None) -> None:
+def check_flags(preset: str, features: str, memory_limit_gb: float | None, fps: float | None = None) -> None:
     """InputError for flags that do not go together, or cannot be."""
     if preset == "paper" and features != "sift":
         raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
     if memory_limit_gb is not None and not memory_limit_gb > 0:
         raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be positive")
+    if fps is not None and not 0 < fps < float("inf"):
+        raise InputError(f"`--fps` is {fps:g}; it must be a positive number of frames a second")
 
 
-def open_input(path: Path, kind: str | None, intrinsics: str | None, rgb_only: bool) -> Sequence:
+def check_provider(preset: str, provider: options.Provider) -> None:
+    """InputError for a GPU that is asked for and not there; a warning where no network would use it."""
+    if provider != "cuda":
+        return
+    from vggtgeo.io.network_errors import as_input_errors
+    from vggtgeo.models.onnx.session import choose_provider
+
+    with as_input_errors():
+        choose_provider(provider)
+    if preset == "classical":
+        warnings.warn("`--provider cuda` has no effect with `--preset classical`", InputWarning, stacklevel=2)
+
+
+def open_input(path: Path, kind: str | None, intrinsics: str | None, rgb_only: bool, fps: float | None) -> Sequence:
     """The sequence at `path`, with what the flags say otherwise."""
-    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
+    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, with_rate, without_depth
 
     sequence = open_sequence(path, kind)
+    if fps is not None:
+        sequence = with_rate(sequence, fps)
     if intrinsics is not None:
         sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
     return without_depth(sequence) if rgb_only else sequence

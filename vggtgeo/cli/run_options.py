@@ -11,9 +11,9 @@ Provider = Literal["auto", "cuda", "cpu"]
 SequenceArgument = Annotated[Path, typer.Argument(help="Folder of a sequence, or a video file.", show_default=False)]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
 KindOption = Annotated[str | None, typer.Option(help="Reader: 7scenes, tum, images or video; found by looking.")]
-StartOption = Annotated[int, typer.Option(help="First frame.")]
-EndOption = Annotated[int | None, typer.Option(help="Frame to stop before.")]
-StrideOption = Annotated[int, typer.Option(help="Take every n-th frame.")]
+StartOption = Annotated[int, typer.Option(min=0, help="First frame.")]
+EndOption = Annotated[int | None, typer.Option(min=1, help="Frame to stop before.")]
+StrideOption = Annotated[int, typer.Option(min=1, help="Take every n-th frame.")]
 IntrinsicsOption = Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels, in place of the folder's.")]
 RgbOnlyOption = Annotated[
     bool, typer.Option("--rgb-only/--no-rgb-only", help="Ignore depth images: the scale stays free.")
@@ -60,4 +60,8 @@ MemoryOption = Annotated[
 SaveDepthOption = Annotated[
     bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
 ]
-SeedOption = Annotated[int, typer.Option(help="Seed of every random choice.")]
+SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]
+RateOption = Annotated[
+    float | None,
+    typer.Option("--fps", help="Frames a second of a video or a folder of images, in place of what is assumed."),
+]

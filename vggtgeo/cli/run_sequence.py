@@ -15,9 +15,11 @@ from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.progress import ProgressBar, print_result
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Sequence
+from vggtgeo.io.interruption import interruption
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.run_folder import RESERVE, RunFolder, taken
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -32,7 +34,7 @@ class Output:
     """Where a run of the command line leaves what, and what it prints meanwhile.
 
     flags: the effective settings by the names of the flags, for `settings.toml`. rerun: where to log the run, see
-    `vggtgeo/viewing/target.py`.
+    `vggtgeo/viewing/target.py`. source: what is read, which nothing may be written into.
     """
 
     folder: Path
@@ -41,6 +43,7 @@ class Output:
     save_depth: bool = False
     quiet: bool = False
     as_json: bool = False
+    source: Path | None = None
 
 
 def run_and_write(
@@ -64,26 +67,30 @@ def run_and_write(
     """
     silent = output.quiet or output.as_json
     console = Console(stderr=False, quiet=silent)
-    callbacks, url = _rerun_callbacks(output, title or sequence.name)
-    if callbacks:
-        settings = updated(settings, {"window": {"record_iterations": True}})
     start, end, stride = selection
-    with as_input_errors(), ProgressBar(console) as bar:
-        result = reconstruct(
-            sequence,
-            roles,
-            settings,
-            start=start,
-            end=end,
-            stride=stride,
-            seed=seed,
-            title=title,
-            callbacks=(bar, _EarlyFiles(output, settings), *callbacks),
-            facts=facts,
-            warned=warned,
-        )
-        bar.on_stage("writing")
-        summary = result.save(output.folder, depth=output.save_depth, settings=output.flags)
+    # From the first frame to the last file a signal only ends the work early; what is there is written as a whole.
+    with interruption() as stop, taken(output.folder, output.source, RESERVE) as folder:
+        callbacks, url = _rerun_callbacks(output, folder, title or sequence.name)
+        if callbacks:
+            settings = updated(settings, {"window": {"record_iterations": True}})
+        with as_input_errors(), ProgressBar(console) as bar:
+            result = reconstruct(
+                sequence,
+                roles,
+                settings,
+                start=start,
+                end=end,
+                stride=stride,
+                seed=seed,
+                title=title,
+                callbacks=(bar, _EarlyFiles(folder.stage, {**output.flags, **changed(settings)}), *callbacks),
+                facts=facts,
+                warned=warned,
+            )
+            bar.on_stage("writing")
+            summary = result.save_into(folder, depth=output.save_depth, settings=output.flags)
+        if stop.asked and not result.summary["interrupted"]:
+            typer.echo("interrupted after the last frame: everything was done and is written", err=True)
     print_result(console, result, summary, output.folder)
     if output.as_json:
         typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
@@ -96,25 +103,27 @@ def run_and_write(
 
 
 class _EarlyFiles(Callback):
-    """Settings and poses lie in the folder before the adjustment of the whole map, should that be killed."""
+    """Settings and poses are on the disk before the adjustment of the whole map, should that be killed."""
 
-    def __init__(self, output: Output, settings: SlamSettings) -> None:
-        self._output = output
-        self._settings = {**output.flags, **changed(settings)}
-
-    def on_begin(self, name: str, total: int | None) -> None:
-        self._output.folder.mkdir(parents=True, exist_ok=True)
+    def __init__(self, stage: Path, settings: Mapping[str, Any]) -> None:
+        self._stage = stage
+        self._settings = settings
 
     def on_adjust(self, slam: Slam) -> None:
-        write_settings(self._output.folder / "settings.toml", self._settings)
-        write_trajectories(self._output.folder, slam)
+        write_settings(self._stage / "settings.toml", self._settings)
+        write_trajectories(self._stage, slam)
 
 
-def _rerun_callbacks(output: Output, name: str) -> tuple[tuple[Callback, ...], str | None]:
-    """What logs the run, if anything, and where a served run is to be seen."""
+def _rerun_callbacks(output: Output, folder: RunFolder, name: str) -> tuple[tuple[Callback, ...], str | None]:
+    """What logs the run, if anything, and where a served run is to be seen; a file in the run's folder grows in its
+    stage.
+    """
     if output.rerun is None:
         return (), None
-    opened = open_target(output.rerun, name, output.folder / STAND_IN)
+    target = output.rerun
+    if target not in ("spawn", "serve") and Path(target).parent.resolve() == output.folder.resolve():
+        target = str(folder.stage / Path(target).name)
+    opened = open_target(target, name, folder.stage / STAND_IN)
     if opened.url is not None:
         typer.echo(f"follow the run in a browser: {opened.url}", err=True)
     return (RerunCallback(opened.stream),), opened.url

@@ -78,12 +78,12 @@ that is no flag of the command, and for a value of a wrong type."""
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(
             f"`--settings` is `{path}`, which cannot be read ({error.strerror}); give a TOML file"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"`{path}` is no TOML file: {error}; a line is `key = value`, text in quotes") from None
 
 

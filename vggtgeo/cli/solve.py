@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.options import JsonOption, QuietOption
+from vggtgeo.cli.options import EXIT_FAILED, JsonOption, QuietOption
 
 
 class Precision(enum.StrEnum):
@@ -28,8 +28,11 @@ def solve(
     as_json: JsonOption = False,
 ) -> None:
     """Solve the bundle-adjustment problem in PROBLEM."""
-    from vggtgeo.cli.timed_solve import solve_file
+    from vggtgeo.cli.timed_solve import check_output, solve_file
 
+    check_output(problem, output)
     report = solve_file(problem, output, max_steps, dtype.value, repeat)
     if as_json or not quiet:
         typer.echo(json.dumps(asdict(report), allow_nan=False) if as_json else report.sentence)
+    if report.result == "nonfinite_step":
+        raise typer.Exit(EXIT_FAILED)

@@ -1,5 +1,6 @@
 """Solving a problem file with a clock beside it: the work of `vggtgeo solve`."""
 
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,17 @@ class Report:
             f"{self.result}: energy {self.energy_initial:.6e} -> {self.energy_final:.6e} in {self.iterations} "
             f"iterations{pace} ({self.dtype}, compiled in {self.compile_s:.1f} s)"
         )
+
+
+def check_output(problem: Path, output: Path) -> None:
+    """InputError for an output that is a folder or the problem itself, before anything is computed."""
+    if output.is_dir():
+        raise InputError(f"`{output}` is a folder; give the name of a file for the solution with `-o`")
+    if output.exists() and problem.exists() and output.samefile(problem):
+        raise InputError(f"`{output}` is the problem itself; give another name for the solution with `-o`")
+    above = next(folder for folder in output.resolve().parents if folder.exists())
+    if not (above.is_dir() and os.access(above, os.W_OK)):
+        raise InputError(f"`{output}` cannot be written: `{above}` is no folder, or may not be written")
 
 
 def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: int) -> Report:

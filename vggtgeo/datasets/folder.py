@@ -9,7 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import MILLIMETRES, DepthFormat, read_depth, read_image
+from vggtgeo.datasets.image_files import (
+    MILLIMETRES,
+    DepthFormat,
+    ImageFile,
+    read_depth,
+    read_image,
+    read_image_file,
+)
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
@@ -57,10 +64,22 @@ class FolderSequence:
 
     def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
         empty = 0
+        bits = 8
+        turned = False
         for file in files:
-            image = self._read_image(file)
-            if image is None:
+            read = self._read_image(file, bits)
+            if read is None:
                 continue
+            if read.bits > max(bits, 8):
+                _warn(f"`{file.image}` has values of {read.bits} bits: taken for an image of so many from here on")
+            bits = max(bits, read.bits)
+            if read.orientation != 1 and not turned:
+                turned = True
+                _warn(
+                    f"`{file.image}` asks to be turned (EXIF orientation {read.orientation}): images are used as they "
+                    "are stored, and intrinsics and depth must be those of the stored images"
+                )
+            image = read.image
             depth = self._read_depth(file) if self.has_depth else None
             if file.depth is not None and depth is not None and not np.isfinite(depth).any():
                 empty += 1
@@ -70,13 +89,13 @@ class FolderSequence:
         if empty > _NAMED_EMPTY_DEPTHS:
             _warn(f"`{self.name}`: {empty} of {len(files)} depth images gave no valid depth")
 
-    def _read_image(self, file: FrameFile) -> np.ndarray | None:
+    def _read_image(self, file: FrameFile, bits: int) -> ImageFile | None:
         try:
-            image = read_image(file.image)
+            read = read_image_file(file.image, bits)
         except InputError as error:
             _warn(f"{error}; the frame is skipped", LeftOutWarning)
             return None
-        height, width = image.shape[:2]
+        height, width = read.image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             _warn(
                 f"`{file.image}` is {width} x {height} pixels; the sequence's images are "
@@ -84,7 +103,7 @@ class FolderSequence:
                 LeftOutWarning,
             )
             return None
-        return image
+        return read
 
     def _read_depth(self, file: FrameFile) -> np.ndarray:
         nothing = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
@@ -128,11 +147,13 @@ def depth_is_usable(name: str, files: Sequence[FrameFile], coding: DepthFormat, 
     valid.
     """
     with_depth = [file for file in files if file.depth is not None]
+    reason = ""
     for file in _spread(with_depth):
         assert file.depth is not None
         try:
             depth = read_depth(file.depth, coding)
-        except InputError:
+        except InputError as error:
+            reason = reason or f" ({error})"
             continue
         if depth.shape != (height, width):
             raise InputError(
@@ -142,7 +163,9 @@ def depth_is_usable(name: str, files: Sequence[FrameFile], coding: DepthFormat, 
         if np.isfinite(depth).any():
             return True
     if with_depth:
-        _warn(f"`{name}`: none of the {len(with_depth)} depth images has a valid pixel; reading the images only")
+        _warn(
+            f"`{name}`: none of the {len(with_depth)} depth images has a valid pixel{reason}; reading the images only"
+        )
     return False
 
 

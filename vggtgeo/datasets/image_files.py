@@ -1,7 +1,8 @@
 """Image and depth files, decoded by OpenCV, with the checks that OpenCV leaves out.
 
-OpenCV may hand back a partly grey image for a JPEG that ends too early; so a file must have its format's end
-mark before it is decoded.
+OpenCV may hand back a partly grey image for a JPEG that ends too early, and turns an image as its EXIF data say, which
+neither the intrinsics nor the depth of a folder know of. So files are looked at before (`image_defects.py`), and images
+are used as they are stored.
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from vggtgeo.datasets.image_defects import defect, ends_in_grey, orientation
 from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
@@ -31,15 +33,47 @@ FIVE_THOUSANDTHS = DepthFormat(5000.0)
 """TUM RGB-D: 5000 is one metre."""
 
 
+BITS = (8, 10, 12, 14, 16)
+"""Bits that the values of a 16-bit file may have: cameras of 10 and 12 bits write such files, and never fill them."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFile:
+    """image: uint8 [H, W, 3] RGB, as it is stored, whatever the file says about turning it. bits: that its values need,
+    one of `BITS`. orientation: what the file says about turning it, 1 for nothing.
+    """
+
+    image: UInt8[np.ndarray, "h w 3"]
+    bits: int
+    orientation: int
+
+
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """The image as RGB; InputError with the reason where the file is missing, cut off, or not an image."""
-    image = _decode(path, cv2.IMREAD_COLOR)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+    return read_image_file(path).image
+
+
+def read_image_file(path: Path, least_bits: int = 8) -> ImageFile:
+    """The image as RGB, and what must be known of its file; InputError as `read_image` has it.
+
+    least_bits: that a 16-bit image has at least, however dark it is: those of the images before it.
+    """
+    content, image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim != 3:
+        raise InputError(f"`{path}`: found {image.dtype} of shape {image.shape}; images must have 8 or 16 bits")
+    bits = 8
+    if image.dtype == np.uint16:
+        needed = max(int(image.max()).bit_length(), least_bits)
+        bits = next(known for known in BITS if known >= needed)
+        image = (image >> (bits - 8)).astype(np.uint8)
+    elif ends_in_grey(content, image):
+        raise InputError(f"`{path}` is cut off: its data end before its end mark, and the rest would be grey")
+    return ImageFile(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), bits, orientation(content))
 
 
 def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     """The depth, float32 metres, NaN for none; InputError where the file is no 16-bit one-channel image."""
-    codes = _decode(path, cv2.IMREAD_UNCHANGED)
+    _, codes = _decode(path, cv2.IMREAD_UNCHANGED)
     if codes.dtype != np.uint16 or codes.ndim != 2:
         raise InputError(f"`{path}`: found {codes.dtype} of shape {codes.shape}; depth must be uint16 with one channel")
     depth = np.divide(codes, np.float32(coding.units_per_metre), dtype=np.float32)
@@ -48,35 +82,19 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     return depth
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
+def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
+    """The file's bytes, and the image in them."""
     try:
-        content = np.fromfile(path, np.uint8)
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(f"`{path}` cannot be read: {error.strerror or error}") from None
-    defect = _defect(content.tobytes())
-    if defect:
-        raise InputError(f"`{path}` {defect}")
-    image = cv2.imdecode(content, flags)
+    wrong = defect(content)
+    if wrong:
+        raise InputError(f"`{path}` {wrong}")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error as error:
+        raise InputError(f"`{path}` cannot be decoded: {error.err}") from None
     if image is None:
         raise InputError(f"`{path}` cannot be decoded: it is damaged, or not an image")
-    return image
-
-
-def _defect(content: bytes) -> str:
-    if not content:
-        return "is empty"
-    if content.startswith(b"\x89PNG") and content.rfind(b"IEND") < 0:
-        return "is cut off: the PNG has no end"
-    if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9") < _start_of_scan(content):
-        return "is cut off: the JPEG has no end"
-    return ""
-
-
-def _start_of_scan(content: bytes) -> int:
-    """Where a JPEG's image data begin; its length where there are none. Thumbnails before it have ends of their own."""
-    position = 2
-    while position + 4 <= len(content) and content[position] == 0xFF:
-        if content[position + 1] == 0xDA:
-            return position
-        position += 2 + int.from_bytes(content[position + 2 : position + 4])
-    return len(content)
+    return content, image

@@ -46,7 +46,7 @@ class ImageFolder(FolderSequence):
     def ground_truth(self) -> Trajectory | None:
         """The true poses, if the folder has them."""
         file = self.folder / "groundtruth.txt"
-        return Trajectory.load_tum(file) if file.is_file() else None
+        return Trajectory.load_tum(file) if file.exists() else None
 
 
 def natural_key(name: str) -> list[int | str]:

@@ -10,6 +10,13 @@ import numpy as np
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.io.errors import InputError, InputWarning
 
+NARROWEST, WIDEST = 1.0, 170.0
+"""Degrees: fields of view that a pinhole camera may have."""
+FARTHEST_CENTRE = 10.0
+"""Sizes of the image that a principal point may be away: nearer ones may belong to a piece of a larger image."""
+LEAST_VALID = 0.5
+"""Share of the undistorted image that must come from the image: of the lenses of docs and benchmarks the worst keeps
+more than 0.8."""
 CALIBRATION = "calibration.txt"
 MATRIX = "camera-intrinsics.txt"
 
@@ -37,9 +44,40 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
         if file.is_file():
             intrinsics, distortion = read(file)
             camera = Camera(intrinsics, width, height, distortion)
+            check_plausible(f"`{file}`", camera)
             _warn_of_other_size(file, camera)
             return camera
     return None
+
+
+def check_plausible(where: str, camera: Camera) -> None:
+    """InputError for a camera that cannot have taken images of this size: its unit is no pixel, or its distortion folds
+    the image.
+
+    Raises:
+        InputError: a field of view beyond 1 to 170 degrees (a pinhole's image is nowhere near 180), a principal point
+            ten times the image's size away, or a distortion that leaves less than half of the image.
+
+    """
+    (fx, fy, cx, cy), width, height = camera.intrinsics, camera.width, camera.height
+    sides = math.atan(0.5 * width / fx), math.atan(0.5 * height / fy)
+    widest, narrowest = (math.degrees(2 * pick(sides)) for pick in (max, min))
+    size = f"for images of {width} x {height} pixels"
+    if widest > WIDEST or widest < NARROWEST:
+        angle = widest if widest > WIDEST else narrowest
+        raise InputError(
+            f"{where}: fx {fx:g} and fy {fy:g} make a field of view of {angle:.3g} deg {size}; they must be in pixels"
+        )
+    if abs(cx) > FARTHEST_CENTRE * width or abs(cy) > FARTHEST_CENTRE * height:
+        raise InputError(f"{where}: the principal point ({cx:g}, {cy:g}) is far outside {size}; give pixels")
+    if any(camera.distortion):
+        valid = camera.undistorter().valid
+        share = 1.0 if valid is None else float(valid.mean())
+        if share < LEAST_VALID:
+            raise InputError(
+                f"{where}: the distortion {camera.distortion} leaves {100 * share:.0f} % of the image; it must be "
+                "k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order"
+            )
 
 
 def freiburg_camera(name: str, width: int, height: int) -> Camera | None:
@@ -93,7 +131,7 @@ def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
 
 
 def _without_comments(file: Path) -> str:
-    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     return " ".join(line.split("#", 1)[0] for line in lines)
 
 

@@ -61,6 +61,10 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequ
 def _open_video(file: Path) -> Sequence:
     if file.is_dir():
         raise InputError(f"`{file}` is a folder; the reader 'video' needs a file")
+    if not file.is_file():
+        raise InputError(f"`{file}` is no regular file; give a folder of images or a video file")
+    if file.suffix.lower() == ".gif":
+        raise InputError(f"`{file}` is a GIF, whose colours and times are not those of a camera; give the video itself")
     if file.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
     return VideoFile.open(file)

@@ -51,7 +51,7 @@ class SevenScenes(FolderSequence):
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses; pose files with NaN or infinity (tracking was lost) are left out with an InputWarning."""
-        if (self.folder / COLOUR_TRUTH).is_file():
+        if (self.folder / COLOUR_TRUTH).exists():
             return Trajectory.load_tum(self.folder / COLOUR_TRUTH)
         times, poses = [], []
         for file in self.files:
@@ -104,7 +104,7 @@ def _published_camera(folder: Path, width: int, height: int) -> Camera:
 
 def _read_pose(file: Path) -> np.ndarray | None:
     try:
-        pose = np.array(file.read_text(encoding="utf-8").split(), np.float64).reshape(4, 4)
+        pose = np.array(file.read_text(encoding="utf-8-sig").replace(",", " ").split(), np.float64).reshape(4, 4)
     except ValueError:
         raise InputError(f"`{file}`: expected a 4 x 4 matrix of numbers, camera to world") from None
     if not np.isfinite(pose).all():

@@ -60,7 +60,7 @@ class TumRgbd(FolderSequence):
     def ground_truth(self) -> Trajectory | None:
         """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
         file = self.folder / _TRUTH
-        return Trajectory.load_tum(file) if file.is_file() else None
+        return Trajectory.load_tum(file) if file.exists() else None
 
 
 def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
@@ -68,7 +68,7 @@ def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
     if not file.is_file():
         raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
     entries = []
-    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         text = line.split("#", 1)[0].strip()
         if text:
             entries.append(_parse_entry(file, number, text))

@@ -23,7 +23,8 @@ _FALLBACK_RATE = 30.0
 class VideoFile:
     """A video, without depth and without truth. Intrinsics come from a file in the video's folder.
 
-    Fields: path; name; camera; rate, frames/s; count, the container's number of frames (an estimate).
+    Fields: path; name; camera; rate, frames/s; count, the container's number of frames (an estimate);
+    given_rate, frames/s in place of the container's times.
     """
 
     path: Path
@@ -32,6 +33,7 @@ class VideoFile:
     rate: float
     count: int
     has_depth: bool = False
+    given_rate: float | None = None
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -88,6 +90,8 @@ class VideoFile:
         """The container's time where it increases (frames of phones come at a varying rate), else by the rate."""
         if index == 0:
             return 0.0
+        if self.given_rate is not None:
+            return index / self.given_rate
         time = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         return time if math.isfinite(time) and time > previous else previous + 1.0 / self.rate
 

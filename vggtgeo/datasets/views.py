@@ -1,12 +1,17 @@
 """A sequence seen otherwise: with other intrinsics, without its depth, or with its truth set apart."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
+from vggtgeo.datasets.intrinsics import check_plausible
+from vggtgeo.datasets.tum import TumRgbd
+from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,24 @@ def with_intrinsics(
 ) -> Sequence:
     """The sequence with the given, known intrinsics (pixels) in place of whatever its folder says."""
     camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height, distortion)
+    check_plausible("`intrinsics`", camera)
     return SequenceView(sequence, camera, sequence.has_depth)
+
+
+def with_rate(sequence: Sequence, rate: float) -> Sequence:
+    """The sequence with `rate` frames a second, in place of the times that are assumed or that a video states.
+
+    Raises:
+        InputError: `rate` is no positive number, or the sequence knows its times.
+
+    """
+    if not (math.isfinite(rate) and rate > 0):
+        raise InputError(f"`rate` is {rate:g}; it must be a positive number of frames a second")
+    if isinstance(sequence, VideoFile):
+        return replace(sequence, given_rate=rate)
+    if isinstance(sequence, FolderSequence) and not isinstance(sequence, TumRgbd):
+        return replace(sequence, files=tuple(replace(file, timestamp=file.index / rate) for file in sequence.files))
+    raise InputError(f"`{sequence.name}` has times of its own; a rate is for videos and folders of images")
 
 
 def without_depth(sequence: Sequence) -> Sequence:

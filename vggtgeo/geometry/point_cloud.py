@@ -10,6 +10,9 @@ from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 
+# What the parser raises for files that are none, or that declare more than they hold.
+_UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyHeaderParseError, PlyParseError)
+
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
@@ -54,14 +57,16 @@ class PointCloud:
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> "PointCloud":
-        """Reads the points, colours (black where there are none) and confidence of a PLY file."""
+        """Reads the points, colours (black where there are none) and confidence of a PLY file; InputError for any file
+        that holds no such points.
+        """
         try:
             vertices = PlyData.read(os.fspath(path))["vertex"].data
-        except (OSError, KeyError, PlyHeaderParseError, PlyParseError) as error:
+            names = vertices.dtype.names or ()
+            points = np.column_stack([vertices[name] for name in "xyz"])
+            colours = np.zeros((len(points), 3), np.uint8)
+            if {"red", "green", "blue"} <= set(names):
+                colours = np.column_stack([vertices[name] for name in ("red", "green", "blue")]).astype(np.uint8)
+            return cls(points, colours, np.array(vertices["confidence"]) if "confidence" in names else None)
+        except _UNREADABLE as error:
             raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY point cloud: {error}") from None
-        names = vertices.dtype.names or ()
-        points = np.column_stack([vertices[name] for name in "xyz"])
-        colours = np.zeros((len(points), 3), np.uint8)
-        if {"red", "green", "blue"} <= set(names):
-            colours = np.column_stack([vertices[name] for name in ("red", "green", "blue")]).astype(np.uint8)
-        return cls(points, colours, np.array(vertices["confidence"]) if "confidence" in names else None)

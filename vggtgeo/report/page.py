@@ -111,7 +111,9 @@ def write_page(
         settings=_flat(summary["settings"]),
         versions=summary["versions"],
         intrinsics=summary["intrinsics"],
-        truth_table=_truth_table(summary.get("truth")),
+        truth_table=_truth_table(summary.get("truth"), slam.metric),
+        scale=summary["scale"],
+        scale_basis=summary.get("scale_basis"),
     )
     write_text(path, text)
 
@@ -155,14 +157,15 @@ def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
     ]
 
 
-def _truth_table(truth: Mapping[str, Any] | None) -> list[tuple[str, list[str]]]:
-    """Rows of errors: RMSE, mean, median, largest."""
+def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[str, list[str]]]:
+    """Rows of errors: RMSE, mean, median, largest; of a free scale those after a Sim(3) alignment only."""
     if truth is None:
         return []
+    translation = "rpe_translation_m" if metric else "rpe_translation_sim3_m"
     rows = (
-        ("ATE, SE(3) [cm]", truth["ate_se3_m"], 100.0),
+        *([("ATE, SE(3) [cm]", truth["ate_se3_m"], 100.0)] if metric else []),
         ("ATE, Sim(3) [cm]", truth["ate_sim3_m"], 100.0),
-        ("RPE translation [cm]", truth["rpe_translation_m"], 100.0),
+        (f"RPE translation{'' if metric else ', Sim(3)'} [cm]", truth[translation], 100.0),
         ("RPE rotation [deg]", truth["rpe_rotation_deg"], 1.0),
     )
     names = ("rmse", "mean", "median", "maximum")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import tomli_w
 
-from vggtgeo.io.files import atomic_path, write_text
+from vggtgeo.io.errors import InputWarning
+from vggtgeo.io.files import atomic_open, write_text
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
@@ -20,22 +21,45 @@ DEPTH_UNIT = 5000.0
 """Counts a metre in the 16-bit depth images, as in the TUM RGB-D format."""
 
 
+MOST_COUNTS = 65535
+DEPTH_NOTE = (
+    "NNNNNN.depth.png: depth z of the keyframe of frame NNNNNN, 16 bit, 0 = none.\n"
+    "NNNNNN.confidence.png: its confidence, 8 bit, 255 = 1.\n"
+)
+METRES = "5000 counts are one metre, as in the TUM RGB-D format.\n"
+NO_METRES = "5000 counts are one unit of trajectory.txt, which is no metre: the scale of this run is free.\n"
+
+
 def write_trajectories(folder: Path, slam: Slam) -> None:
     """`trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world."""
     frame_trajectory(slam).save_tum(folder / "trajectory.txt")
     keyframe_trajectory(slam).save_tum(folder / "keyframes.txt")
 
 
-def write_depth(folder: Path, keyframes: Sequence[Keyframe], depths: Sequence[np.ndarray | None]) -> None:
-    """The keyframes' `fused_depths` as `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none), and beside each
-    `depth/NNNNNN.confidence.png` (8 bit).
+def write_depth(
+    folder: Path, keyframes: Sequence[Keyframe], depths: Sequence[np.ndarray | None], metric: bool = True
+) -> None:
+    """The keyframes' `fused_depths` as `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none), beside each
+    `depth/NNNNNN.confidence.png` (8 bit), and `depth/README.txt`, which says so.
+
+    A keyframe without any depth has no files; where none has any there is no folder, and a warning.
     """
-    for keyframe, depth in zip(keyframes, depths, strict=True):
-        metres = np.zeros(keyframe.depth.shape) if depth is None else np.nan_to_num(depth)
-        counts = np.clip(metres * DEPTH_UNIT, 0, 65535).round().astype(np.uint16)
+    written = [(keyframe, depth) for keyframe, depth in zip(keyframes, depths, strict=True) if _any(depth)]
+    if not written:
+        warnings.warn("no keyframe has dense depth: there is none to save", InputWarning, stacklevel=3)
+        return
+    write_text(folder / "depth" / "README.txt", DEPTH_NOTE + (METRES if metric else NO_METRES))
+    for keyframe, depth in written:
+        counts = np.rint(np.nan_to_num(depth) * DEPTH_UNIT)
+        counts = np.where(counts <= MOST_COUNTS, counts, 0).astype(np.uint16)  # farther than 13.1 m: none, not 13.1 m
         for name, image in (("depth", counts), ("confidence", keyframe.depth_confidence)):
-            with atomic_path(folder / "depth" / f"{keyframe.frame:06d}.{name}.png") as temporary:
-                cv2.imwrite(os.fspath(temporary), image)
+            # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
+            with atomic_open(folder / "depth" / f"{keyframe.frame:06d}.{name}.png", "wb") as file:
+                file.write(cv2.imencode(".png", image)[1].tobytes())
+
+
+def _any(depth: np.ndarray | None) -> bool:
+    return depth is not None and bool((np.nan_to_num(depth) > 0).any())
 
 
 def write_settings(path: Path, values: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,11 +14,15 @@ from typing import Any
 import cv2
 
 from vggtgeo.datasets import Frame, Sequence, SequenceView, open_sequence
+from vggtgeo.datasets.frame import check_selection
 from vggtgeo.datasets.in_memory import FrameStream, frame_stream
+from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.warned import collected_warnings
+from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
@@ -31,10 +36,13 @@ from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
-from vggtgeo.slam.trust.input import check_input
+from vggtgeo.slam.trust.input import check_input, check_refusals
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.window import warm_up
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
+
+LEAST_SIDE = 32
+"""Pixels: windows of features and of the image pyramid do not fit into less."""
 
 
 def reconstruct(
@@ -55,7 +63,7 @@ def reconstruct(
     """Track and map every frame, adjust the whole map, judge the result.
 
     Ctrl-C (in a notebook: the stop button) ends the run early with the result of the frames so far, whose `summary`
-    says `interrupted`.
+    says `interrupted`: after the frame at hand, or in place of the last adjustment. A second one ends it at once.
 
     Args:
         frames: a folder or a video file, a sequence (`vggtgeo.read`, `vggtgeo.simulate`), or any iterable of `Frame`,
@@ -86,23 +94,28 @@ def reconstruct(
     clock, began = Clock(), time.perf_counter()
     cv2.setRNGSeed(seed)
     settings = settings or SlamSettings()
-    with collected_warnings() as collected:
+    with interruption() as stop, collected_warnings() as collected:
         source = _opened(frames, camera)
+        source.check(start, end, stride)
         perception = _perception(roles, source.has_depth)
         windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
         hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
-        with clock.measure("compile"):
+        with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
-        tracked = _track(source, (start, end, stride), perception.roles, settings, hooks)
-    slam, interrupted = _adjust(tracked, perception.roles, settings, hooks)
-    known = {
-        **perception.facts(),
-        **(facts or {}),
-        "frames_per_second": round(tracked.frames_per_second, 2),
-        "interrupted": interrupted,
-    }
-    ending = _Ending(slam, source.truth, (*warned, *collected), title or source.name, known, clock, began)
-    return _concluded(ending, settings, hooks, windows.records, evidence)
+        tracked = _track(source, (start, end, stride), perception.roles, settings, hooks, stop)
+        slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
+        report = compare(slam, source.truth)
+        known = {
+            **perception.facts(),
+            **(facts or {}),
+            "frames_per_second": round(tracked.frames_per_second, 2),
+            "interrupted": interrupted,
+        }
+        notices = (*warned, *collected)
+        ending = _Ending(
+            slam, source.truth, report, notices, perception.refusals, title or source.name, known, clock, began
+        )
+        return _concluded(ending, settings, hooks, windows.records, evidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +124,9 @@ class _Ending:
 
     slam: Slam
     truth: Trajectory | None
+    report: TrajectoryReport | None
     warned: tuple[Warning | str, ...]
+    refusals: Mapping[str, Refusals]
     title: str
     facts: Mapping[str, Any]
     clock: Clock
@@ -130,13 +145,14 @@ def _concluded(
     hooks.each("on_finish", slam, cloud)
     hooks.each("on_stage", "verdict")
     with clock.measure("verdict"):
-        verdict = judge(slam, evidence.frames, check_input(run.warned, len(slam.frames)))
+        left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
+        verdict = judge(slam, evidence.frames, left_out)
     summary = summarise(
         slam,
         verdict,
         settings=changed(settings),
         seconds={**clock.seconds, "all": time.perf_counter() - run.began},
-        report=compare(slam, run.truth),
+        report=run.report,
         map_points=len(cloud),
         **run.facts,
     )
@@ -161,6 +177,16 @@ class _Source:
     @property
     def has_depth(self) -> bool:
         return self.frames.has_depth
+
+    def check(self, start: int, end: int | None, stride: int) -> None:
+        """InputError for a selection that is none, or images too small for features, before anything is compiled."""
+        if min(self.camera.width, self.camera.height) < LEAST_SIDE:
+            raise InputError(
+                f"the images of `{self.name}` are {self.camera.width} x {self.camera.height} pixels; both sides must "
+                f"be at least {LEAST_SIDE}"
+            )
+        length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames)
+        check_selection(self.name, length, start, end, stride)
 
     def count(self, start: int, end: int | None, stride: int) -> int | None:
         """Frames of a selection; None where only their end will tell."""
@@ -225,9 +251,14 @@ class _Tracked:
 
 
 def _track(
-    source: _Source, selection: tuple[int, int | None, int], roles: Roles, settings: SlamSettings, hooks: _Callbacks
+    source: _Source,
+    selection: tuple[int, int | None, int],
+    roles: Roles,
+    settings: SlamSettings,
+    hooks: _Callbacks,
+    stop: Interruption,
 ) -> _Tracked:
-    """The loop over frames; Ctrl-C ends it early, an input error of the sequence ends it without a result."""
+    """The loop over frames; Ctrl-C ends it after a whole frame, an input error of the sequence without a result."""
     slam: Slam | None = None
     interrupted = False
     given: dict[int, Frame] = {}
@@ -237,8 +268,11 @@ def _track(
     try:
         for slam in run_frames(frames, source.camera, roles, settings, hooks.clock):
             hooks.each("on_frame", slam, given.pop(slam.frames[-1].frame))
+            if stop.asked:
+                break
     except KeyboardInterrupt:
         interrupted = True
+    interrupted = interrupted or stop.asked
     if slam is None or not slam.frames:
         if interrupted:
             raise KeyboardInterrupt
@@ -248,14 +282,17 @@ def _track(
     return _Tracked(slam, interrupted, len(slam.frames) / (time.perf_counter() - began))
 
 
-def _adjust(tracked: _Tracked, roles: Roles, settings: SlamSettings, hooks: _Callbacks) -> tuple[Slam, bool]:
+def _adjust(
+    tracked: _Tracked, roles: Roles, settings: SlamSettings, hooks: _Callbacks, stop: Interruption
+) -> tuple[Slam, bool]:
     """The state after the last adjustment, and whether Ctrl-C ended the run; after Ctrl-C there is none."""
     hooks.each("on_adjust", tracked.slam)
     if tracked.interrupted:
         return tracked.slam, True
     hooks.each("on_stage", "last adjustment")
     try:
-        return finish(tracked.slam, roles, settings, hooks.clock), False
+        with stop.at_once():
+            return finish(tracked.slam, roles, settings, hooks.clock), False
     except KeyboardInterrupt:
         hooks.each("on_message", "interrupted: keeping what there is, without the last adjustment")
         return tracked.slam, True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,10 +18,11 @@ from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
 from vggtgeo.figures.result_figure import result_figure
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
 from vggtgeo.report import write_page
 from vggtgeo.results.files import write_depth, write_settings
+from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.summary import compare, summarise, with_writing
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.keyframe_depth import fused_depths
@@ -104,12 +106,15 @@ class Result:
     def load(cls, folder: str | os.PathLike[str]) -> Self:
         """Reads the folder that `Result.save` or `vggtgeo run` wrote; InputError where a file of it is missing."""
         place = Path(folder)
+        unfinished = check_finished(place)
+        if unfinished:
+            warnings.warn(unfinished, InputWarning, stacklevel=2)
         try:
             summary = json.loads((place / "summary.json").read_text(encoding="utf-8"))
             fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
             metric = summary["scale"] == "metric"
             verdict = Verdict.from_dict(summary["verdict"], metric)
-        except (OSError, json.JSONDecodeError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             message = f"`{place}` has no usable `summary.json` ({error}); give a folder that `vggtgeo run` wrote"
             raise InputError(message) from None
         return cls(
@@ -130,7 +135,8 @@ class Result:
         settings: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
         """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `trajectory.png`, `report.html`,
-        `summary.json` and `settings.toml`, each atomically; `vggtgeo.read` reads it.
+        `summary.json` and `settings.toml`; `vggtgeo.read` reads it. They are written beside and take their places
+        together; what an earlier run left there is replaced as a whole.
 
         A result that was read from a folder has neither images nor windows, so it is saved without page and depth.
 
@@ -143,14 +149,22 @@ class Result:
             What `summary.json` holds: the summary, and of a run how long it took with all its files.
 
         Raises:
-            InputError: `depth` is asked of a result that was read from a folder.
+            InputError: `depth` is asked of a result that was read from a folder, or the folder cannot be written, is
+                in use by a run, or holds a sequence of images.
 
         """
-        place = Path(folder)
+        with taken(folder) as place:
+            return self.save_into(place, depth=depth, settings=settings)
+
+    def save_into(
+        self, run: RunFolder, *, depth: bool = False, settings: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """The same, into a folder that is taken already."""
+        place = run.stage
         if depth and self.record is None:
             raise InputError("`depth` needs a result that is still in memory; this one was read from a folder")
         began = time.perf_counter()
-        place.mkdir(parents=True, exist_ok=True)
+        run.release_reserve()
         used = {**(settings or {}), **self.summary.get("settings", {})}
         flags = {name.replace("_", "-"): value for name, value in used.items()}
         plain = {**self.summary, "settings": {name.replace("-", "_"): value for name, value in used.items()}}
@@ -158,15 +172,16 @@ class Result:
         self.trajectory.save_tum(place / "trajectory.txt")
         self.keyframes.save_tum(place / "keyframes.txt")
         self.cloud.save_ply(place / "map.ply")
-        self._draw(place, {**plain, "settings": flags})
+        self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
         if depth and self.record is not None:
-            write_depth(place, self.record.slam.keyframes, self.record.depths)
+            write_depth(place, self.record.slam.keyframes, self.record.depths, self.record.slam.metric)
         if self.record is not None:
             plain = with_writing(plain, time.perf_counter() - began)
         write_json(place / "summary.json", plain)
+        run.publish()
         return plain
 
-    def _draw(self, place: Path, summary: Mapping[str, Any]) -> None:
+    def _draw(self, place: Path, name: str, summary: Mapping[str, Any]) -> None:
         record = self.record
         if len(self.trajectory):
             plot_trajectory(
@@ -175,7 +190,7 @@ class Result:
                 record.truth if record else None,
                 self.keyframes,
                 with_scale=not (record.slam.metric if record else self.metric),
-                title=record.title if record else place.resolve().name,
+                title=record.title if record else name,
             )
         if record is not None:
             write_page(

@@ -5,24 +5,29 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import resource
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
 
 
 def compare(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:
-    """Errors against the truth; None where there is none, or too few poses match it in time."""
-    if truth is None:
+    """Errors against the truth; None where there is none, for fewer than three poses and, with a warning, where the
+    truth does not match them in time.
+    """
+    estimate = frame_trajectory(slam)
+    if truth is None or len(estimate) < 3:
         return None
     try:
-        return evaluate_trajectory(frame_trajectory(slam), truth)
-    except InputError:
+        return evaluate_trajectory(estimate, truth)
+    except InputError as error:
+        warnings.warn(f"there is no comparison with the truth: {error}", InputWarning, stacklevel=2)
         return None
 
 

@@ -13,13 +13,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.io.network_files import networks_folder
+from vggtgeo.models.onnx.bounds import (
+    BoundedConfidence,
+    BoundedDepth,
+    BoundedLineMatcher,
+    BoundedLines,
+    BoundedPoints,
+    BoundedWindow,
+    Refusals,
+)
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
 from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
@@ -44,10 +53,11 @@ NEEDED = {
 
 @dataclass(frozen=True, eq=False)
 class Perception:
-    """Role objects and the networks behind them, by their names in the registry."""
+    """Role objects and the networks behind them, by their names in the registry; what was refused, by role."""
 
     roles: Roles
     networks: Mapping[str, Session]
+    refusals: Mapping[str, Refusals] = field(default_factory=dict)
 
     @property
     def random(self) -> list[str]:
@@ -70,7 +80,8 @@ class Perception:
             for name, session in self.networks.items()
         }
         warning = {"meaningless": self.warning()} if self.random else {}
-        return {"networks": described, **warning}
+        refused = {role: asdict(counts) for role, counts in self.refusals.items()}
+        return {"networks": described, "refused": refused, **warning}
 
     def warning(self) -> str:
         """What a user must know before reading any result of random weights."""
@@ -124,35 +135,41 @@ def perception(
             for name in NEEDED[preset]
         }
         build = _paper if preset == "paper" else _light
-        roles = build(classical, networks, cache)
+        roles, refusals = build(classical, networks, cache)
         for session in networks.values():
             session.warm_up()
-    return Perception(roles, networks)
+    return Perception(roles, networks, refusals)
 
 
-def _light(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Roles:
+Built = tuple[Roles, dict[str, Refusals]]
+
+
+def _light(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Built:
     features = DinoFeatures(networks["dinov3-small"], _cache(cache))
-    return replace(
-        classical,
-        lines=MlsdDetector(networks["mlsd"], _cache(cache)),
-        line_matches=DenseLineMatcher(features),
-        depth=MogeDepth(networks["moge2-small"], _cache(cache)),
-        confidence=features,
-    )
+    lines = BoundedLines(MlsdDetector(networks["mlsd"], _cache(cache)))
+    depth = BoundedDepth(MogeDepth(networks["moge2-small"], _cache(cache)))
+    confidence = BoundedConfidence(features)
+    roles = replace(classical, lines=lines, line_matches=DenseLineMatcher(features), depth=depth, confidence=confidence)
+    return roles, {"depth": depth.refusals, "lines": lines.refusals, "confidence": confidence.refusals}
 
 
-def _paper(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Roles:
+def _paper(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Built:
     features = DinoFeatures(networks["dinov3"], _cache(cache))
-    window = _check_views(VggtWindow(networks["vggt"], _cache(cache)))
-    return Roles(
-        points=Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache)),
-        lines=LetrDetector(networks["letr"], _cache(cache)),
-        line_matches=DenseLineMatcher(features),
-        depth=MogeDepth(networks["moge2"], _cache(cache)),
-        confidence=features,
-        geometry=WindowLocator(window, classical.geometry, views=window.views),
-        flow=None,
-    )
+    model = _check_views(VggtWindow(networks["vggt"], _cache(cache)))
+    window = BoundedWindow(model)
+    points = BoundedPoints(Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache)))
+    lines = BoundedLines(LetrDetector(networks["letr"], _cache(cache)))
+    depth = BoundedDepth(MogeDepth(networks["moge2"], _cache(cache)))
+    confidence, pairs = BoundedConfidence(features), BoundedLineMatcher(DenseLineMatcher(features))
+    bounded: dict[str, Any] = {
+        "points": points,
+        "lines": lines,
+        "line_matches": pairs,
+        "depth": depth,
+        "confidence": confidence,
+    }
+    roles = Roles(**bounded, geometry=WindowLocator(window, classical.geometry, views=model.views), flow=None)
+    return roles, {role: part.refusals for role, part in {**bounded, "geometry": window}.items()}
 
 
 def _cache(folder: Path | None) -> OutputCache:

@@ -1,0 +1,216 @@
+"""What a network may answer: each role's values within bounds, and a count of what was refused.
+
+A file keeps its contract by its shapes; its values may still be anything. Here is what the values of a role can be, in
+an indoor world, whatever the network: depth from 5 cm to 100 m, confidence in [0, 1], everything finite. What is
+outside is taken away before the estimator sees it (no depth, no match, no segment, no view), and counted, so that the
+verdict can say so. A network that fails to run at all still ends the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from vggtgeo.models.classical.depth import no_depth
+from vggtgeo.models.onnx.session import NetworkValueError
+from vggtgeo.models.roles import (
+    DenseConfidence,
+    DepthEstimate,
+    Features,
+    GeometryResult,
+    LineDetector,
+    LineFeatures,
+    LineMatcher,
+    LineMatches,
+    MetricDepth,
+    PointMatcher,
+    PointMatches,
+    RelativeView,
+    Segments,
+    WindowGeometry,
+    WindowGuess,
+)
+
+NEAREST, FARTHEST = 0.05, 100.0
+"""Metres: depths of an indoor world, a sports hall included."""
+AVERAGE = 0.5
+"""Confidence in the place of one that is none: that of a pixel like any other."""
+
+
+@dataclass
+class Refusals:
+    """Of one role: asked, answers asked for; without, those of which nothing was left; values and refused, numbers in
+    all answers, and those of them that were out of bounds. Nothing is computed from it but the verdict.
+    """
+
+    asked: int = 0
+    without: int = 0
+    values: int = 0
+    refused: int = 0
+
+    def note(self, values: int, refused: int, left: bool) -> None:
+        """One answer."""
+        self.asked += 1
+        self.values += values
+        self.refused += refused
+        self.without += not left
+
+    @property
+    def share(self) -> float:
+        """Of what was asked for, how much was refused: of answers or of values, whichever is more."""
+        return max(self.without / max(self.asked, 1), self.refused / max(self.values, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedDepth:
+    """A `MetricDepth` whose depth lies between `NEAREST` and `FARTHEST`, with a positive deviation."""
+
+    source: MetricDepth
+    refusals: Refusals = field(default_factory=Refusals)
+
+    def estimate(
+        self,
+        image: np.ndarray,
+        sensor_depth: np.ndarray | None = None,
+        intrinsics: Sequence[float] | None = None,
+    ) -> DepthEstimate:
+        """See `MetricDepth.estimate`."""
+        try:
+            found = self.source.estimate(image, sensor_depth, intrinsics)
+        except NetworkValueError:
+            self.refusals.note(image[..., 0].size, image[..., 0].size, left=False)
+            return no_depth(image.shape[:2])
+        with np.errstate(invalid="ignore"):
+            given = np.isfinite(found.depth)
+            good = given & (found.depth >= NEAREST) & (found.depth <= FARTHEST) & (found.sigma_rel > 0)
+        self.refusals.note(int(given.sum()), int(given.sum() - good.sum()), left=bool(good.any()))
+        if (good == given).all():
+            return found
+        nothing = np.float32(np.nan)
+        return DepthEstimate(
+            np.where(good, found.depth, nothing).astype(np.float32),
+            np.where(good, found.confidence, 0.0).astype(np.float32),
+            np.where(good, found.sigma_rel, nothing).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedConfidence:
+    """A `DenseConfidence` in [0, 1]; `AVERAGE` where the source's is not."""
+
+    source: DenseConfidence
+    refusals: Refusals = field(default_factory=Refusals)
+
+    def confidence(self, image: np.ndarray) -> np.ndarray:
+        """See `DenseConfidence.confidence`."""
+        average = np.full(image.shape[:2], AVERAGE, np.float32)
+        try:
+            found = self.source.confidence(image)
+        except NetworkValueError:
+            self.refusals.note(average.size, average.size, left=False)
+            return average
+        with np.errstate(invalid="ignore"):
+            good = np.isfinite(found) & (found >= 0) & (found <= 1)
+        self.refusals.note(found.size, int(found.size - good.sum()), left=bool(good.any()))
+        return found if good.all() else np.where(good, found, average).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedLines:
+    """A `LineDetector` whose segments lie in the image."""
+
+    source: LineDetector
+    refusals: Refusals = field(default_factory=Refusals)
+
+    def detect(self, image: np.ndarray) -> Segments:
+        """See `LineDetector.detect`."""
+        try:
+            found = self.source.detect(image)
+        except NetworkValueError:
+            self.refusals.note(1, 1, left=False)
+            return Segments(np.zeros((0, 2, 2)), np.zeros(0))
+        inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
+        good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
+        self.refusals.note(len(found), int(len(found) - good.sum()), left=True)  # an image may have no line
+        return found if good.all() else Segments(found.endpoints[good], found.scores[good])
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedLineMatcher:
+    """A `LineMatcher` that knows no segment of an image for which its network had no answer."""
+
+    source: LineMatcher
+    refusals: Refusals = field(default_factory=Refusals)
+
+    def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
+        """See `LineMatcher.describe`."""
+        try:
+            found = self.source.describe(image, segments)
+        except NetworkValueError:
+            self.refusals.note(1, 1, left=False)
+            return LineFeatures(Segments(np.zeros((0, 2, 2)), np.zeros(0)))
+        self.refusals.note(1, 0, left=True)
+        return found
+
+    def match(
+        self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
+    ) -> LineMatches:
+        """See `LineMatcher.match`."""
+        if not len(features_i) or not len(features_j):
+            none = np.zeros(0, np.int64)
+            return LineMatches(none, none, np.zeros(0))
+        return self.source.match(features_i, features_j, relative)
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedPoints:
+    """A `PointMatcher` whose matches lie in bounds that its own types check; an answer that is none gives no match."""
+
+    source: PointMatcher
+    refusals: Refusals = field(default_factory=Refusals)
+
+    def describe(self, image: np.ndarray) -> Features:
+        """See `PointMatcher.describe`."""
+        return self.source.describe(image)
+
+    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
+        """See `PointMatcher.match`."""
+        try:
+            found = self.source.match(features_i, features_j, predicted)
+        except NetworkValueError:
+            self.refusals.note(1, 1, left=False)
+            none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
+            return PointMatches(none, none, nowhere, nowhere, np.zeros(0))
+        self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedWindow:
+    """A `WindowGeometry` whose answer is none where it is not finite; what is out of bounds in a view makes it one that
+    is not found.
+    """
+
+    source: WindowGeometry
+    refusals: Refusals = field(default_factory=Refusals)
+
+    def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
+        """See `WindowGeometry.window`."""
+        count, size = len(images), images[0].shape[:2]
+        try:
+            found = self.source.window(images, intrinsics)
+        except NetworkValueError:
+            self.refusals.note(count, count, left=False)
+            focal, (height, width) = float(max(size)), size
+            camera = np.array([focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)])
+            return WindowGuess(
+                np.tile(np.eye(4), (count, 1, 1)),
+                camera if intrinsics is None else np.asarray(intrinsics, np.float64),
+                np.full((count, *size), np.nan, np.float32),
+                np.zeros((count, *size), np.float32),
+                np.zeros(count, bool),
+                result=GeometryResult.DEGENERATE,
+            )
+        self.refusals.note(count, int(count - found.found.sum()), left=bool(found.found.any()))
+        return found

@@ -1,0 +1,270 @@
+"""Rows of the table of bad inputs: command lines, settings, outputs, networks, results and environments."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import bad_files as bad
+import pytest
+import tiny_sequences as tiny
+from bad_row import Row, good, line, nothing, rows, run_with
+
+from vggtgeo.cli.jax_flags import cache_folder
+from vggtgeo.results import Result
+from vggtgeo.results.run_folder import taken
+
+
+def flags(*words: Any) -> dict[str, Any]:
+    """`vggtgeo run` on good images with these flags."""
+    return {"argv": run_with(*words)}
+
+
+def settings(content: str | bytes) -> dict[str, Any]:
+    """`vggtgeo run` on good images with a settings file."""
+
+    def make(folder: Path) -> Path:
+        bad.file("run.toml", content)(folder)
+        return good(folder)
+
+    return {"make": make, "argv": lambda made: [*run_with("--settings", made.parent / "run.toml")(made)]}
+
+
+def output(make: Any, name: str) -> dict[str, Any]:
+    """`vggtgeo run` on good images into something that is there already."""
+
+    def both(folder: Path) -> Path:
+        make(folder / name)
+        return good(folder)
+
+    return {"make": both, "argv": lambda made: ["run", made, "-o", made.parent / name]}
+
+
+def network(content: bytes | None, *words: Any) -> dict[str, Any]:
+    """`vggtgeo models verify` of a file."""
+    make = nothing if content is None else bad.file("net.onnx", content)
+    return {
+        "make": make,
+        "argv": lambda made: ["models", "verify", made if content is not None else made / "net.onnx", *words],
+    }
+
+
+def evaluated(estimate: Any, reference: Any, *words: Any) -> dict[str, Any]:
+    """`vggtgeo evaluate` of two trajectories."""
+
+    def make(folder: Path) -> Path:
+        estimate(folder / "estimate.txt")
+        reference(folder / "truth.txt")
+        return folder
+
+    return {"make": make, "argv": lambda made: ["evaluate", made / "estimate.txt", made / "truth.txt", *words]}
+
+
+def walk(seed: int = 0, **options: Any) -> Any:
+    """Makes a trajectory file."""
+    return lambda path: bad.walk(path, seed, **options)
+
+
+def write(content: str) -> Any:
+    """Makes a file."""
+    return lambda path: path.write_text(content)
+
+
+def folder_of_run(summary: str, unfinished: bool = False) -> Any:
+    """A run's folder with this summary."""
+
+    def make(folder: Path) -> Path:
+        (folder / "summary.json").write_text(summary)
+        if unfinished:
+            (folder / "unfinished").mkdir()
+        return folder
+
+    return make
+
+
+def backwards(path: Path) -> None:
+    """A trajectory whose last pose comes first."""
+    path.write_text("\n".join(bad.walk(path, 0).read_text().splitlines()[::-1]))
+
+
+def twice(path: Path) -> None:
+    """A trajectory in which each pose stands twice."""
+    path.write_text("\n".join(line for line in bad.walk(path, 0).read_text().splitlines() for _ in range(2)))
+
+
+def from_a_spreadsheet(path: Path) -> None:
+    """A trajectory as other programs write text."""
+    path.write_bytes(b"\xef\xbb\xbf" + bad.walk(path, 0).read_bytes().replace(b" ", b",").replace(b"\n", b"\r\n"))
+
+
+def simulated(*words: str) -> Any:
+    """`vggtgeo simulate` into a new folder."""
+    return lambda made: ["simulate", "room", "-o", made / "new", *words]
+
+
+def benched(*words: str) -> Any:
+    """`vggtgeo bench` into a new folder."""
+    return lambda made: ["bench", "paper", "-o", made / "new", *words]
+
+
+def locked(folder: Path) -> None:
+    """A run into a folder that another run holds."""
+    with taken(folder / "out"), taken(folder / "out"):
+        pass
+
+
+def without_home(folder: Path) -> None:
+    """No home folder, and one that cannot be written: there is no cache, and that is all."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("HOME", "XDG_CACHE_HOME"):
+            patch.delenv(name, raising=False)
+        patch.setattr(os.path, "expanduser", lambda path: path)
+        assert cache_folder() is None
+        (folder / "file").write_text("")
+        patch.setenv("XDG_CACHE_HOME", str(folder / "file"))
+        assert cache_folder() is None
+
+
+RUN = rows(
+    "`vggtgeo run`",
+    [
+        ("no path", nothing, {"argv": line("run")}),
+        ("a path that is not there", nothing, {"argv": line("run", "no/such/clip")}),
+        ("`--stride 0`", good, flags("--stride", "0")),
+        ("`--stride -2`", good, flags("--stride", "-2")),
+        ("`--start -1`", good, flags("--start", "-1")),
+        ("`--end 0`", good, flags("--end", "0")),
+        ("`--end -5`", good, flags("--end", "-5")),
+        ("`--start 2 --end 1`", good, flags("--start", "2", "--end", "1")),
+        ("`--start` behind the last frame", good, flags("--start", "100")),
+        ("three intrinsics", good, flags("--intrinsics", "1,2,3")),
+        ("intrinsics that are words", good, flags("--intrinsics", "a,b,c,d")),
+        ("intrinsics with NaN", good, flags("--intrinsics", "nan,50,32,24")),
+        ("a negative focal length", good, flags("--intrinsics", "-50,50,32,24")),
+        ("a focal length in metres", good, flags("--intrinsics", "0.001,0.001,32,24")),
+        ("a principal point far outside", good, flags("--intrinsics", "55,55,3200,24")),
+        ("`--fps 0`", good, flags("--fps", "0")),
+        ("`--fps nan`", good, flags("--fps", "nan")),
+        ("`--fps` where frames have times", bad.rgbd(lambda folder: None), flags("--fps", "5")),
+        ("`--provider cuda` without a GPU", good, flags("--provider", "cuda")),
+        ("`--provider tpu`", good, flags("--provider", "tpu")),
+        ("a preset that is none", good, flags("--preset", "papers")),
+        ("a preset whose networks are not there", good, flags("--preset", "light", "--models", "no")),
+        ("`--memory-limit-gb 0`", good, flags("--memory-limit-gb", "0")),
+        ("`--features orb --preset paper`", good, flags("--features", "orb", "--preset", "paper")),
+        ("`--set` without a value", good, flags("--set", "nonsense")),
+        ("`--set` of a setting that is none", good, flags("--set", "tracking.least_inlier=3")),
+        ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=many")),
+        ("`--rerun` to a text file", good, flags("--rerun", "run.txt")),
+        ("`--seed -1`", good, flags("--seed", "-1")),
+        ("`--seed` beyond 32 bits", good, flags("--seed", "99999999999")),
+        ("a reader that is none", good, flags("--kind", "photos")),
+        ("the reader of videos on a folder", good, flags("--kind", "video")),
+        ("the reader of folders on a file", bad.file("clip.mp4", b"no"), flags("--kind", "tum")),
+    ],
+)
+SETTINGS = rows(
+    "Settings files",
+    [
+        ("a file that is not there", good, flags("--settings", "no.toml")),
+        ("no TOML", None, settings("stride: 2")),
+        ("not UTF-8", None, settings(b"path = '\xff\xfe'")),
+        ("an unknown key", None, settings("strid = 2")),
+        ("text for a number", None, settings("stride = 'two'")),
+        ("a number out of range", None, settings("stride = 0")),
+        ("an unknown group", None, settings("[trackin]\nleast_inliers = 3")),
+        ("ten thousand brackets", None, settings("a = " + "[" * 10_000)),
+    ],
+)
+OUTPUT = rows(
+    "The output folder",
+    [
+        ("a file", None, output(write(""), "out")),
+        ("a folder of images", None, output(bad.frames, "pictures")),
+        ("a TUM folder", None, output(tiny.tum, "desk")),
+        ("the folder that is read", good, {"argv": lambda made: ["run", made, "-o", made]}),
+        ("a folder that another run writes", nothing, {"call": locked}),
+        ("of `solve`: a folder", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made.parent]}),
+        ("of `solve`: the problem", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made]}),
+        ("of `simulate`: a folder with files", good, {"argv": lambda made: ["simulate", "room", "-o", made]}),
+    ],
+)
+OTHERS = rows(
+    "Other commands",
+    [
+        ("a command that is none", nothing, {"argv": line("solv")}),
+        ("a flag that is none", nothing, {"argv": line("run", "--bad")}),
+        ("`demo --frames 0`", nothing, {"argv": line("demo", "--frames", "0")}),
+        ("`demo --frames many`", nothing, {"argv": line("demo", "--frames", "many")}),
+        ("`demo` of a scene that is none", nothing, {"argv": line("demo", "--scene", "moon")}),
+        ("`simulate --frames 0`", nothing, {"argv": simulated("--frames", "0")}),
+        ("`simulate --size 640`", nothing, {"argv": simulated("--size", "640")}),
+        ("`simulate --size 4x4`", nothing, {"argv": simulated("--size", "4x4")}),
+        ("`simulate --rate 0`", nothing, {"argv": simulated("--rate", "0")}),
+        ("`simulate --blur -1`", nothing, {"argv": simulated("--blur", "-1")}),
+        ("`simulate --speed nan`", nothing, {"argv": simulated("--speed", "nan")}),
+        ("`view` of a folder that is not there", nothing, {"argv": line("view", "no/such/run")}),
+        ("`view` of a folder that is no run's", nothing, {"argv": lambda made: ["view", made]}),
+        ("`view --rerun text.txt`", nothing, {"argv": lambda made: ["view", made, "--rerun", "text.txt"]}),
+        ("`bench` of a plan that is none", nothing, {"argv": benched("--plan", "huge")}),
+        ("`bench` of a scene that is none", nothing, {"argv": benched("--scenes", "moon")}),
+    ],
+)
+TRAJECTORIES = rows(
+    "`vggtgeo evaluate`",
+    [
+        ("a file that is not there", nothing, {"argv": line("evaluate", "no.txt", "no.txt")}),
+        ("`--delta 0`", None, evaluated(walk(), walk(), "--delta", "0")),
+        ("`--max-dt -1`", None, evaluated(walk(), walk(), "--max-dt", "-1")),
+        ("times that never meet", None, evaluated(walk(), walk(start=1e6))),
+        ("few times that meet", None, evaluated(walk(), walk(start=1.5))),
+        ("the truth of another sequence", None, evaluated(walk(0), walk(1))),
+        (
+            "a dataset without truth",
+            good,
+            {"argv": lambda made: ["evaluate", bad.walk(made.parent / "e.txt", 0), made]},
+        ),
+        ("words", None, evaluated(write("a b c d e f g h\n"), walk())),
+        ("seven columns", None, evaluated(write("0 0 0 0 0 0 1\n"), walk())),
+        ("a NaN", None, evaluated(write("0 nan 0 0 0 0 0 1\n"), walk())),
+        ("a quaternion of length zero", None, evaluated(write("0 0 0 0 0 0 0 0\n"), walk())),
+        ("no pose", None, evaluated(write("# nothing\n"), walk())),
+        ("binary data", None, evaluated(lambda path: path.write_bytes(bytes(range(256)) * 9), walk())),
+        ("times out of order", None, evaluated(backwards, walk())),
+        ("each pose twice", None, evaluated(twice, walk())),
+        ("commas, a byte order mark and CR LF", None, evaluated(from_a_spreadsheet, walk())),
+    ],
+)
+NETWORKS = rows(
+    "Network files",
+    [
+        ("a file that is not there", None, network(None)),
+        ("an empty file", None, network(b"")),
+        ("a PyTorch checkpoint", None, network(b"PK\x03\x04" + b"\0" * 99)),
+        ("a pickle", None, network(b"\x80\x02}q\0." + b"\0" * 99)),
+        ("a Git LFS pointer", None, network(b"version https://git-lfs.github.com/spec/v1\n")),
+        ("a web page", None, network(b"<!DOCTYPE html><html></html>")),
+        ("random bytes", None, network(bytes(range(256)) * 20)),
+        ("a network that is none", None, network(b"\x08\x09", "--network", "resnet")),
+        ("`models fetch` of a network that is none", nothing, {"argv": line("models", "fetch", "resnet")}),
+    ],
+    slack=3.0,
+)
+RESULTS = rows(
+    "A run's folder that is read",
+    [
+        ("without a summary", nothing, {}),
+        ("a summary that is no JSON", folder_of_run("{"), {}),
+        ("a summary that is a list", folder_of_run("[1, 2]"), {}),
+        ("a summary that lacks the intrinsics", folder_of_run("{}"), {}),
+        ("ten thousand brackets", folder_of_run("[" * 10_000), {}),
+        ("a run that was killed", folder_of_run("{}", unfinished=True), {}),
+    ],
+    call=Result.load,
+)
+ENVIRONMENT = rows(
+    "Environment",
+    [("no home folder, or one that cannot be written: nothing is cached", nothing, {"call": without_home})],
+)
+COMMANDS: list[Row] = [*RUN, *SETTINGS, *OUTPUT, *OTHERS, *TRAJECTORIES, *NETWORKS, *RESULTS, *ENVIRONMENT]

@@ -1,0 +1,301 @@
+"""Rows of the table of bad inputs: images, depth, text files, videos, point clouds and problem files."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from pathlib import Path
+from typing import Any
+
+import bad_files as bad
+import numpy as np
+import tiny_sequences as tiny
+from bad_row import Row, read_frames, rows, solve_with
+
+from vggtgeo.bundle.problem_file import load_problem
+from vggtgeo.geometry.point_cloud import PointCloud
+
+PICTURE = bad.picture(1)
+WIDE = (PICTURE.astype(np.uint16) << 8) + 128
+HALF_GREY = np.vstack([PICTURE[:16], np.full((32, 64, 3), 128, np.uint8)])
+NUL = b"\0" * 999
+XYZ = "\nproperty float x\nproperty float y\nproperty float z\n"
+WEIGHTS = ("pt_weight", "ln_weight", "d_weight")
+LISTED = (
+    *("edges", "var_kf", "var_uv", "d_init", "d_prior", "d_sigma", "pt_edge", "pt_var", "pt_target", "ln_edge"),
+    *("ln_var", "ln_abc", *WEIGHTS),
+)
+LOADED: dict[str, Any] = {"call": load_problem, "argv": None}
+
+
+def linked_to_itself(folder: Path) -> Path:
+    """Good images and a link to itself."""
+    bad.frames(folder / "frames")
+    (folder / "frames/1.png").unlink()
+    (folder / "frames/1.png").symlink_to("1.png")
+    return folder / "frames"
+
+
+def calibrated(content: str | bytes) -> Any:
+    """Good images with this `calibration.txt`."""
+    return lambda folder: bad.frames(folder / "frames", calibration=content)
+
+
+def matrix(content: str) -> Any:
+    """Good images with this `camera-intrinsics.txt`."""
+
+    def make(folder: Path) -> Path:
+        bad.frames(folder / "frames", calibration=None)
+        (folder / "frames/camera-intrinsics.txt").write_text(content)
+        return folder / "frames"
+
+    return make
+
+
+def truth_folder(folder: Path) -> None:
+    """A folder in the place of the truth."""
+    (folder / "groundtruth.txt").unlink()
+    (folder / "groundtruth.txt").mkdir()
+
+
+def poses(content: str) -> Any:
+    """A 7-Scenes folder with one pose file like this."""
+
+    def make(folder: Path) -> Path:
+        tiny.seven_scenes(folder / "seq-01")
+        (folder / "seq-01/frame-000002.pose.txt").write_text(content)
+        return folder / "seq-01"
+
+    return make
+
+
+def cut_video(folder: Path) -> Path:
+    """Two thirds of a video."""
+    whole = bad.video(folder / "clip.mp4").read_bytes()
+    (folder / "clip.mp4").write_bytes(whole[: len(whole) * 2 // 3])
+    return folder / "clip.mp4"
+
+
+def lines(file: str, text: str) -> Any:
+    """A TUM folder with this list."""
+    return bad.rgbd(bad.write(file, text))
+
+
+def empty(folder: Path) -> Path:
+    """A folder without files."""
+    (folder / "a").mkdir()
+    return folder / "a"
+
+
+def flat(folder: Path) -> Path:
+    """Images that are 3 pixels high."""
+    for row in range(3):
+        tiny.write_image(folder / f"frames/{row}.png", bad.picture(row, 2000, 3))
+    return folder / "frames"
+
+
+def windows_list(folder: Path) -> None:
+    """A list as Windows writes text."""
+    (folder / "rgb.txt").write_bytes(b"\xef\xbb\xbf" + (folder / "rgb.txt").read_bytes().replace(b"\n", b"\r\n"))
+
+
+def cut_problem(folder: Path) -> Path:
+    """The first bytes of a problem file."""
+    return bad.file("problem.npz", bad.problem()(folder).read_bytes()[:900])(folder)
+
+
+IMAGES = rows(
+    "Images",
+    [
+        ("no bytes", bad.with_image(lambda: b"")),
+        ("text", bad.with_image(lambda: b"no picture")),
+        ("half a PNG", bad.with_image(lambda: bad.encoded(".png")[:2000])),
+        ("half a JPEG", bad.with_image(lambda: bad.cut_jpeg()[:-2], ".jpg")),
+        ("half a JPEG with an end mark", bad.with_image(bad.cut_jpeg, ".jpg")),
+        ("half a progressive JPEG with an end mark", bad.with_image(lambda: bad.cut_jpeg(True), ".jpg")),
+        ("a header of 60000 x 60000 pixels", bad.with_image(bad.huge_png)),
+        ("another size than the others", bad.with_image(lambda: bad.encoded(".png", bad.picture(1, 80, 60)))),
+        ("12-bit values in a 16-bit PNG", bad.with_image(lambda: bad.encoded(".png", PICTURE.astype(np.uint16) << 4))),
+        ("16-bit PNG", bad.with_image(lambda: bad.encoded(".png", WIDE))),
+        ("floating-point TIFF", bad.with_image(lambda: bad.encoded(".tiff", PICTURE.astype(np.float32)), ".tiff")),
+        ("a JPEG that asks to be turned (EXIF)", bad.with_image(bad.turned_jpeg, ".jpg")),
+        ("a link to itself", linked_to_itself),
+        ("grey", bad.with_image(lambda: bad.encoded(".png", PICTURE[..., 0]))),
+        ("with transparency", bad.with_image(lambda: bad.encoded(".png", np.dstack([PICTURE, PICTURE[..., 0]])))),
+        ("grey at its end, whole", bad.with_image(lambda: bad.encoded(".jpg", HALF_GREY), ".jpg")),
+        ("all of them damaged", lambda folder: bad.file("a/1.png", "no")(folder).parent),
+        ("an empty folder", empty),
+        ("a folder of other files", lambda folder: bad.file("a/notes.txt", "")(folder).parent),
+        ("a single image", bad.file("a.png", bad.encoded(".png"))),
+        ("an animated GIF", bad.file("a.gif", b"GIF89a" + NUL)),
+    ],
+    call=read_frames,
+)
+SMALL = rows(
+    "Images",
+    [("2000 x 3 pixels", flat)],
+    argv=lambda made: ["run", made, "-o", made.parent / "out", "--intrinsics", "1500,1500,1000,1"],
+)
+DEPTH = rows(
+    "Depth images",
+    [
+        ("8 bits", bad.every_depth(lambda: tiny.image(1)[..., 0])),
+        ("three channels", bad.every_depth(lambda: tiny.image(1))),
+        ("all zero", bad.every_depth(lambda: np.zeros((tiny.HEIGHT, tiny.WIDTH), np.uint16))),
+        ("another size than the images", bad.every_depth(lambda: tiny.depth_codes(0, 20, 15))),
+        ("one that is cut off", bad.rgbd(bad.write("depth/10.104000.png", b"\x89PNG\r\n\x1a\n"))),
+        ("one that is not there", bad.rgbd(lambda folder: (folder / "depth/10.104000.png").unlink())),
+        ("none near in time", lines("depth.txt", "99 depth/10.104000.png\n")),
+    ],
+    call=read_frames,
+)
+LISTS = rows(
+    "Lists and poses",
+    [
+        ("`rgb.txt` without a line", lines("rgb.txt", "# nothing\n")),
+        ("a word for a time", lines("rgb.txt", "now rgb/10.000000.png\n")),
+        ("a NaN for a time", lines("rgb.txt", "nan rgb/10.000000.png\n")),
+        ("a time without a file", lines("rgb.txt", "10.0\n")),
+        ("a file that is not there", lines("rgb.txt", "10.0 rgb/10.000000.png\n10.1 rgb/no.png\n")),
+        ("times out of order", lines("rgb.txt", "10.1 rgb/10.100000.png\n10.0 rgb/10.000000.png\n")),
+        ("a time twice", lines("rgb.txt", "10.0 rgb/10.000000.png\n10.0 rgb/10.100000.png\n")),
+        ("UTF-16", bad.rgbd(bad.write("rgb.txt", "10.0 rgb/10.000000.png\n".encode("utf-16")))),
+        ("a byte order mark and CR LF", bad.rgbd(windows_list)),
+        ("truth with seven columns", lines("groundtruth.txt", "10 0 0 0 0 0 1\n")),
+        ("truth that is a folder", bad.rgbd(truth_folder)),
+        ("a pose file of 7-Scenes with NaN", poses("nan " * 16)),
+        ("a pose file of 7-Scenes with nine numbers", poses("1 " * 9)),
+        ("a pose file of 7-Scenes that is no rotation", poses("2 " * 16)),
+    ],
+    call=read_frames,
+)
+CALIBRATION = rows(
+    "Calibration",
+    [
+        ("words", calibrated("fx fy cx cy")),
+        ("nothing", calibrated("")),
+        ("three numbers", calibrated("55 55 31.5")),
+        ("a NaN", calibrated("55 nan 31.5 23.5")),
+        ("a focal length of 0.001", calibrated("0.001 0.001 31.5 23.5")),
+        ("a focal length of zero", calibrated("0 0 31.5 23.5")),
+        ("distortion 5, 5, 5, 5", calibrated("55 55 31.5 23.5 5 5 5 5")),
+        ("seven numbers", calibrated("55 55 31.5 23.5 0 0 0")),
+        ("of another image size", calibrated("525 525 120 90")),
+        ("binary data", calibrated(bytes(range(256)))),
+        ("commas, a byte order mark and CR LF", calibrated(b"\xef\xbb\xbf55, 55, 31.5, 23.5\r\n")),
+        ("a matrix of eight numbers", matrix("1 " * 8)),
+        ("a matrix that is none of intrinsics", matrix("1 2 3 4 5 6 7 8 9")),
+        ("none", calibrated(None)),
+    ],
+    call=read_frames,
+)
+VIDEOS = rows(
+    "Videos",
+    [
+        ("text", bad.file("clip.mp4", "no video")),
+        ("no bytes", bad.file("clip.mp4", b"")),
+        ("cut off", cut_video),
+        ("no regular file", lambda folder: Path("/dev/null")),
+        ("a sound", bad.file("clip.wav", b"RIFF\x24\0\0\0WAVEfmt " + NUL)),
+    ],
+    call=read_frames,
+)
+CLOUDS = rows(
+    "Point clouds",
+    [
+        ("text", bad.file("map.ply", "no cloud")),
+        ("no vertices", bad.ply("format ascii 1.0\n")),
+        ("no coordinates", bad.ply("format ascii 1.0\nelement vertex 1\nproperty float a\n", b"1\n")),
+        ("fewer points than declared", bad.ply("format ascii 1.0\nelement vertex 3" + XYZ, b"1 2 3\n")),
+        (
+            "a header of 10^15 points",
+            bad.ply("format binary_little_endian 1.0\nelement vertex 1000000000000000" + XYZ, NUL),
+        ),
+        ("a point that is NaN", bad.ply("format ascii 1.0\nelement vertex 1" + XYZ, b"nan 2 3\n")),
+        ("not there", lambda folder: folder / "map.ply"),
+    ],
+    call=PointCloud.load_ply,
+)
+NPY = io.BytesIO()
+np.save(NPY, np.zeros(9))
+HUGE = {"descr": "<f8", "fortran_order": False, "shape": (10**13,)}
+OBJECTS = {"descr": "|O", "fortran_order": False, "shape": (1,)}
+PROBLEMS = rows(
+    "`vggtgeo solve`",
+    [
+        ("not there", lambda folder: folder / "no.npz"),
+        ("no bytes", bad.file("problem.npz", b"")),
+        ("text", bad.file("problem.npz", "no problem")),
+        ("cut off", cut_problem),
+        ("a `.npy` named `.npz`", bad.file("problem.npz", NPY.getvalue())),
+        ("a pickle", bad.file("problem.npz", pickle.dumps({"edges": 1}))),
+        ("an array is missing", bad.problem(pt_weight=None)),
+        ("an array of another shape", bad.problem(T_init=np.zeros((3, 4)))),
+        ("an array of words", bad.problem(d_prior=lambda old: old.astype(str))),
+        ("complex numbers", bad.problem(d_prior=lambda old: old.astype(complex))),
+        ("a header that declares 72.8 TiB", bad.member("d_prior", HUGE)),
+        ("Python objects", bad.member("d_prior", OBJECTS, pickle.dumps([1]))),
+        ("a damaged header", bad.member("d_prior", None, b"\x93NUMPY\x01\0\xff\xff{{{{")),
+        (
+            "300 MB of one array, packed into 0.3 MB",
+            bad.member("d_prior", {**HUGE, "shape": (4 * 10**7,)}, bytes(32 * 10**7)),
+            {"slack": 5.0},
+        ),
+        ("`alpha` that is NaN", bad.problem(alpha=np.nan)),
+        ("`alpha` that is negative", bad.problem(alpha=-1.0)),
+        ("`huber` that is zero", bad.problem(huber=0.0)),
+        ("`huber` that is NaN", bad.problem(huber=np.nan)),
+        ("a negative weight", bad.problem(pt_weight=bad.put(3, -1.0))),
+        ("a weight that is NaN", bad.problem(ln_weight=bad.put(3, np.nan))),
+        ("a weight that is infinite", bad.problem(d_weight=bad.put(3, np.inf))),
+        ("indices that are no whole numbers", bad.problem(pt_edge=lambda old: old + 0.5)),
+        ("an index out of range", bad.problem(pt_var=bad.put(0, 10**6))),
+        ("a negative index", bad.problem(var_kf=bad.put(0, -1))),
+        ("an edge from a keyframe to itself", bad.problem(edges=bad.put(0, (1, 1)))),
+        ("an edge twice", bad.problem(edges=lambda old: np.tile(old[:1], (len(old), 1)))),
+        ("a keyframe that nothing observes", bad.without_keyframe(2)),
+        ("no weight that is positive", bad.problem(**dict.fromkeys(WEIGHTS, np.zeros_like))),
+        (
+            "a landmark that nothing observes",
+            bad.problem(d_weight=np.zeros_like, pt_weight=bad.put(slice(0, 6), 0.0)),
+            LOADED,
+        ),
+        ("no landmark", bad.problem(**dict.fromkeys(LISTED, lambda old: old[:0]))),
+        ("no keyframe", bad.problem(T_init=lambda old: old[:0])),
+        ("a quaternion of length zero", bad.problem(T_init=bad.put((1, slice(0, 4)), 0.0))),
+        ("a pose with NaN", bad.problem(T_init=bad.put((1, 5), np.nan))),
+        ("intrinsics with NaN", bad.problem(k_init=bad.put(0, np.nan))),
+        ("a negative focal length", bad.problem(k_init=bad.put(0, -500.0))),
+        ("a prior's deviation that is zero", bad.problem(k_prior_sigma=bad.put(0, 0.0))),
+        ("a depth that is negative", bad.problem(d_init=bad.put(0, -1.0))),
+        ("a depth that is NaN", bad.problem(d_init=bad.put(0, np.nan))),
+        ("a depth prior that is NaN", bad.problem(d_prior=bad.put(0, np.nan))),
+        ("a depth prior's deviation that is zero", bad.problem(d_sigma=bad.put(0, 0.0))),
+        ("a line whose normal is no unit vector", bad.problem(ln_abc=lambda old: 3 * old)),
+        ("a target that is infinite", bad.problem(pt_target=bad.put((0, 0), np.inf))),
+        ("targets beyond all numbers", bad.problem(pt_target=lambda old: old + 1e200), {"slack": 20.0}),
+        ("unknown arrays beside the known ones, whatever they declare", bad.member("unknown", HUGE), LOADED),
+        (
+            "saved: a class of a stranger",
+            bad.saved(bad.described(lambda old: old["problem"].update({"class": "os:system"}))),
+        ),
+        ("saved: another version", bad.saved(bad.described(lambda old: old.update(version=99)))),
+        ("saved: a description that is no JSON", bad.saved(lambda old: old.update(description=np.array("{")))),
+        ("saved: ten thousand brackets", bad.saved(lambda old: old.update(description=np.array("[" * 10_000)))),
+        ("saved: an array is missing", bad.saved(lambda old: old.pop("problem/terms/points/target"))),
+        ("saved: a weight that is NaN", bad.saved(lambda old: old["problem/terms/points/weight"].fill(np.nan))),
+        ("saved: an edge to a keyframe that is not there", bad.saved(lambda old: old["problem/edges/target"].fill(99))),
+        ("saved: poses with NaN", bad.saved(lambda old: old["state/poses/wxyz_xyz"].fill(np.nan))),
+    ],
+    argv=solve_with(),
+    slack=3.0,
+)
+ARGUMENTS = rows(
+    "`vggtgeo solve`",
+    [
+        ("`--max-steps 0`", bad.problem(), {"argv": solve_with("--max-steps", "0")}),
+        ("`--dtype float16`", bad.problem(), {"argv": solve_with("--dtype", "float16")}),
+        ("`--repeat 0`", bad.problem(), {"argv": solve_with("--repeat", "0")}),
+    ],
+)
+FILES: list[Row] = [*IMAGES, *SMALL, *DEPTH, *LISTS, *CALIBRATION, *VIDEOS, *CLOUDS, *PROBLEMS, *ARGUMENTS]

@@ -1,0 +1,102 @@
+"""The table of bad inputs: what a user may give, and what the user sees.
+
+Each row makes its input and gives it to the command line, or to the reader that the command line calls. Oracle: the
+sentence that `docs/bad-inputs.md` has for the row: that page is the table, and the rows here make what it speaks of.
+
+What is an error ends with code 2 and one line, with the name of what is wrong, within a second and 500 MB. What is a
+warning is told and the rest goes on. What is used is used without a word, because nothing is lost.
+"""
+
+from __future__ import annotations
+
+import re
+import resource
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+from bad_input_rows import ROWS, Row
+from conftest import ROOT
+from typer.testing import CliRunner
+
+from vggtgeo.cli.main import make_app
+from vggtgeo.io.errors import InputError, InputWarning
+
+PAGE = (ROOT / "docs" / "bad-inputs.md").read_text(encoding="utf-8")
+SECONDS = 1.0
+MEGABYTES = 500
+
+
+@pytest.fixture(autouse=True)
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames without parallax start no window, so nothing need be compiled."""
+    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
+    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
+    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
+
+
+def seen(row: Row, folder: Path) -> tuple[str, list[str]]:
+    """How the row ends ("error", or "used" where nothing is refused), and what is said."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            if row.argv is None:
+                row.call(row.make(folder))
+                end, said = "used", []
+            else:
+                given = row.argv(row.make(folder))
+                done = CliRunner().invoke(make_app(), list(map(str, given)))
+                assert done.exit_code in (0, 2, 3), done.output
+                end = "error" if done.exit_code == 2 else "used"
+                said = [line.removeprefix("error: ") for line in done.stderr.splitlines() if line.startswith("error: ")]
+                assert end == "used" or len(done.stderr.splitlines()) - len(said) <= 0, done.stderr
+        except InputError as error:
+            end, said = "error", [str(error)]
+    told = [str(entry.message) for entry in caught if issubclass(entry.category, InputWarning)]
+    return end, said + told
+
+
+def page_rows() -> dict[tuple[str, str], tuple[str, str]]:
+    """How each row of the page ends and what is seen, by its group and what is given."""
+    found = {}
+    for part in PAGE.split("\n## ")[1:]:
+        group, *lines = part.splitlines()
+        for line in lines:
+            cells = [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+            if len(cells) == 3 and cells[1] in ("error", "warning", "used"):
+                found[group, cells[0]] = cells[1], cells[2]
+    return found
+
+
+TABLE = page_rows()
+
+
+def pattern(sentence: str) -> str:
+    """`...` in the table stands for anything."""
+    return ".*".join(re.escape(part) for part in sentence.split("..."))
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.group}: {row.given}".replace(" ", "-"))
+def test_what_the_user_sees(row: Row, tmp_path: Path) -> None:
+    """The page's sentence for the row, and the way it ends."""
+    ends, sees = TABLE[row.group, row.given]
+    before, memory = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    end, said = seen(row, tmp_path)
+    seconds, grown = time.process_time() - before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
+    assert end == ("error" if ends == "error" else "used"), said
+    if ends == "used":
+        assert said == []
+    else:
+        assert any(re.search(pattern(sees), " ".join(line.split())) for line in said), said
+    assert grown < MEGABYTES * 2**10
+    if ends == "error":
+        assert seconds < SECONDS * row.slack, f"{seconds:.2f} s"
+
+
+def test_the_page_has_every_row_and_no_other() -> None:
+    """Page and rows are of the same inputs, at least 120 of them, each told in a sentence of its own."""
+    assert [(row.group, row.given) for row in ROWS if (row.group, row.given) not in TABLE] == []
+    assert set(TABLE) == {(row.group, row.given) for row in ROWS}
+    assert len(ROWS) == len(TABLE) >= 120
+    assert [given for given, (ends, sees) in TABLE.items() if (ends == "used") != (not sees)] == []

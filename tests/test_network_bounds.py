@@ -1,0 +1,161 @@
+"""What a network may answer: anything out of bounds is left out, counted, and told in the verdict."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_networks as tiny
+from recorded_run import SETTINGS
+from vggtgeo.models.onnx.bounds import (
+    AVERAGE,
+    FARTHEST,
+    NEAREST,
+    BoundedConfidence,
+    BoundedDepth,
+    BoundedLines,
+    BoundedPoints,
+    BoundedWindow,
+    Refusals,
+)
+from vggtgeo.models.onnx.contracts import MOGE2
+from vggtgeo.models.onnx.letr import LetrDetector
+from vggtgeo.models.onnx.moge2 import MogeDepth
+from vggtgeo.models.onnx.session import NetworkValueError, open_session
+from vggtgeo.models.onnx.vggt import decode_cameras
+from vggtgeo.models.roles import DepthEstimate, Segments
+
+import vggtgeo as vg
+from vggtgeo.slam.trust.input import check_refusals
+
+SIZE = (48, 64)
+IMAGE = np.random.default_rng(0).integers(0, 255, (*SIZE, 3)).astype(np.uint8)
+
+
+def moge(path: Path, scale: float, mask: float = 1.0, size: tuple[int, int] = SIZE) -> Path:
+    """A file of MoGe-2 that answers a wall at 2 m times `scale`, valid with probability `mask`."""
+    y, x = np.mgrid[: size[0], : size[1]] - np.array(size)[:, None, None] / 2
+    points = np.stack([x / 30, y / 30, np.full(size, 2.0)], axis=-1)[None]
+    outputs = {"points": points, "mask": np.full((1, *size), mask), "metric_scale": np.full(1, scale)}
+    return tiny.constant(path, "moge2", {"image": (1, 3, *size)}, outputs, "test")
+
+
+@pytest.mark.parametrize(
+    ("scale", "mask", "left"),
+    [
+        (1.0, 1.0, True),
+        (1e30, 1.0, False),
+        (-1.0, 1.0, False),
+        (0.0, 1.0, False),
+        (1.0, 0.0, False),
+        (1e-4, 1.0, False),
+    ],
+    ids=["right", "1e30", "negative", "zero", "masked", "of a doll's house"],
+)
+def test_depth_that_cannot_be_is_left_out_and_counted(tmp_path: Path, scale: float, mask: float, left: bool) -> None:
+    """A real ONNX file whose depth is right, or 1e30, negative, zero, masked or a tenth of a millimetre: only the right
+    one gives depth, and the others make the verdict worse. Oracle: the values in the file.
+    """
+    role = BoundedDepth(MogeDepth(open_session(moge(tmp_path / "m.onnx", scale, mask), MOGE2)))
+    found = role.estimate(IMAGE, None, (30.0, 30.0, 31.5, 23.5))
+    assert np.isfinite(found.depth).any() == left
+    assert (found.confidence[~np.isfinite(found.depth)] == 0).all()
+    findings = check_refusals({"depth": role.refusals})
+    assert [finding.level for finding in findings] == ([] if left else ["degraded"])
+    if left:
+        np.testing.assert_allclose(found.depth, np.float32(2.0), rtol=0.1)
+    else:
+        assert "depth answered 1 of 1 times with nothing that can be" in findings[0].text
+
+
+def test_values_that_are_not_finite_cost_the_answer_only() -> None:
+    """Each role goes on without the answer, and one is counted; oracle: roles that raise as a session does."""
+
+    class Broken:
+        def __getattr__(self, name: str):
+            def fail(*_: object) -> None:
+                raise NetworkValueError("not finite")
+
+            return fail
+
+    depth, lines, confidence = BoundedDepth(Broken()), BoundedLines(Broken()), BoundedConfidence(Broken())
+    points, window = BoundedPoints(Broken()), BoundedWindow(Broken())
+    assert not np.isfinite(depth.estimate(IMAGE).depth).any()
+    assert len(lines.detect(IMAGE)) == 0
+    assert (confidence.confidence(IMAGE) == AVERAGE).all()
+    assert len(points.match(None, None)) == 0
+    guess = window.window([IMAGE, IMAGE])
+    assert not guess.found.any()
+    assert not np.isfinite(guess.depth).any()
+    for role in (depth, lines, confidence, points, window):
+        assert (role.refusals.asked, role.refusals.without, role.refusals.share) == (1, 1, 1.0)
+        assert len(check_refusals({"role": role.refusals})) == 1
+
+
+def test_what_is_in_bounds_passes_untouched_and_the_rest_is_counted() -> None:
+    """Depth, confidence and segments, half of them out of bounds, keep the other half as it was; oracle: the halves."""
+
+    class Half:
+        def estimate(self, *_: object) -> DepthEstimate:
+            depth = np.full(SIZE, 2.0, np.float32)
+            depth[:8], depth[8:16], depth[16:24] = 2 * FARTHEST, NEAREST / 2, -1.0
+            return DepthEstimate(depth, np.ones(SIZE, np.float32), np.full(SIZE, 0.05, np.float32))
+
+        def confidence(self, *_: object) -> np.ndarray:
+            omega = np.full(SIZE, 0.25, np.float32)
+            omega[:12], omega[12:24] = 7.0, np.nan
+            return omega
+
+        def detect(self, *_: object) -> Segments:
+            ends = np.array([[[1, 2], [30, 40]], [[1, 2], [1e9, 40]], [[5, 5], [5, 5]], [[3, 3], [9, 3]]], float)
+            return Segments(ends, np.ones(4))
+
+    depth, confidence, lines = BoundedDepth(Half()), BoundedConfidence(Half()), BoundedLines(Half())
+    found = depth.estimate(IMAGE)
+    assert (np.isfinite(found.depth) == (np.arange(SIZE[0]) >= 24)[:, None]).all()
+    assert (found.depth[24:] == 2.0).all()
+    omega = confidence.confidence(IMAGE)
+    assert (omega[:24] == AVERAGE).all()
+    assert (omega[24:] == 0.25).all()
+    assert lines.detect(IMAGE).endpoints[:, 1].tolist() == [[30.0, 40.0], [9.0, 3.0]]
+    for role in (depth, confidence, lines):
+        assert role.refusals.share == 0.5
+        assert role.refusals.without == 0
+    assert check_refusals({"depth": Refusals(asked=100, without=9, values=100, refused=9)}) == ()
+
+
+def test_cameras_and_segments_that_are_nowhere(tmp_path: Path) -> None:
+    """A camera 1e9 units away is not found, and a segment many images away is none; oracle: the file's numbers."""
+    encoding = np.zeros((3, 9))
+    encoding[:, 6:] = 1.0, 0.8, 1.1
+    encoding[1, 0], encoding[2, 1] = 1e9, np.inf
+    assert decode_cameras(encoding, SIZE)[2].tolist() == [True, False, False]
+    from vggtgeo.models.onnx.contracts import LETR
+
+    far = tiny.letr(tmp_path / "letr.onnx", SIZE, lines=[(0.1, 0.2, 0.8, 0.3), (-1e30, 0.5, 1e30, 0.5)])
+    assert len(LetrDetector(open_session(far, LETR)).detect(IMAGE)) == 1
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e30], ids=["right", "1e30"])
+def test_a_run_tells_what_was_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scale: float) -> None:
+    """Networks behind a whole run: with depth of 1e30 m nothing is metric, no coordinate is beyond a room, and the
+    verdict names the network. Oracle: the same run with right depth.
+    """
+    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
+    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
+    size = (120, 160)
+    tiny.dinov3(tmp_path / "dinov3-small.onnx", (112, 160))
+    tiny.mlsd(tmp_path / "mlsd.onnx")
+    moge(tmp_path / "moge2-small.onnx", scale, size=size)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", vg.io.errors.InputWarning)
+        perceived = vg.perception("light", vg.Roles(), tmp_path)
+        result = vg.reconstruct(vg.simulate("room", 2, 0, size[::-1]), perceived, SETTINGS)
+    counts = result.summary["refused"]["depth"]
+    assert counts["asked"] > 0
+    named = [reason for reason in result.verdict.reasons if "the network of depth answered" in reason]
+    assert bool(named) == (scale == 1e30) == (counts["without"] == counts["asked"])
+    assert result.verdict.level != "good"
+    assert np.abs(result.cloud.points).max(initial=0.0) < FARTHEST

@@ -1,0 +1,331 @@
+"""The folder of a run: one run's files or another's, whatever signal comes and whenever it does."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_sequences as tiny
+from typer.testing import CliRunner
+
+from vggtgeo.cli.main import make_app
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.files import write_text
+from vggtgeo.io.interruption import end_on_signals, interruption
+from vggtgeo.io.locks import LockedError, locked
+from vggtgeo.results import Result
+from vggtgeo.results.run_folder import RESERVE, check_finished, taken
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of another kind")
+FRAMES = 6
+
+
+@pytest.fixture(autouse=True)
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames without parallax start no window, so nothing need be compiled."""
+    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
+    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
+    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """The signals as the program's entry has them."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts jobs in the background without it
+    end_on_signals()
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    """A folder of images of one place."""
+    pixels = np.random.default_rng(1).integers(0, 255, (12, 16, 3)).astype(np.uint8).repeat(10, 0).repeat(10, 1)
+    for row in range(FRAMES):
+        tiny.write_image(tmp_path / f"frames/{row}.png", pixels)
+    tiny.write_calibration(tmp_path / "frames", (150.0, 150.0, 79.5, 59.5))
+    return tmp_path / "frames"
+
+
+def old_run(folder: Path) -> dict[str, bytes]:
+    """What an earlier run left in `folder`."""
+    (folder / "depth").mkdir(parents=True)
+    for name in ("trajectory.txt", "keyframes.txt", "map.ply", "report.html", "depth/000000.depth.png", "run.rrd"):
+        (folder / name).write_text("of the run before")
+    (folder / "summary.json").write_text('{"frames": 4711}')
+    (folder / "settings.toml").write_text('rerun = "run.rrd"\n')
+    (folder / "notes.txt").write_text("the user's own")
+    return contents(folder)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def call(frames: Path, out: Path, *more: str):
+    return CliRunner().invoke(make_app(), ["run", str(frames), "-o", str(out), *more])
+
+
+def check_one_run(out: Path, frames: int) -> None:
+    """All files are of one run of so many frames, and nothing of an earlier one is among them."""
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["frames"] == frames
+    assert ("interrupted" in (out / "report.html").read_text()) == summary["interrupted"] == (frames < FRAMES)
+    for file in out.rglob("*"):
+        if file.is_file() and file.name != "notes.txt":
+            assert file.read_bytes() != b"of the run before", file
+    assert sorted(path.name for path in out.iterdir() if path.name not in ("notes.txt", "trajectory.png")) == [
+        "keyframes.txt",
+        "map.ply",
+        "report.html",
+        "settings.toml",
+        "summary.json",
+        "trajectory.txt",
+    ]
+
+
+def test_a_new_run_replaces_the_old_one_as_a_whole(frames: Path, tmp_path: Path) -> None:
+    """Depth images and recording of the run before are gone, the user's own file is not; oracle: the folder."""
+    out = tmp_path / "out"
+    old_run(out)
+    assert call(frames, out).exit_code == 3
+    check_one_run(out, FRAMES)
+    assert (out / "notes.txt").read_text() == "the user's own"
+
+
+STAGES = (
+    "vggtgeo.results.reconstruction.finish",
+    "vggtgeo.results.reconstruction.map_points",
+    "vggtgeo.results.reconstruction.judge",
+    "vggtgeo.results.result.write_settings",
+    "vggtgeo.results.result.write_json",
+    "vggtgeo.results.result.write_page",
+    "vggtgeo.results.run_folder._old_recording",
+    "vggtgeo.results.run_folder.os.replace",
+)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.rpartition(".")[2])
+def test_a_signal_at_any_stage_leaves_one_run(
+    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str, number: signal.Signals
+) -> None:
+    """SIGTERM and SIGINT, in the last adjustment, while the map is made or between two files of the result: the folder
+    holds the new run as a whole, labelled as its summary says; oracle: every file of it.
+    """
+    out = tmp_path / "out"
+    old_run(out)
+    module, _, name = stage.rpartition(".")
+    owner = os if module.endswith(".os") else sys.modules[module]
+    real, sent = getattr(owner, name), []
+
+    def signalled(*arguments: object, **options: object) -> object:
+        if not sent and (name != "replace" or Path(str(arguments[1])).parent == out):
+            sent.append(number)
+            os.kill(os.getpid(), number)
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, signalled)
+    done = call(frames, out)
+    assert sent
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["interrupted"] == (name == "finish")
+    assert done.exit_code == (130 if name == "finish" else 3), done.output
+    assert ("interrupted" in (out / "report.html").read_text()) == summary["interrupted"]
+    assert b"of the run before" not in {value for key, value in contents(out).items() if key != "notes.txt"}
+    assert not (out / "unfinished").exists()
+    assert not (out / ".lock").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP], ids=lambda number: number.name)
+def test_a_signal_between_frames_keeps_what_is_done(
+    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    """The frame at hand is finished, the rest left out, code 130, all files say so; oracle: the count of frames."""
+    from vggtgeo.slam import run as fold
+
+    out, real, count = tmp_path / "out", fold.step, []
+
+    def step(*arguments: object) -> object:
+        count.append(1)
+        if len(count) == 3:
+            os.kill(os.getpid(), number)
+        return real(*arguments)
+
+    monkeypatch.setattr("vggtgeo.slam.run.step", step)
+    old_run(out)
+    done = call(frames, out)
+    assert done.exit_code == 130, done.output
+    check_one_run(out, 3)
+
+
+def test_a_second_signal_ends_at_once_and_the_old_run_stays(
+    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who presses Ctrl-C twice gets out, and the folder is as it was, with the poses beside; oracle: the old files."""
+
+    def stuck(*_: object, **__: object) -> None:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    out = tmp_path / "out"
+    before = old_run(out)
+    monkeypatch.setattr("vggtgeo.results.result.write_page", stuck)
+    assert call(frames, out).exit_code == 130
+    after = contents(out)
+    assert {name: after[name] for name in before} == before
+    assert "unfinished/trajectory.txt" in after
+    assert not (out / ".lock").exists()
+    with pytest.warns(InputWarning, match="goes on or was killed"), pytest.raises(InputError):
+        Result.load(out)
+
+
+def test_two_runs_into_one_folder(frames: Path, tmp_path: Path) -> None:
+    """The second is refused with a sentence, also by another name of the folder, and touches nothing; once the first is
+    over, it may. Oracle: the files before and after.
+    """
+    out = tmp_path / "out"
+    before = old_run(out)
+    (tmp_path / "link").symlink_to(out)
+    with taken(out):
+        for name in ("out", "link"):
+            done = call(frames, tmp_path / name)
+            assert done.exit_code == 2
+            assert "is in use by another run (process" in done.stderr
+    assert contents(out) == before
+    assert call(frames, out).exit_code == 3
+
+
+def test_the_lock_of_a_killed_run_is_given_back(tmp_path: Path) -> None:
+    """A process that is killed while it holds the folder leaves its lock file, and the next run takes the folder;
+    oracle: SIGKILL of a real process.
+    """
+    out = tmp_path / "out"
+    code = f"""
+from vggtgeo.results.run_folder import taken
+with taken({str(out)!r}) as run:
+    (run.stage / "trajectory.txt").write_text("half")
+    print("taken", flush=True)
+    input()
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"taken\n"
+        with pytest.raises(InputError, match=f"process {other.pid}"), taken(out):
+            pass
+        other.kill()
+    assert "is in" in check_finished(out)
+    with taken(out) as run:
+        assert [path.name for path in run.stage.iterdir()] == ["README.txt"]
+    assert not out.exists() or contents(out) == {}
+
+
+@pytest.mark.parametrize("inside", ["", "run"])
+def test_nothing_is_left_where_nothing_was_done(tmp_path: Path, inside: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that is refused leaves no folder and none above it; oracle: the folder that was there."""
+    tiny.images(tmp_path / "frames")
+    out = tmp_path / "a" / "b" / inside
+    monkeypatch.setattr("vggtgeo.slam.run.step", lambda *_: (_ for _ in ()).throw(InputError("nothing works")))
+    assert call(tmp_path / "frames", out).exit_code == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames"]
+
+
+@pytest.mark.parametrize("where", ["itself", "another", "tum"])
+def test_images_are_never_mixed_with_results(tmp_path: Path, where: str) -> None:
+    """A folder of images is refused as output, that of the run or any other, before anything is written; oracle: its
+    files.
+    """
+    tiny.images(tmp_path / "itself")
+    tiny.images(tmp_path / "another")
+    tiny.tum(tmp_path / "tum")
+    before = contents(tmp_path)
+    done = call(tmp_path / "itself", tmp_path / where)
+    assert done.exit_code == 2
+    assert "give another folder for the results" in done.stderr
+    assert contents(tmp_path) == before
+
+
+def test_an_output_that_cannot_be_written_is_found_before_the_first_frame(
+    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file, a name below a file, and a disk with too little room are refused with the name before any frame is read;
+    oracle: no frame is tracked.
+    """
+    monkeypatch.setattr("vggtgeo.slam.run.step", lambda *_: pytest.fail("a frame was tracked"))
+    (tmp_path / "file").write_text("")
+    for name in ("file", "file/run"):
+        done = call(frames, tmp_path / name)
+        assert done.exit_code == 2
+        assert f"{tmp_path / 'file'}" in done.stderr
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.posix_fallocate", full)
+    done = call(frames, tmp_path / "out")
+    assert done.exit_code == 2
+    assert (
+        f"`{tmp_path / 'out'}` cannot be written: No space left on device; a run needs {RESERVE >> 20} MB"
+        in done.stderr
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_disk_that_fills_up_names_the_file_and_keeps_old_and_poses(
+    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the disk is full at the end, the error names the file, the old run stays whole, and the poses are there;
+    oracle: the files.
+    """
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    out = tmp_path / "out"
+    before = old_run(out)
+    monkeypatch.setattr("vggtgeo.io.files.json.dumps", full)
+    done = call(frames, out)
+    assert done.exit_code == 2, done.output
+    after = contents(out)
+    assert {name: after[name] for name in before} == before
+    assert len(after["unfinished/trajectory.txt"].splitlines()) == 2
+    monkeypatch.setattr("vggtgeo.io.files.os.fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device.*map.ply"):
+        write_text(tmp_path / "map.ply", "points")
+
+
+def test_signals_are_noted_once_and_then_raise() -> None:
+    """Inside, the first is noted and the second raises; `at_once` raises at the first; handlers are as before at the
+    end. Oracle: signals sent to this process.
+    """
+    send = lambda: os.kill(os.getpid(), signal.SIGINT)
+    before = signal.getsignal(signal.SIGINT)
+    with interruption() as stop:
+        send()
+        assert stop.asked
+        with interruption() as inner:
+            assert inner is stop
+        with pytest.raises(KeyboardInterrupt):
+            send()
+    with interruption() as stop, pytest.raises(KeyboardInterrupt), stop.at_once():
+        send()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_lock_says_who_holds_it(tmp_path: Path) -> None:
+    """The second to come reads the first one's process; afterwards the file is gone. Oracle: this process's number."""
+    with (
+        locked(tmp_path / "lock"),
+        pytest.raises(LockedError, match=f"process {os.getpid()}"),
+        locked(tmp_path / "lock"),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,128 @@
+"""What is wrong with the bytes of an image file, where its decoder would hand back something without a word.
+
+A JPEG whose data end too early is filled up with mid grey by the decoder (libjpeg sets the coefficients of missing
+blocks to zero), whether its end mark is there or not. A header may declare any size, and the decoder takes memory for
+it before it looks at the data.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+MOST_PIXELS = 100_000_000
+"""Pixels of an image that are decoded: 0.3 GB."""
+_BLOCK = 8
+_MID_GREY = 128
+_LONGEST_PERIOD = 64
+_TAIL = 192
+_ORIENTATION = 0x0112
+
+
+def defect(content: bytes) -> str:
+    """What is wrong with a file before it is decoded, as the end of a sentence; empty for nothing."""
+    if not content:
+        return "is empty"
+    if content.startswith(b"\x89PNG") and content.rfind(b"IEND") < 0:
+        return "is cut off: the PNG has no end"
+    if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9") < _start_of_scan(content):
+        return "is cut off: the JPEG has no end"
+    if _lacks_scans(content):
+        return "is cut off: scans of the progressive JPEG are missing"
+    width, height = declared_size(content)
+    if width * height > MOST_PIXELS:
+        return f"declares {width} x {height} pixels, more than {MOST_PIXELS // 10**6} million: not decoded"
+    return ""
+
+
+def ends_in_grey(content: bytes, image: np.ndarray) -> bool:
+    """Whether a JPEG's data end too early although it has an end mark; image: as decoded, uint8 [H, W, ...].
+
+    Its last block is mid grey then, and the last bytes are those of a picture. Where a picture is grey there, the data
+    of many equal blocks repeat every few bytes.
+    """
+    if not content.startswith(b"\xff\xd8") or not (image[-_BLOCK:, -_BLOCK:] == _MID_GREY).all():
+        return False
+    end = content.rfind(b"\xff\xd9")
+    tail = np.frombuffer(content[max(end - _TAIL, 0) : end], np.uint8)[:-2]  # the last byte is padded
+    return not any(np.array_equal(tail[period:], tail[:-period]) for period in range(1, _LONGEST_PERIOD))
+
+
+def orientation(content: bytes) -> int:
+    """The EXIF orientation of a JPEG, 1 to 8; 1, as it is stored, where it has none."""
+    for marker, part in _segments(content):
+        if marker == 0xE1 and part.startswith(b"Exif\0\0"):
+            return _tag_of(part[6:])
+    return 1
+
+
+def declared_size(content: bytes) -> tuple[int, int]:
+    """Width and height that a PNG or a JPEG declares; (0, 0) for others."""
+    if content.startswith(b"\x89PNG") and len(content) >= 24:
+        width, height = struct.unpack(">II", content[16:24])
+        return width, height
+    for marker, part in _segments(content):
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(part) >= 5:
+            height, width = struct.unpack(">HH", part[1:5])
+            return width, height
+    return 0, 0
+
+
+def _segments(content: bytes) -> list[tuple[int, bytes]]:
+    """Marker and content of each segment of a JPEG before its image data."""
+    found, position = [], 2
+    while content.startswith(b"\xff\xd8") and position + 4 <= len(content) and content[position] == 0xFF:
+        marker, length = content[position + 1], int.from_bytes(content[position + 2 : position + 4])
+        if marker == 0xDA:
+            break
+        found.append((marker, content[position + 4 : position + 2 + length]))
+        position += 2 + length
+    return found
+
+
+def _lacks_scans(content: bytes) -> bool:
+    """Whether a progressive JPEG ends before each component has its DC and all 63 AC coefficients to the last bit."""
+    frame = next((part for marker, part in _segments(content) if marker == 0xC2), None)
+    if frame is None or len(frame) < 6:
+        return False
+    missing = {component: set(range(64)) for component in frame[6 : 6 + 3 * frame[5] : 3]}
+    position = content.find(b"\xff\xda")
+    while position >= 0 and position + 5 < len(content):  # in the data of a scan, ff is followed by 00
+        count = content[position + 4]
+        after = position + 5 + 2 * count
+        if after + 3 > len(content):
+            break
+        first, last, bits = content[after : after + 3]
+        if bits & 15 == 0:
+            for component in content[position + 5 : after : 2]:
+                missing.get(component, set()).difference_update(range(first, last + 1))
+        position = content.find(b"\xff\xda", after)
+    return any(missing.values())
+
+
+def _start_of_scan(content: bytes) -> int:
+    """Where a JPEG's image data begin; its length where there are none. Thumbnails before it have ends of their own."""
+    position = 2
+    while position + 4 <= len(content) and content[position] == 0xFF:
+        if content[position + 1] == 0xDA:
+            return position
+        position += 2 + int.from_bytes(content[position + 2 : position + 4])
+    return len(content)
+
+
+def _tag_of(tiff: bytes) -> int:
+    """The orientation in the first directory of EXIF data."""
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    try:
+        if order is None:
+            return 1
+        (offset,) = struct.unpack_from(f"{order}I", tiff, 4)
+        (count,) = struct.unpack_from(f"{order}H", tiff, offset)
+        for row in range(count):
+            tag, _, _, value = struct.unpack_from(f"{order}HHIH", tiff, offset + 2 + 12 * row)
+            if tag == _ORIENTATION:
+                return value if 1 <= value <= 8 else 1
+    except struct.error:
+        pass
+    return 1

@@ -1,0 +1,201 @@
+"""The folder of a run: taken before the first frame, filled in one go at the end, never a mixture of two runs.
+
+While a run goes on, everything that it writes goes to `FOLDER/unfinished/`, and what an earlier run left stays whole.
+`publish` then takes the old files away, the summary first, and moves the new ones in, the summary last. These are
+renames within one file system; signals wait until they are done. Should the process be killed between two of them, the
+folder holds files of one run only, without a summary, and `unfinished/` says so.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_text
+from vggtgeo.io.interruption import interruption
+from vggtgeo.io.locks import LockedError, locked
+
+UNFINISHED = "unfinished"
+"""Folder, inside that of the run, of what a run has written before it is done."""
+SUMMARY = "summary.json"
+NAMES = (
+    SUMMARY,
+    "settings.toml",
+    "trajectory.txt",
+    "keyframes.txt",
+    "map.ply",
+    "trajectory.png",
+    "report.html",
+    "depth",
+    "run.rrd",
+    "view.rrd",
+)
+"""All that a run may leave, in the order in which what is old is taken away."""
+RESERVE = 32 * 2**20
+"""Bytes that must be free before the first frame, and are held until the results are written: a map of 300,000 points,
+page and trajectories of 10,000 frames take less than 20 MB."""
+
+_LOCK = ".lock"
+_NOTE = "README.txt"
+_RESERVED = ".reserve"
+_MARKS = ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "camera-intrinsics.txt")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A folder that is taken: `stage` is where to write, `publish` makes it the folder's content."""
+
+    folder: Path
+
+    @property
+    def stage(self) -> Path:
+        """Where the files of the run go before they are all there."""
+        return self.folder / UNFINISHED
+
+    def release_reserve(self) -> None:
+        """Gives back the space that was held for the results: now they are written."""
+        (self.stage / _RESERVED).unlink(missing_ok=True)
+
+    def publish(self) -> None:
+        """Replaces what an earlier run left by what is in `stage`; a signal waits until it is done."""
+        with interruption():
+            self.release_reserve()
+            (self.stage / _NOTE).unlink(missing_ok=True)
+            new = sorted(self.stage.iterdir(), key=lambda path: path.name == SUMMARY)
+            strange = [path.name for path in new if path.name not in NAMES and path.suffix != ".rrd"]
+            if strange:
+                raise ValueError(
+                    f"`NAMES` lacks {strange}: what a run leaves must be known, to be replaced by the next"
+                )
+            for name in dict.fromkeys((*NAMES, *_old_recording(self.folder))):
+                _remove(self.folder / name)
+            for path in new:
+                os.replace(path, self.folder / path.name)
+
+
+@contextmanager
+def taken(folder: str | os.PathLike[str], source: Path | None = None, reserve: int = 0) -> Iterator[RunFolder]:
+    """Takes a folder for one run; what is in it stays as it is until `publish`.
+
+    Without `publish` nothing is left: neither `unfinished/` nor a folder that was made for it, unless there are poses
+    in `unfinished/` (the disk was full when the results were written, say).
+
+    Args:
+        folder: made where it does not exist.
+        source: file or folder that the run reads.
+        reserve: bytes to hold for the results.
+
+    Raises:
+        InputError: it cannot be written, another run writes into it, or it holds a sequence of images.
+
+    """
+    place = Path(folder)
+    _refuse_input(place, source)
+    made = _missing(place)
+    try:
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            holding = locked(place / _LOCK)
+            holding.__enter__()
+        except LockedError as error:
+            raise InputError(f"`{place}` is in use by another run ({error}); give another folder with `-o`") from None
+        except OSError as error:
+            raise _not_written(place, error) from None
+        try:
+            yield _begun(RunFolder(place), reserve)
+        finally:
+            _end(place / UNFINISHED)
+            holding.__exit__(None, None, None)
+    finally:
+        for path in made:
+            _remove_if_empty(path)
+
+
+def check_finished(folder: Path) -> str | None:
+    """A sentence if a run into `folder` has not ended, or was killed; None for any other folder."""
+    stage = folder / UNFINISHED
+    if not stage.is_dir():
+        return None
+    return f"a run into `{folder}` goes on or was killed: what it has so far is in `{stage}`" + (
+        ", and the files beside that are of the run before" if (folder / SUMMARY).is_file() else ""
+    )
+
+
+def _begun(run: RunFolder, reserve: int) -> RunFolder:
+    """An empty stage that can be written, with a note for whoever finds it."""
+    try:
+        _remove(run.stage)
+        run.stage.mkdir()
+        write_text(
+            run.stage / _NOTE,
+            "A run that goes on, or that was killed. The files in the folder above, if any, are of the run before.\n",
+        )
+        if reserve and hasattr(os, "posix_fallocate"):
+            with (run.stage / _RESERVED).open("wb") as file:
+                os.posix_fallocate(file.fileno(), 0, reserve)
+    except OSError as error:
+        _remove(run.stage)
+        raise _not_written(run.folder, error, reserve) from None
+    return run
+
+
+def _end(stage: Path) -> None:
+    """Takes `stage` away, unless poses that were not published are in it."""
+    if (stage / "trajectory.txt").is_file():
+        (stage / _RESERVED).unlink(missing_ok=True)
+    else:
+        _remove(stage)
+
+
+def _refuse_input(place: Path, source: Path | None) -> None:
+    if place.exists() and not place.is_dir():
+        raise InputError(f"`{place}` is a file; the results need a folder: give another name with `-o`")
+    if source is not None and place.exists() and source.is_dir() and place.samefile(source):
+        raise InputError(f"`{place}` is the folder that is read; give another folder for the results with `-o`")
+    if not place.is_dir() or (place / SUMMARY).is_file():
+        return
+    for path in place.iterdir():
+        if path.name in _MARKS or (path.suffix.lower() in IMAGE_SUFFIXES and path.name not in NAMES):
+            raise InputError(
+                f"`{place}` holds images or a sequence (`{path.name}`); give another folder for the results with `-o`"
+            )
+
+
+def _not_written(place: Path, error: OSError, reserve: int = 0) -> InputError:
+    room = f"; a run needs {reserve // 2**20} MB" if reserve else ""
+    return InputError(f"`{place}` cannot be written: {error.strerror or error}{room}: give another folder with `-o`")
+
+
+def _old_recording(folder: Path) -> list[str]:
+    """The recording that an earlier run into `folder` made there, by its settings."""
+    try:
+        target = tomllib.loads((folder / "settings.toml").read_text(encoding="utf-8")).get("rerun")
+    except (OSError, ValueError):
+        return []
+    path = Path(str(target))
+    inside = path.suffix == ".rrd" and path.parent.resolve() == folder.resolve()
+    return [path.name] if inside else []
+
+
+def _missing(place: Path) -> list[Path]:
+    """The folders that making `place` would make, the deepest first."""
+    return [path for path in (place, *place.parents) if not path.exists()]
+
+
+def _remove_if_empty(path: Path) -> None:
+    if path.is_dir() and not any(path.iterdir()):
+        path.rmdir()
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
