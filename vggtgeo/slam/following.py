@@ -19,20 +19,29 @@ from vggtgeo.slam.keyframe import Keyframe
 
 MOST_POINTS = 300
 """Key points that are followed, the best of each part of the image; a pose needs no more."""
+TRUSTED, LEAST_TRUST = 0.5, 0.1
+"""Confidence of a key point's depth: below the first, points are followed only where there are no others; no point
+counts less than the second, so that a map without depth of its own can be tracked, too."""
 LEAST_ARRIVED = 0.4
 """Share of those in view. On redkitchen and building-walk, 5 and 1 frames apart, 0.4 to 0.9 arrive from a bad guess."""
 LEAST_SHARE = 0.7
 """Of those that arrived, in one pose: far above what wrong poses ever had (0.5, see `evidence.py`)."""
 LEAST_INLIERS = 60
+FLOW_SIGMA = 2.0
+"""Standard deviation of a match, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """A pose by key points, the matches that it was sought by, and their points in the world, float64 [m, 3]."""
+    """A pose by key points, the matches that it was sought by, and their points in the world, float64 [m, 3].
+
+    sigma: standard deviation of a match, pixels.
+    """
 
     guess: PoseGuess
     matches: PointMatches
     points: np.ndarray
+    sigma: float
 
 
 def located_by_flow(
@@ -52,7 +61,10 @@ def located_by_flow(
     with np.errstate(invalid="ignore"):
         expected = rigid.project(points, predicted, intrinsics)
         inside = ((expected >= 0) & (expected < image.shape[1::-1])).all(1)
-    seen = np.flatnonzero(inside)[:MOST_POINTS]  # key points stand best first, in turn over the image
+    seen = np.flatnonzero(inside)
+    # Key points stand best first, in turn over the image; those whose depth is at a jump come last.
+    doubtful = keyframe.points.prior_confidence[known[seen]] < TRUSTED
+    seen = seen[np.argsort(doubtful, kind="stable")][:MOST_POINTS]
     if len(seen) < LEAST_INLIERS:
         return None
     asked, points = known[seen], points[seen]
@@ -62,8 +74,11 @@ def located_by_flow(
     if len(arrived) < max(LEAST_ARRIVED * len(seen), LEAST_INLIERS):
         return None
     nowhere = np.full(len(arrived), -1)
-    matches = PointMatches(asked[arrived], nowhere, pixels[arrived], moved[arrived], np.clip(alike[arrived], 0.0, 1.0))
+    trust = np.clip(alike[arrived], 0.0, 1.0) * np.maximum(
+        keyframe.points.prior_confidence[asked[arrived]], LEAST_TRUST
+    )
+    matches = PointMatches(asked[arrived], nowhere, pixels[arrived], moved[arrived], trust)
     points = points[arrived]
     guess = geometry.locate(PoseQuery(image, intrinsics, points, matches.pixels_j, matches.confidence, predicted))
     agree = guess.inlier_count >= max(LEAST_SHARE * len(arrived), LEAST_INLIERS)
-    return Located(guess, matches, points) if guess.result is GeometryResult.SUCCESS and agree else None
+    return Located(guess, matches, points, FLOW_SIGMA) if guess.result is GeometryResult.SUCCESS and agree else None

@@ -12,7 +12,7 @@ from scipy.stats import chi2 as chi_square
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import pose_information
-from vggtgeo.models.roles import Features, GeometryResult, PointMatcher, PointMatches, PoseGuess, PoseQuery
+from vggtgeo.models.roles import Features, GeometryResult, PointMatcher, PoseGuess, PoseQuery
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, tangent, worst_sigma
 from vggtgeo.slam.factors import MeasuredRelativePose
@@ -107,14 +107,14 @@ def track(
     if located is None:
         matcher = roles.points if aligner is None else roles.coarse_points
         located = _by_descriptors(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
-    guess, matches, points = located.guess, located.matches, located.points
+    guess, matches = located.guess, located.matches
     known = guess.result is GeometryResult.SUCCESS
     dense = None
     if aligner is not None and views is not None and (known or expected):
         dense = aligner.align(*views, guess.pose @ rigid.invert(keyframe.pose))
     if not known and dense is None:
         return Track(keyframe, guess.pose, np.zeros((6, 6)), _seen(guess, len(matches)), guess.result)
-    return _fused(keyframe, guess, matches, points, dense, expected, intrinsics)
+    return _fused(keyframe, located, dense, expected, intrinsics)
 
 
 def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
@@ -154,24 +154,22 @@ def _by_descriptors(
         window_poses=tuple(member.pose for member in window),
         window_depths=tuple(member.depth for member in window) if roles.metric else (),
     )
-    return Located(roles.geometry.locate(query), matches, points)
+    return Located(roles.geometry.locate(query), matches, points, PIXEL_SIGMA)
 
 
 def _fused(
     keyframe: Keyframe,
-    guess: PoseGuess,
-    matches: PointMatches,
-    points: np.ndarray,
+    located: Located,
     dense: Aligned | None,
     expected: Expectation | None,
     intrinsics: np.ndarray,
 ) -> Track:
     """One pose from points, picture and, weakly, the motion: the mean by information, in the motion's tangent space."""
-    back = rigid.invert(keyframe.pose)
-    evidence = _seen(guess, len(matches))
+    back, guess = rigid.invert(keyframe.pose), located.guess
+    evidence = _seen(guess, len(located.matches))
     by_points = None
     if guess.result is GeometryResult.SUCCESS:
-        known = pose_information(guess.pose, points[guess.inliers], intrinsics, PIXEL_SIGMA)
+        known = pose_information(guess.pose, located.points[guess.inliers], intrinsics, located.sigma)
         by_points = _Motion(guess.pose @ back, known)
     if dense is not None:
         evidence = _with_picture(evidence, dense)
