@@ -163,11 +163,13 @@ class RelativeView:
     pose: float [4, 4], camera i -> camera j (metres, or any one scale shared with the depths).
     intrinsics: float [4] of both views.
     depths: float [L_i, 2], depth of the two ends of each segment of i, NaN where unknown; None if none is known.
+    error: how far the pose may move what it predicts in the image, pixels, beyond what a matcher allows anyway.
     """
 
     pose: np.ndarray
     intrinsics: np.ndarray
     depths: np.ndarray | None = None
+    error: float = 0.0
 
     def __post_init__(self) -> None:
         check_pose("pose", self.pose)

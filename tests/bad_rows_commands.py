@@ -11,7 +11,7 @@ import pytest
 import tiny_sequences as tiny
 from bad_row import Row, good, line, nothing, rows, run_with
 
-from vggtgeo.cli.jax_flags import cache_folder
+from vggtgeo.io.jax_environment import cache_folder
 from vggtgeo.results import Result
 from vggtgeo.results.run_folder import taken
 
@@ -155,7 +155,7 @@ RUN = rows(
         ("`--features orb --preset paper`", good, flags("--features", "orb", "--preset", "paper")),
         ("`--set` without a value", good, flags("--set", "nonsense")),
         ("`--set` of a setting that is none", good, flags("--set", "tracking.least_inlier=3")),
-        ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=many")),
+        ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=-3")),
         ("`--rerun` to a text file", good, flags("--rerun", "run.txt")),
         ("`--seed -1`", good, flags("--seed", "-1")),
         ("`--seed` beyond 32 bits", good, flags("--seed", "99999999999")),

@@ -14,6 +14,7 @@ import resource
 import time
 import warnings
 from pathlib import Path
+from typing import Any
 
 import pytest
 from bad_input_rows import ROWS, Row
@@ -36,17 +37,17 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
 
 
-def seen(row: Row, folder: Path) -> tuple[str, list[str]]:
+def seen(row: Row, made: Any) -> tuple[str, list[str]]:
     """How the row ends ("error", or "used" where nothing is refused), and what is said."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             if row.argv is None:
-                row.call(row.make(folder))
+                row.call(made)
                 end, said = "used", []
             else:
-                given = row.argv(row.make(folder))
-                done = CliRunner().invoke(make_app(), list(map(str, given)))
+                given = list(map(str, row.argv(made)))
+                done = CliRunner().invoke(make_app(), given, prog_name="vggtgeo")
                 assert done.exit_code in (0, 2, 3), done.output
                 end = "error" if done.exit_code == 2 else "used"
                 said = [line.removeprefix("error: ") for line in done.stderr.splitlines() if line.startswith("error: ")]
@@ -81,8 +82,9 @@ def pattern(sentence: str) -> str:
 def test_what_the_user_sees(row: Row, tmp_path: Path) -> None:
     """The page's sentence for the row, and the way it ends."""
     ends, sees = TABLE[row.group, row.given]
+    made = row.make(tmp_path)
     before, memory = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    end, said = seen(row, tmp_path)
+    end, said = seen(row, made)
     seconds, grown = time.process_time() - before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
     assert end == ("error" if ends == "error" else "used"), said
     if ends == "used":

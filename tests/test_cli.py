@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_problem
-from vggtgeo.cli.jax_flags import cache_folder
 from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command, make_app
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.jax_environment import cache_folder
 
 HEAVY = {"jax", "cv2", "matplotlib", "scipy", "onnxruntime", "rerun", "equinox", "numpy"}
 PROBE = """

@@ -17,6 +17,7 @@ import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.depth_alignment import FARTHEST, LEAST_COSINE, Surface, align, align_pairs
 from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.keyframe_images import KeyframeImages
 
 INTRINSICS = np.array([260.0, 255.0, 159.5, 119.5])
 SIZE = (240, 320)
@@ -53,13 +54,15 @@ def keyframe(number: int, pose: np.ndarray, depth: np.ndarray, sigma: float = 0.
         frame=number,
         timestamp=float(number),
         pose=pose,
-        image=np.zeros((*SIZE, 3), np.uint8),
+        images=KeyframeImages(
+            np.zeros((*SIZE, 3), np.uint8),
+            depth.astype(np.float16),
+            np.full(SIZE, sigma, np.float16),
+            np.full(SIZE, 255, np.uint8),
+        ),
         features=Features(nobody, none, np.zeros((0, 1))),
         lines=LineFeatures(segments, None),
         line_depths=nobody,
-        depth=depth.astype(np.float16),
-        depth_sigma=np.full(SIZE, sigma, np.float16),
-        depth_confidence=np.full(SIZE, 255, np.uint8),
         points=slots,
         samples=slots,
         sample_segment=np.zeros(0, int),

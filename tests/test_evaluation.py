@@ -11,7 +11,16 @@ from evo.core.units import Unit
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets import open_sequence
-from vggtgeo.evaluation import absolute_error, associate, evaluate_trajectory, relative_error, rotation_angle, umeyama
+from vggtgeo.evaluation import (
+    absolute_error,
+    associate,
+    coverage,
+    evaluate_trajectory,
+    heading,
+    relative_error,
+    rotation_angle,
+    umeyama,
+)
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -112,6 +121,107 @@ def test_rpe_agrees_with_evo(tmp_path: Path, delta: int, all_pairs: bool) -> Non
         assert error < TOLERANCE, f"{relation}: differs from evo by {error}"
 
 
+@pytest.mark.parametrize("all_pairs", [False, True])
+@pytest.mark.parametrize("delta", [0.3, 1.1])
+def test_rpe_over_metres_agrees_with_evo(tmp_path: Path, delta: float, all_pairs: bool) -> None:
+    # Proves that pairs a stated path apart, a camera that stands still at times included, are evo's on the same files.
+    truth = _truth(150)
+    poses = truth.poses.copy()
+    poses[40:50, :3, 3], poses[149, :3, 3] = poses[40, :3, 3], poses[148, :3, 3]
+    truth = Trajectory(truth.timestamps, poses)
+    reference, evo_estimate = _evo_pair(tmp_path, _estimate(truth), truth)
+    found = evaluate_trajectory(*_both_loaded(tmp_path), delta=delta, all_pairs=all_pairs, unit="metres").relative
+    for relation, errors in (
+        (metrics.PoseRelation.translation_part, found.translation),
+        (metrics.PoseRelation.rotation_angle_rad, found.rotation),
+    ):
+        metric = metrics.RPE(relation, delta, Unit.meters, all_pairs=all_pairs, pairs_from_reference=True)
+        metric.process_data((reference, evo_estimate))
+        assert len(errors) == len(metric.error) > 3
+        error = np.abs(errors - metric.error).max()
+        assert error < TOLERANCE, f"{relation}: differs from evo by {error}"
+
+
+@pytest.mark.parametrize("all_pairs", [False, True])
+def test_rpe_over_seconds_is_that_over_poses_on_an_even_clock(all_pairs: bool) -> None:
+    # Proves pairs by time, gaps included. Oracle: pairs by counting where the clock is even; by hand where it is not.
+    truth = _truth(60)
+    even = Trajectory(np.arange(60) / 30.0, truth.poses)
+    estimate = Trajectory(even.timestamps, _estimate(truth).poses)
+    by_count = relative_error(estimate, even, 6, all_pairs)
+    by_time = relative_error(estimate, even, 0.2, all_pairs, "seconds")
+    np.testing.assert_allclose(by_time.translation, by_count.translation, atol=1e-12)
+    assert by_time.interval == "0.2 seconds"
+    gap = Trajectory(np.array([0.0, 0.1, 0.2, 1.0, 1.1]), truth.poses[:5])
+    assert relative_error(gap, gap, 0.2, all_pairs, "seconds").translation.shape == (1 if all_pairs else 2,)
+
+
+@pytest.mark.parametrize("vertical", [(0.0, 0.0, 1.0), (0.0, -2.0, 0.0), (0.3, 0.5, -0.2)])
+def test_heading_finds_the_turn_about_the_vertical(vertical: tuple[float, float, float]) -> None:
+    # Proves that a turn about the vertical and a shift are undone exactly, and that noise leaves the best of all turns.
+    # Oracle: the motion that was applied; a search over the angle.
+    rng = np.random.default_rng(7)
+    axis = np.array(vertical) / np.linalg.norm(vertical)
+    source = rng.normal(size=(40, 3))
+    turn = Rotation.from_rotvec(2.5 * axis).as_matrix()
+    found = heading(source, source @ turn.T + [1.0, -4.0, 2.0], vertical)
+    assert np.abs(found.rotation - turn).max() < 1e-12
+    np.testing.assert_allclose(found.translation, [1.0, -4.0, 2.0], atol=1e-12)
+    target = source @ Rotation.random(rng=rng).as_matrix().T + rng.normal(scale=0.1, size=(40, 3))
+    found = heading(source, target, vertical)
+    centred = target - target.mean(0)
+    cost = lambda rotation: float(((((source - source.mean(0)) @ rotation.T) - centred) ** 2).sum())
+    angles = np.linspace(-np.pi, np.pi, 2001)
+    assert cost(found.rotation) <= min(cost(Rotation.from_rotvec(angle * axis).as_matrix()) for angle in angles) + 1e-9
+
+
+def test_each_alignment_removes_what_it_says() -> None:
+    # Proves the four errors of one report: an estimate turned about z, tilted, and scaled in turn is brought back by
+    # just those alignments that know of it. Oracle: zero, or not.
+    truth = _truth()
+    turned = Rotation.from_rotvec([0.0, 0.0, 1.0]).as_matrix()
+    tilted = Rotation.from_rotvec([0.4, 0.0, 0.0]).as_matrix()
+    for name, rotation, scale, zeros in (
+        ("as it is", np.eye(3), 1.0, {"unaligned", "yaw", "se3", "sim3"}),
+        ("turned", turned, 1.0, {"yaw", "se3", "sim3"}),
+        ("tilted", tilted, 1.0, {"se3", "sim3"}),
+        ("scaled", tilted, 2.0, {"sim3"}),
+    ):
+        poses = truth.poses.copy()
+        poses[:, :3, :3] = rotation @ truth.rotations
+        poses[:, :3, 3] = scale * truth.positions @ rotation.T
+        report = evaluate_trajectory(Trajectory(truth.timestamps, poses), truth)
+        errors = {kind: getattr(report, kind).statistics.rmse for kind in ("unaligned", "yaw", "se3", "sim3")}
+        assert {kind for kind, error in errors.items() if error < 1e-9} == zeros, f"{name}: {errors}"
+        assert report.sim3.alignment.scale == pytest.approx(1 / scale)
+
+
+def test_coverage_is_the_share_of_time_that_is_followed() -> None:
+    # Proves that gaps and a missing end count, keyframes do not. Oracle: by hand, over ten seconds.
+    poses = np.tile(np.eye(4), (101, 1, 1))
+    truth = Trajectory(np.arange(101) / 10.0, poses)
+    assert coverage(truth, truth) == pytest.approx(1.0)
+    assert coverage(truth.select(slice(0, None, 10)), truth) == pytest.approx(1.0)
+    assert coverage(truth.select(slice(0, 51)), truth) == pytest.approx(0.5)
+    lost = np.r_[0:21, 60:101]
+    assert coverage(truth.select(lost), truth) == pytest.approx(0.6)
+    longer = Trajectory(np.arange(301) / 10.0 - 10.0, np.tile(np.eye(4), (301, 1, 1)))
+    assert coverage(longer, truth) == pytest.approx(1.0)
+
+
+def test_doubtful_numbers_are_named() -> None:
+    # Proves the warnings of few matches, another clock, a short estimate and an absurd scale, and none for a good one.
+    truth = _truth()
+    good = Trajectory(truth.timestamps, _estimate(truth).poses)
+    assert evaluate_trajectory(good, truth).warnings == ()
+    assert "only 5 poses match" in evaluate_trajectory(good.select(slice(0, 5)), truth).warnings[0]
+    assert "follows 25 %" in evaluate_trajectory(good.select(slice(0, 31)), truth).warnings[0]
+    scaled = Trajectory(truth.timestamps, _scaled(good.poses, 9.0))
+    assert "the scale is 0.111" in evaluate_trajectory(scaled, truth).warnings[0]
+    shifted = Trajectory(truth.timestamps + np.where(np.arange(120) % 3, 0.012, 0.0), good.poses)
+    assert "only 40 of 120 poses match" in evaluate_trajectory(shifted, truth, max_dt=1e-4).warnings[0]
+
+
 def test_rpe_after_sim3_agrees_with_evo(tmp_path: Path) -> None:
     # Proves that the RPE of an estimate without scale, after its Sim(3) alignment, is evo's, to 1e-9.
     truth = _truth()
@@ -171,9 +281,9 @@ def test_a_still_camera_has_an_ate() -> None:
     truth = _truth(20)
     still = Trajectory(truth.timestamps, np.tile(np.eye(4), (20, 1, 1)))
     spread = np.sqrt(((truth.positions - truth.positions.mean(0)) ** 2).sum(1).mean())
-    for with_scale in (False, True):
-        assert absolute_error(still, truth, with_scale).statistics.rmse == pytest.approx(spread)
-        assert absolute_error(still, still, with_scale).statistics.rmse == pytest.approx(0.0, abs=1e-12)
+    for kind in ("se3", "sim3"):
+        assert absolute_error(still, truth, kind).statistics.rmse == pytest.approx(spread)
+        assert absolute_error(still, still, kind).statistics.rmse == pytest.approx(0.0, abs=1e-12)
 
 
 def test_rotation_angle_is_accurate_at_both_ends() -> None:

@@ -21,14 +21,14 @@ STAIR = (
     ("figures",),
     ("report",),
     ("results",),
-    ("learning", "paper_bench", "viewing"),
+    ("benchmark", "learning", "viewing"),
     ("cli",),
 )
 """Packages of `vggtgeo`, the lowest first: each imports of those below it; those of one step nothing of each other."""
 STEP = {package: step for step, packages in enumerate(STAIR) for package in packages}
 LATE = {"vggtgeo.cli"}
 """Packages whose functions import the project: a command's help must not load what the command needs."""
-NEVER_AT_MODULE_LEVEL = {"evo", "onnx", "onnxscript", "rerun", "torch"}
+NEVER_AT_MODULE_LEVEL = {"evo", "onnx", "onnxscript", "pyarrow", "ray", "rerun", "rosbags", "torch"}
 
 
 def _statements(body: ast.AST, in_functions: bool, for_types: bool = True) -> Iterator[ast.AST]:

@@ -7,6 +7,7 @@ from vggtgeo.models.roles import Features, LineFeatures, Segments
 
 from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.keyframe_depth import fused_depths, optimised_depth
+from vggtgeo.slam.keyframe_images import KeyframeImages
 
 SIZE = (120, 160)
 INTRINSICS = np.array([160.0, 160.0, 79.5, 59.5])
@@ -25,13 +26,15 @@ def keyframe(number: int, depth: np.ndarray, slots: Slots | None = None) -> Keyf
         frame=number,
         timestamp=float(number),
         pose=pose,
-        image=np.zeros((*SIZE, 3), np.uint8),
+        images=KeyframeImages(
+            np.zeros((*SIZE, 3), np.uint8),
+            depth.astype(np.float16),
+            np.full(SIZE, 0.01, np.float16),
+            np.full(SIZE, 255, np.uint8),
+        ),
         features=Features(np.zeros((0, 2)), none),
         lines=LineFeatures(Segments(np.zeros((0, 2, 2)), none)),
         line_depths=np.zeros((0, 2)),
-        depth=depth.astype(np.float16),
-        depth_sigma=np.full(SIZE, 0.01, np.float16),
-        depth_confidence=np.full(SIZE, 255, np.uint8),
         points=slots or empty,
         samples=empty,
         sample_segment=np.zeros(0, int),

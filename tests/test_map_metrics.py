@@ -1,10 +1,19 @@
-"""Metrics of depth maps and point clouds against brute force and closed forms."""
+"""Metrics of depth maps, clouds, meshes and covariances against brute force and closed forms."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.evaluation import cloud_error, depth_error, depth_of_cloud
+from vggtgeo.evaluation import (
+    cloud_error,
+    consistency,
+    depth_error,
+    depth_of_cloud,
+    focal_error,
+    mesh_error,
+    scale_error,
+    surface_points,
+)
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 
@@ -88,3 +97,89 @@ def test_impossible_clouds_are_refused() -> None:
         cloud_error(np.full((2, 3), np.nan), points)
     with pytest.raises(InputError, match="`threshold` is 0"):
         cloud_error(points, points, 0.0)
+
+
+def test_cloud_error_has_the_distances_of_open3d() -> None:
+    # Proves precision, recall, F-score and both mean distances on clouds of thousands of points. Oracle: Open3D's
+    # point-to-point distances, to 1e-6.
+    open3d = pytest.importorskip("open3d", reason="Open3D, the oracle, is not installed", exc_type=ImportError)
+    rng = np.random.default_rng(3)
+    truth = rng.uniform(-2, 2, (5000, 3)) * [1.0, 1.0, 0.1]
+    estimate = truth[:4000] + rng.normal(scale=0.03, size=(4000, 3))
+    clouds = [open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)) for points in (estimate, truth)]
+    to_truth = np.asarray(clouds[0].compute_point_cloud_distance(clouds[1]))
+    to_estimate = np.asarray(clouds[1].compute_point_cloud_distance(clouds[0]))
+    found = cloud_error(estimate, truth, 0.05)
+    precision, recall = (to_truth < 0.05).mean(), (to_estimate < 0.05).mean()
+    expected = (precision, recall, 2 * precision * recall / (precision + recall), to_truth.mean(), to_estimate.mean())
+    errors = np.abs(
+        np.subtract((found.precision, found.recall, found.f_score, found.accuracy, found.completeness), expected)
+    )
+    assert errors.max() < 1e-6, f"off by {errors}"
+
+
+def test_points_on_a_mesh_are_even_by_area() -> None:
+    # Proves that a mesh is sampled by area, and within its faces. Oracle: the plane of each face; areas 1 to 3; the
+    # centre of a triangle is the mean of its corners.
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 5], [3, 0, 5], [0, 1, 5]])
+    points = surface_points((vertices, np.array([[0, 1, 2], [3, 4, 5]])), 0.02)
+    assert len(points) == round(2.0 / 0.02**2)
+    low = points[:, 2] == 0.0
+    assert np.all(low | (points[:, 2] == 5.0))
+    assert abs(low.mean() - 0.25) < 4 * np.sqrt(0.25 * 0.75 / len(points)), low.mean()
+    np.testing.assert_allclose(points[low].mean(0), [1 / 3, 1 / 3, 0], atol=4 * 0.24 / np.sqrt(low.sum()))
+    assert (points[low, :2].sum(axis=1) <= 1 + 1e-12).all()
+
+
+def test_meshes_of_one_surface_agree_however_it_is_cut() -> None:
+    # Proves that a square of two triangles and one of 200, raised by 3 cm, are 3 cm apart everywhere. Oracle: geometry.
+    steps = np.linspace(0, 1, 11)
+    x, y = np.meshgrid(steps, steps)
+    grid = np.column_stack([x.ravel(), y.ravel(), np.full(121, 0.03)])
+    corner = (np.arange(10)[:, None] * 11 + np.arange(10)).ravel()[:, None]
+    many = np.concatenate([corner + [0, 1, 11], corner + [1, 12, 11]])
+    two = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    found = mesh_error((grid, many), two, threshold=0.05)
+    assert (found.precision, found.recall) == (1.0, 1.0)
+    assert found.mean_distance == pytest.approx(0.03, rel=0.03)
+    assert mesh_error((grid, many), two, threshold=0.025).f_score == 0.0
+
+
+def test_impossible_meshes_are_refused() -> None:
+    # Proves the errors of a face without vertex, of no area, and of no spacing.
+    vertices = np.zeros((3, 3))
+    with pytest.raises(InputError, match="corner 3"):
+        surface_points((vertices, np.array([[0, 1, 3]])), 0.1)
+    with pytest.raises(InputError, match="no face with an area"):
+        surface_points((vertices, np.array([[0, 1, 2]])), 0.1)
+    with pytest.raises(InputError, match="`spacing` is 0"):
+        surface_points((np.eye(3), np.array([[0, 1, 2]])), 0.0)
+
+
+def test_nees_of_right_covariances_keeps_to_its_band() -> None:
+    # Proves that errors drawn by their covariances are consistent, that errors of twice the size are not, and by how
+    # much. Oracle: the chi-square law; the Mahalanobis distance by an inverse.
+    rng = np.random.default_rng(11)
+    roots = rng.normal(size=(400, 6, 6)) + 3 * np.eye(6)
+    covariances = roots @ roots.swapaxes(1, 2)
+    errors = (roots @ rng.normal(size=(400, 6, 1)))[..., 0]
+    found = consistency(errors, covariances)
+    expected = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    np.testing.assert_allclose(found.nees, expected, rtol=1e-9)
+    assert found.consistent, (found.low, found.mean, found.high)
+    too_sure = consistency(2 * errors, covariances)
+    assert not too_sure.consistent
+    assert too_sure.mean > too_sure.high
+    assert too_sure.inflation == pytest.approx(2.0, rel=0.05)
+    assert not consistency(0.5 * errors, covariances).consistent
+    with pytest.raises(InputError, match="not positive definite"):
+        consistency(errors, -covariances)
+
+
+def test_errors_of_focal_length_and_scale() -> None:
+    # Proves sign and size. Oracle: by hand.
+    assert focal_error((510.0, 490.0, 1.0, 1.0), (500.0, 500.0, 0.0, 0.0)) == pytest.approx(0.0)
+    assert focal_error((510.0, 510.0, 1.0, 1.0), (500.0, 500.0, 0.0, 0.0)) == pytest.approx(0.02)
+    assert scale_error(1 / 1.02) == pytest.approx(0.02)
+    with pytest.raises(InputError, match="`scale` is 0"):
+        scale_error(0.0)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny_networks as tiny
-from recorded_run import SETTINGS
+from recorded_run import SETTINGS, recorded_run
 from vggtgeo.models.onnx.bounds import (
     AVERAGE,
     FARTHEST,
@@ -29,6 +30,8 @@ from vggtgeo.models.roles import DepthEstimate, Segments
 
 import vggtgeo as vg
 from vggtgeo.slam.trust.input import check_refusals
+from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.trust.surfaces import check_surfaces
 
 SIZE = (48, 64)
 IMAGE = np.random.default_rng(0).integers(0, 255, (*SIZE, 3)).astype(np.uint8)
@@ -136,6 +139,25 @@ def test_cameras_and_segments_that_are_nowhere(tmp_path: Path) -> None:
 
     far = tiny.letr(tmp_path / "letr.onnx", SIZE, lines=[(0.1, 0.2, 0.8, 0.3), (-1e30, 0.5, 1e30, 0.5)])
     assert len(LetrDetector(open_session(far, LETR)).detect(IMAGE)) == 1
+
+
+@pytest.mark.parametrize("kind", ["right", "5 % off", "random"])
+def test_depth_of_another_scene_is_told(kind: str) -> None:
+    """The keyframes of a simulated run keep their depth, get smooth errors, or depth that is random: only the last is
+    named. Oracle: the rendered depth.
+    """
+    slam, rng = recorded_run().slam, np.random.default_rng(0)
+    assert len(slam.keyframes) > 1
+    change = {
+        "right": lambda depth: depth,
+        "5 % off": lambda depth: depth * rng.normal(1.0, 0.05, depth.shape),
+        "random": lambda depth: rng.uniform(0.5, 5.0, depth.shape),
+    }[kind]
+    keyframes = tuple(replace(member, depth=change(member.depth).astype(np.float16)) for member in slam.keyframes)
+    found = list(check_surfaces(keyframes, np.asarray(slam.intrinsics)))
+    assert [finding.level for finding in found] == (["degraded"] if kind == "random" else [])
+    verdict = judge(replace(slam, keyframes=keyframes))
+    assert any("neighbouring keyframes disagrees" in reason for reason in verdict.reasons) == (kind == "random")
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e30], ids=["right", "1e30"])

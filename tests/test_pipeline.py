@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -18,12 +19,16 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.results.files import write_trajectories
+from vggtgeo.results.summary import pieces
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import compile_global, expected_keyframes
-from vggtgeo.slam.global_adjustment import adjust_all, close_loops
+from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.global_shape import padded_count, shape_for
-from vggtgeo.slam.run import finish, frame_trajectory, keyframe_trajectory, run_frames
+from vggtgeo.slam.loops import close_loops
+from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import updated
@@ -105,7 +110,9 @@ def test_no_recompilation_after_the_first_window(room, tracked: Slam) -> None:
 
 def _keyframe_error(slam: Slam, truth: Trajectory) -> float:
     """Root mean square of the keyframes' places after alignment, metres."""
-    return evaluate_trajectory(keyframe_trajectory(slam), truth).se3.statistics.rmse
+    poses = rigid.invert(np.array([keyframe.pose for keyframe in slam.keyframes]))
+    times = np.array([keyframe.timestamp for keyframe in slam.keyframes])
+    return evaluate_trajectory(Trajectory(times, poses), truth).se3.statistics.rmse
 
 
 def _shaken(slam: Slam, metres: float, degrees: float, from_keyframe: int = 1, together: bool = False) -> Slam:
@@ -183,6 +190,39 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
     error = _keyframe_error(adjust_all(closed, settings), room[2])
     assert error < 0.01, f"{error:.4f} m"
     assert _keyframe_error(adjust_all(apart, settings), room[2]) > 0.015
+
+
+def _visited_twice(slam: Slam, motion: np.ndarray) -> Slam:
+    """The map with every keyframe once more, as of a second visit that drift has carried away by `motion`; the step
+    between the visits is tracked as wrongly as that.
+    """
+    count = len(slam.keyframes)
+    again = tuple(replace(k, number=k.number + count, pose=k.pose @ rigid.invert(motion)) for k in slam.keyframes)
+    pairs = tuple(replace(p, first=p.first + count, second=p.second + count) for p in slam.pairs)
+    ties = tuple(replace(t, first=t.first + count, second=t.second + count) for t in slam.ties)
+    step = again[0].pose @ rigid.invert(slam.keyframes[-1].pose)
+    wrong = MeasuredRelativePose(count - 1, count, step, ties[0].information)
+    keyframes = (*slam.keyframes, *again)
+    return replace(slam, keyframes=keyframes, pairs=(*slam.pairs, *pairs), factors=(*slam.factors, wrong, *ties))
+
+
+def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
+    """A second visit 3 m and 40 degrees away, where no keyframe should see what the first visit saw: what it looks like
+    finds it, and a pose graph brings it back before the adjustment. Oracle: the keyframes of the first visit.
+    """
+    settings = updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth": {"surface_points": 0.0}})
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(np.deg2rad(40.0) * np.array([0.2, 0.97, 0.1])).as_matrix()
+    motion[:3, 3] = 2.0, 0.5, -2.0
+    count = len(tracked.keyframes)
+    closed = close_loops(_visited_twice(tracked, motion), ROLES, settings)
+    assert any("straightened the map" in note for note in closed.notes), closed.notes
+    assert sum(pair.first < count <= pair.second for pair in closed.pairs) >= 3
+    for slam, bound in ((closed, 0.10), (adjust_all(closed, settings), 0.005)):
+        poses = np.array([keyframe.pose for keyframe in slam.keyframes])
+        centres = rigid.invert(poses)[:, :3, 3]
+        off = np.linalg.norm(centres[count:] - centres[:count], axis=1).max()
+        assert off < bound, f"{off:.4f} m"
 
 
 @pytest.mark.long
@@ -291,8 +331,10 @@ def test_bad_sequences_end_with_finite_poses(room, case: int) -> None:
     assert np.all(np.isfinite(poses)), name
 
 
-def test_a_jump_is_said_and_survived(room) -> None:
-    """After a jump to a place never seen, tracking is reported lost, the map goes on from a new origin."""
+def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
+    """After a jump to a place never seen, tracking is reported lost, the map goes on from a new origin, and each piece
+    is written to a file of its own, the one of more frames first. Oracle: which frames are of which place.
+    """
     frames, camera, _ = room
     other = simulate("room", 2000, 0, SIZE, rate=10.0)
     elsewhere = [replace(other.frame(60 + i), index=8 + i, timestamp=(8 + i) / 10) for i in range(14)]
@@ -300,6 +342,15 @@ def test_a_jump_is_said_and_survived(room) -> None:
     assert any("tracking was lost at frame 8" in note for note in slam.notes), slam.notes
     assert len(slam.origins) == 2
     assert len(slam.frames) == 22
+    (tmp_path / "trajectory-5.txt").write_text("of an earlier run")
+    write_trajectories(tmp_path, slam)
+    assert sorted(file.name for file in tmp_path.glob("traj*")) == ["trajectory-2.txt", "trajectory.txt"]
+    times = [Trajectory.load_tum(tmp_path / f"trajectory{which}.txt").timestamps for which in ("", "-2")]
+    assert times[0].min() > 0.75, "the jump's place has more frames"
+    np.testing.assert_allclose(times[1], np.arange(8) / 10)
+    told = pieces(slam)
+    assert [piece["poses"] for piece in told] == [len(own) for own in times]
+    assert told[1]["frames"] == [0, 7]
 
 
 def test_a_frame_of_another_size_is_named(room) -> None:

@@ -139,7 +139,8 @@ def test_the_verdict_is_the_first_thing_on_the_page(run: RecordedRun, tmp_path: 
 
 def test_the_page_without_depth_and_without_windows(run: RecordedRun, tmp_path: Path) -> None:
     """A run without depth, map, truth or window has a page that says so."""
-    blank = [replace(k, depth=np.full_like(k.depth, np.nan)) for k in run.slam.keyframes]
+    without = [replace(k.images, depth=np.full_like(k.depth, np.nan)) for k in run.slam.keyframes]
+    blank = [replace(k, images=images) for k, images in zip(run.slam.keyframes, without, strict=True)]
     slam = replace(run.slam, keyframes=tuple(blank), metric=False)
     empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     text = _page(run, tmp_path, slam, cloud=empty, records=[], truth=None)

@@ -22,6 +22,7 @@ from vggtgeo.slam.settings_table import GROUPS, changed, names, parsed, tables_o
 
 WRONG = {
     "tracking.least_inliers": (0, 2.5, True, "many"),
+    "tracking.search_map": (1,),
     "keyframes.keyframe_distance": (0.0, -1.0, float("nan"), float("inf"), "far"),
     "keyframes.keyframe_angle": (0.0, 4.0),
     "matching.least_covisible": (0,),
@@ -31,6 +32,8 @@ WRONG = {
     "matching.epipolar_gate": (-4.0,),
     "matching.least_overlap": (-0.1, 1.1),
     "line.use_lines": (1, "yes"),
+    "line.in_tracking": ("always",),
+    "line.in_edges": (0,),
     "line.line_gate": (0,),
     "line.line_spacing": (0.0,),
     "line.line_weight": (-0.1,),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
-from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery
+from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery, Segments
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
@@ -16,10 +17,13 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
+from vggtgeo.slam import relocalisation
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.pieces import join_pieces, scaled_piece
+from vggtgeo.slam.pipeline import step
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
@@ -27,7 +31,7 @@ from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking import Sight
+from vggtgeo.slam.tracking import Expectation, Sight, Track, track
 
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
@@ -167,6 +171,45 @@ def test_frames_are_described_where_flow_fails(room: Room) -> None:
     assert errors[0] < max(1.5 * errors[2], 0.01), f"{100 * errors[0]:.2f} cm by flow, {100 * errors[2]:.2f} without"
 
 
+def _by_lines(room: Room, keep: Callable[[np.ndarray], np.ndarray]) -> tuple[Track, np.ndarray]:
+    """Frame 2 against a keyframe at frame 0 by its segments alone, those that `keep` says of their ends [l, 2, 2], from
+    4 cm and 2 degrees off; and the true pose.
+    """
+    frames, camera, truth = room
+    poses, intrinsics = rigid.invert(truth.poses), np.array(camera.intrinsics)
+    blank = Description.of(ROLES.points.describe(np.zeros_like(frames[0].image)))
+    keyframe = make_keyframe(0, frames[0], poses[0], blank, ROLES, SETTINGS, intrinsics)
+    segments = ROLES.lines.detect(frames[2].image)
+    kept = keep(segments.endpoints)
+    segments = Segments(segments.endpoints[kept], segments.scores[kept])
+    sight = Sight(frames[2], blank, None, lambda: ROLES.line_matches.describe(frames[2].image, segments))
+    wrong = rigid.exponential(np.array([0.03, -0.02, 0.02, 0.02, -0.025, 0.015])) @ poses[2]
+    return track(sight, keyframe, None, Expectation(wrong, np.eye(4)), intrinsics, ROLES), poses[2]
+
+
+def test_lines_alone_hold_a_frame(room: Room) -> None:
+    """Without a key point and without depth of its own a frame is placed by its segments to 1 cm, and believed.
+
+    Oracle: the renderer's poses.
+    """
+    found, true = _by_lines(room, lambda ends: np.ones(len(ends), bool))
+    off = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(true))
+    assert off < 0.01, f"{1000 * off:.1f} mm"
+    assert rigid.angle_between(found.pose, true) < np.deg2rad(0.3)
+    assert found.accepted, found.evidence
+
+
+def test_lines_that_leave_a_direction_open_are_not_believed(room: Room) -> None:
+    """The upright segments of the same frame leave the height open: no pose. Oracle: they are parallel in space."""
+
+    def upright(ends: np.ndarray) -> np.ndarray:
+        along = np.abs(ends[:, 1] - ends[:, 0])
+        return along[:, 1] > 5 * along[:, 0]
+
+    found, _ = _by_lines(room, upright)
+    assert not found.accepted, found.evidence
+
+
 class _Mirage:
     """A pose solver that from a certain frame on is sure of a pose 2 m off, on 12 of its matches."""
 
@@ -209,8 +252,24 @@ def test_a_step_that_no_hand_makes_is_not_believed(room: Room) -> None:
         (Evidence(matches=0, inliers=0, correlation=0.75, surface=0.97, overlap=0.6, chi2=90.0), False),
         (Evidence(matches=300, inliers=280, correlation=-0.1, surface=0.5, overlap=0.5, chi2=4.0), False),
         (Evidence(matches=90, inliers=80, sigma_translation=0.4, chi2=4.0), False),
+        (Evidence(lines=20, visible_lines=35, sigma_translation=0.02, chi2=4.0), True),
+        (Evidence(lines=20, visible_lines=35, sigma_translation=0.4, chi2=4.0), False),
+        (Evidence(lines=20, visible_lines=35, sigma_translation=0.02, chi2=90.0), False),
+        (Evidence(lines=20, visible_lines=70, sigma_translation=0.02, chi2=4.0), False),
     ],
-    ids=["mirrored", "a fifth agrees", "points and picture", "picture", "picture, far", "picture differs", "vague"],
+    ids=[
+        "mirrored",
+        "a fifth agrees",
+        "points and picture",
+        "picture",
+        "picture, far",
+        "picture differs",
+        "vague",
+        "lines",
+        "parallel lines",
+        "lines, far",
+        "few of the lines",
+    ],
 )
 def test_what_is_believed(evidence: Evidence, believed: bool) -> None:
     """Two witnesses or one beyond doubt; oracle: cases measured on real pairs of frames, right and wrong."""
@@ -271,6 +330,33 @@ def test_a_place_is_recognised(room: Room) -> None:
 
 
 @pytest.mark.long
+def test_a_place_that_drift_has_moved_is_used_again(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Old keyframes 40 cm off, as drift would have them: on the way back the camera is tracked against one of them
+    again, and a motion ties the old to the new. Oracle: the renderer's poses, relative to the old keyframe.
+    """
+    monkeypatch.setattr(relocalisation, "MOST_DRIFT", 1.0)  # the room is small for so much drift
+    frames, camera, truth = room
+    slam, old = _run(frames, camera), 3
+    assert min(slam.window) > old - 1
+    drift = np.eye(4)
+    drift[:3, 3] = 0.3, 0.0, 0.26
+    moved = (replace(k, pose=k.pose @ drift) if k.number < old else k for k in slam.keyframes)
+    slam = replace(slam, keyframes=tuple(moved))
+    played, known = [*range(29, -1, -1)], len(slam.ties)
+    for index, row in enumerate(played, start=len(frames)):
+        frame = replace(frames[row], index=index, timestamp=index / 10)
+        slam = step(slam, frame, Description.of(ROLES.points.describe(frame.image)), ROLES, SETTINGS)
+    back = [record for record in slam.frames[len(frames) :] if record.tracked and record.reference < old]
+    assert back, "no frame of the way back hangs on an old keyframe"
+    assert any(min(tie.keyframes) < old <= max(tie.keyframes) for tie in slam.ties[known:])
+    true = rigid.invert(truth.poses)
+    for record in back:
+        reference = slam.keyframes[record.reference].frame
+        expected = true[played[record.frame - len(frames)]] @ rigid.invert(true[reference])
+        off = np.linalg.norm(rigid.centre(record.relative) - rigid.centre(expected))
+        assert off < 0.03, f"frame {record.frame} is {100 * off:.1f} cm off"
+
+
 def test_pieces_join_where_they_meet(room: Room) -> None:
     """Two parts of a room, the second begun without knowing the first, become one map when the camera comes back.
 
@@ -301,7 +387,14 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
     seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:16], *frames[14:4:-1]))]
     whole = replace(_run(seen, camera), metric=False)
     origin = len(whole.keyframes) // 2
-    apart = scaled_piece(replace(whole, origins=(0, origin)), 1.6)
+    own = lambda ends: len({number < origin for number in ends}) == 1
+    torn_apart = replace(
+        whole,
+        origins=(0, origin),
+        pairs=tuple(pair for pair in whole.pairs if own(pair.key)),
+        factors=tuple(factor for factor in whole.factors if own(factor.keyframes)),
+    )
+    apart = scaled_piece(torn_apart, 1.6)
     moved = np.eye(4)
     moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
     moved[:3, 3] = [0.5, -1.0, 2.0]

@@ -258,7 +258,7 @@ def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
     assert [(f.start, f.end, f.local) for f in check_record(lose([7, 8]))] == [(7, 8, True)]
     assert [f.local for f in check_record(lose(np.arange(10, 16)))] == [False]
     assert "failed" in {f.level for f in check_record(lose(np.arange(8, 40)))}
-    assert [f.check for f in check_record(replace(healthy.estimate, origins=2))] == ["parts"]
+    assert [f.check for f in check_record(replace(healthy.estimate, pieces=2))] == ["parts"]
 
 
 def test_a_run_that_never_began_has_failed(healthy: Walk) -> None:

@@ -13,6 +13,8 @@ from vggtgeo import _source_tree as _source_tree  # first: in a source tree it f
 
 if TYPE_CHECKING:
     from vggtgeo import learning as learning
+    from vggtgeo.benchmark.runner import BenchReport as BenchReport
+    from vggtgeo.benchmark.runner import bench as bench
     from vggtgeo.bundle.analysis.covariances import Covariances as Covariances
     from vggtgeo.bundle.analysis.covariances import covariances as covariances
     from vggtgeo.bundle.analysis.observability import observability as observability
@@ -69,8 +71,6 @@ if TYPE_CHECKING:
     from vggtgeo.geometry.cameras import SquarePinhole as SquarePinhole
     from vggtgeo.geometry.trajectory import Trajectory as Trajectory
     from vggtgeo.io.errors import InputError as InputError
-    from vggtgeo.paper_bench.runner import BenchReport as BenchReport
-    from vggtgeo.paper_bench.runner import bench as bench
     from vggtgeo.results import Result as Result
     from vggtgeo.results import evaluate as evaluate
     from vggtgeo.results import read as read
@@ -134,7 +134,7 @@ _HOME = {
     "bundle.observations": ("FlatTerm", "Observations"),
     "bundle.packing": ("pack",),
     "bundle.padding": ("PaddedSize",),
-    "paper_bench.runner": ("BenchReport", "bench"),
+    "benchmark.runner": ("BenchReport", "bench"),
     "bundle.problem": ("Problem", "State"),
     "bundle.problem_file": ("load_problem", "save_problem"),
     "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),

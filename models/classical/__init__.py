@@ -2,6 +2,7 @@
 
 from vggtgeo.models.classical.depth import NoDepth, SensorDepth
 from vggtgeo.models.classical.flow import PatchFlow
+from vggtgeo.models.classical.guided_search import can_search, search_around, search_near, search_tree
 from vggtgeo.models.classical.line_detector import LsdDetector
 from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
 from vggtgeo.models.classical.line_matcher import BandLineMatcher
@@ -32,10 +33,14 @@ __all__ = [
     "SiftMatcher",
     "StructureTensor",
     "TwoViewStart",
+    "can_search",
     "line_coefficients",
     "nearest_frame",
     "place_vector",
     "pose_information",
     "sample_segments",
+    "search_around",
+    "search_near",
+    "search_tree",
     "segment_depths",
 ]

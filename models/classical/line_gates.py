@@ -19,8 +19,8 @@ def allowed_pairs(
     """Bool [L_i, L_j]: pairs of segments that can be one line.
 
     Without `relative`: their directions differ by less than `angle`. With it, a segment whose depth is known is
-    moved into j and must lie within `distance` pixels of the other, in its direction, and overlap it; one whose depth
-    is unknown must, between the epipolar lines of its ends, overlap the other.
+    moved into j and must lie within `distance` pixels of the other, and what the view may be off, in its direction,
+    and overlap it; one whose depth is unknown must, between the epipolar lines of its ends, overlap the other.
 
     ends_i: float [L_i, 2, 2]. ends_j: float [L_j, 2, 2].
     """
@@ -31,7 +31,7 @@ def allowed_pairs(
     moved = _move(ends_i, relative)
     known = np.isfinite(moved).all(axis=(1, 2))
     allowed = np.zeros((len(ends_i), len(ends_j)), dtype=bool)
-    allowed[known] = _near(moved[known], ends_j, distance, overlap)
+    allowed[known] = _near(moved[known], ends_j, distance + relative.error, overlap)
     allowed[~known] = _on_epipolar_beam(ends_i[~known], ends_j, relative, angle, overlap)
     return allowed
 

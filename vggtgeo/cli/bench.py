@@ -1,9 +1,8 @@
-"""`vggtgeo bench`: the paper's tables in simulation."""
+"""`vggtgeo bench`: a suite of runs and its tables."""
 
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,51 +11,103 @@ import typer
 from vggtgeo.cli.options import JsonOption
 
 if TYPE_CHECKING:
-    from vggtgeo.paper_bench.plan import Job
-    from vggtgeo.paper_bench.store import BenchRun
+    from vggtgeo.benchmark.store import Row
 
 
 def bench(
-    what: Annotated[Literal["paper"], typer.Argument(help="What to measure: the tables of the paper.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder; finished runs in it are kept.")] = Path(
-        "runs/paper"
-    ),
-    plan: Annotated[str, typer.Option(help="small (a minute), quick (half an hour) or full (a day).")] = "quick",
-    scenes: Annotated[str | None, typer.Option(help="Some scenes of the plan, with commas.")] = None,
-    variants: Annotated[str | None, typer.Option(help="Some variants of the plan, with commas.")] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the plan's.")] = None,
+    suite: Annotated[
+        str, typer.Argument(metavar="SUITE", help="A TOML file, or a suite that comes along; `list` lists those.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Folder; finished runs in it are kept.", show_default="runs/SUITE"),
+    ] = None,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of recordings; may be given several times.", show_default="$VGGTGEO_DATA, data"),
+    ] = None,
+    sequences: Annotated[str | None, typer.Option(help="Some sequences of the suite, with commas.")] = None,
+    settings: Annotated[str | None, typer.Option(help="Some settings of the suite, with commas.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the suite's.")] = None,
     first_seed: Annotated[int | None, typer.Option(min=0, help="First seed.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes, of up to 4 GB each.")] = 2,
+    frames: Annotated[int | None, typer.Option(min=1, help="Of each sequence, at most.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; the processors are shared out.")] = 1,
+    timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
+    memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
+    retry: Annotated[bool, typer.Option("--retry/--no-retry", help="Run again what ended without a result.")] = False,
+    engine: Annotated[
+        Literal["processes", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
+    ] = "processes",
+    address: Annotated[str, typer.Option(help="Of the Ray cluster; local starts one.")] = "auto",
+    cpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 1.0,
+    gpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 0.0,
     quiet: Annotated[bool, typer.Option("--quiet/--no-quiet", help="Print the tables only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the comparisons of the paper with simulated roles in rendered worlds, and print their tables."""
-    from vggtgeo.paper_bench.runner import bench as run_bench  # brings JAX, which --help does without
+    """Run a suite of sequences, settings and seeds, and write its tables and its page."""
+    from vggtgeo.benchmark.cluster import Cluster
+    from vggtgeo.benchmark.runner import bench as run_suite  # brings JAX, which --help does without
+    from vggtgeo.benchmark.suite import shipped
 
-    began = time.monotonic()
-
-    def say(number: int, total: int, job: Job, result: BenchRun) -> None:
-        if not (quiet or as_json):
-            errors = result.errors
-            typer.echo(
-                f"{number}/{total} {job.name}: ATE {100 * errors.ate_m:.2f} cm, {errors.keyframes} keyframes, run of "
-                f"{errors.seconds:.0f} s, {time.monotonic() - began:.0f} s in all (simulated)",
-                err=True,
-            )
-
-    report = run_bench(
-        output,
-        plan,
-        scenes=_list(scenes),
-        variants=_list(variants),
-        seeds=seeds,
-        first_seed=first_seed,
-        progress=say,
-        workers=workers,
-    )
+    if suite == "list":
+        for name, title in shipped().items():
+            typer.echo(f"{name:14s} {title}")
+        return
+    folder = output or Path("runs") / Path(suite).stem
+    with _Bar(quiet or as_json) as bar:
+        report = run_suite(
+            suite,
+            folder,
+            data=data,
+            sequences=_list(sequences),
+            settings=_list(settings),
+            seeds=seeds,
+            first_seed=first_seed,
+            frames=frames,
+            workers=workers,
+            timeout_minutes=timeout_minutes,
+            memory_gb=memory_gb,
+            retry=retry,
+            progress=bar.advance,
+            cluster=Cluster(address, cpus, gpus) if engine == "ray" else None,
+        )
     typer.echo(json.dumps(report.to_dict()) if as_json else report.markdown())
     if not (quiet or as_json):
-        typer.echo(f"in {output}: tables.md runs.csv ablations.png", err=True)
+        typer.echo(f"in {folder}: report.html tables.md runs.csv", err=True)
+
+
+class _Bar:
+    """Runs done, and a line for each."""
+
+    def __init__(self, silent: bool) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self._progress = Progress(*columns, console=Console(stderr=True, quiet=silent))
+        self._task = self._progress.add_task("runs", total=None)
+
+    def __enter__(self) -> _Bar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def advance(self, done: int, total: int, row: Row) -> None:
+        """A run has ended."""
+        self._progress.update(self._task, completed=done, total=total)
+        self._progress.console.print(_line(row), markup=False, highlight=False, soft_wrap=True)
+
+
+def _line(row: Row) -> str:
+    name = f"{row['sequence']}, {row['setting']}, seed {row['seed']}"
+    if row["status"] != "ok":
+        return f"{name}: {row['status']}; {row.get('message', '')}"
+    error = row.get("ate_se3_m") if row.get("metric") else row.get("ate_sim3_m")
+    text = "" if error is None else f" ATE {100 * error:.2f} cm after {'SE(3)' if row.get('metric') else 'Sim(3)'},"
+    simulated = " (simulated)" if row.get("simulated") else ""
+    return f"{name}:{text} {row['tracked']}/{row['frames']} frames, {row['verdict']}{simulated}"
 
 
 def _list(text: str | None) -> list[str] | None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from vggtgeo.cli.options import JsonOption
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,7 +26,10 @@ def evaluate(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM format), or a run's output folder.")],
     truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM format), or a dataset folder.")],
     max_dt: Annotated[float, typer.Option(min=0, help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
-    delta: Annotated[int, typer.Option(min=1, help="Poses between the two of a pair, for RPE.")] = 1,
+    delta: Annotated[float, typer.Option(min=0, help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0,
+    unit: Annotated[
+        Literal["poses", "seconds", "metres"], typer.Option(help="Of --delta: poses, seconds, or metres of true path.")
+    ] = "poses",
     all_pairs: Annotated[
         bool, typer.Option("--all-pairs/--no-all-pairs", help="Overlapping pairs for RPE, not consecutive ones.")
     ] = False,
@@ -36,7 +40,7 @@ def evaluate(
     from vggtgeo.evaluation.resemblance import warn_of_strangers
 
     found, true, scale = load_estimate(estimate), load_truth(truth), load_scale(estimate)
-    report = evaluate_trajectory(found, true, max_dt, delta, all_pairs)
+    report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit)
     warn_of_strangers(found, true, max_dt)
     if as_json:
         typer.echo(json.dumps({**report.as_dict(), **({} if scale is None else {"estimate_scale": scale})}, indent=2))
@@ -47,7 +51,11 @@ def evaluate(
 def load_estimate(path: Path) -> Trajectory:
     """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`."""
     from vggtgeo.geometry.trajectory import Trajectory
+    from vggtgeo.results.run_folder import check_finished
 
+    unfinished = check_finished(path)
+    if unfinished:
+        warnings.warn(unfinished, InputWarning, stacklevel=2)
     return Trajectory.load_tum(path / "trajectory.txt" if path.is_dir() else path)
 
 
@@ -83,10 +91,10 @@ def print_report(report: TrajectoryReport, scale: str | None = None) -> None:
     from vggtgeo.evaluation import ErrorStatistics
 
     console = Console()
-    step = f"{report.relative.delta} pose{'s' if report.relative.delta > 1 else ''}"
     console.print(
-        f"{report.matched} poses matched, of {report.estimated} estimated and {report.true} true; scale of the Sim(3) "
-        f"alignment {report.sim3.alignment.scale:.4f}; RPE over {step}",
+        f"{report.matched} poses matched, of {report.estimated} estimated and {report.true} true; "
+        f"{100 * report.coverage:.0f} % of the truth's duration covered; scale of the Sim(3) alignment "
+        f"{report.sim3.alignment.scale:.4f}; RPE over {report.relative.interval}",
         soft_wrap=True,
     )
     table = Table("", "RMSE", "mean", "median", "max")
@@ -98,10 +106,14 @@ def print_report(report: TrajectoryReport, scale: str | None = None) -> None:
         _add_row(table, "ATE, SE(3)", report.se3.statistics, 100, "cm")
     _add_row(table, "ATE, Sim(3)", report.sim3.statistics, 100, "cm")
     if not free:
+        _add_row(table, "ATE, yaw only", report.yaw.statistics, 100, "cm")
+        _add_row(table, "ATE, not aligned", report.unaligned.statistics, 100, "cm")
         _add_row(table, "RPE translation", report.relative.translation_statistics, 100, "cm")
     _add_row(table, "RPE translation, Sim(3)", report.relative_sim3.translation_statistics, 100, "cm")
     _add_row(table, "RPE rotation", angles, 1, "deg")
     console.print(table)
+    for warning in report.warnings:
+        console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _add_row(table: Table, name: str, errors: ErrorStatistics, factor: float, unit: str) -> None:

@@ -1,32 +1,13 @@
 """JAX's global settings for the program; a library call never touches them."""
 
 import os
-from pathlib import Path
 
-SHORTEST_CACHED_COMPILATION = 0.5
-"""Seconds: what compiles faster is not kept."""
+from vggtgeo.io.jax_environment import jax_environment
 
 
 def set_jax_flags() -> None:
-    """64-bit numbers, compiled code kept between runs, and memory of a GPU taken as needed, not three quarters at once:
-    the networks of onnxruntime share it. A setting of the user's environment wins.
-
-    Settings go through environment variables, which JAX reads when it is imported: most of `--help` never does.
+    """Settings go through environment variables, which JAX reads when it is imported: most of `--help` never does. A
+    setting of the user's environment wins.
     """
-    os.environ.setdefault("JAX_ENABLE_X64", "1")
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    folder = cache_folder()
-    if folder is not None:
-        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(SHORTEST_CACHED_COMPILATION))
-
-
-def cache_folder() -> Path | None:
-    """`$XDG_CACHE_HOME/vggtgeo/jax` (`~/.cache/...` without that variable), or None where it cannot be written."""
-    try:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(base) / "vggtgeo" / "jax"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):
-        return None
-    return folder if os.access(folder, os.W_OK) else None
+    for name, value in jax_environment().items():
+        os.environ.setdefault(name, value)

@@ -89,10 +89,24 @@ COMMANDS = (
         ("vggtgeo models list  # what each is for, its licence, and whether its file is there",),
     ),
     CommandEntry(
+        "data",
+        "vggtgeo.cli.data",
+        "Where to get recordings, and what is wrong with one.",
+        (
+            "vggtgeo data list  # benchmarks: where to get them, sizes, licences, layouts",
+            "vggtgeo data check /disk/tum/rgbd_dataset_freiburg1_desk  # what is wrong with a folder",
+        ),
+    ),
+    CommandEntry(
         "bench",
         "vggtgeo.cli.bench",
-        "Run the comparisons of the paper with simulated roles in rendered worlds, and print their tables.",
-        ("vggtgeo bench paper --help  # what it compares, and for how long",),
+        "Run a suite of sequences, settings and seeds, and write its tables and its page.",
+        (
+            "vggtgeo bench list  # suites that come along",
+            "vggtgeo bench quick --data ~/data  # a first look, in minutes",
+            "vggtgeo bench paper --workers 2 -o runs/paper  # the paper's tables, simulated; resumes",
+            "vggtgeo bench mine.toml --data /disk/tum --data /disk/7scenes",
+        ),
     ),
 )
 START = (

@@ -6,7 +6,6 @@ What is heavy is imported when a run begins, so that `vggtgeo run --help` answer
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,6 +58,7 @@ def run(
     from vggtgeo.cli.pipeline_settings import Switches, pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
+    from vggtgeo.slam.presets import classical_roles
     from vggtgeo.slam.setting_groups import DepthSettings
     from vggtgeo.viewing.target import check_target
 
@@ -75,7 +75,8 @@ def run(
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:
         sequence = open_input(path, kind, intrinsics, rgb_only, fps)
-    perceived = make_perception(preset, make_roles(sequence, init, features), models, cache, provider, memory_limit_gb)
+    classical = classical_roles(sequence.has_depth, init, features)
+    perceived = make_perception(preset, classical, models, cache, provider, memory_limit_gb)
     flags = settings.values() if settings else {}
     run_and_write(
         sequence,
@@ -111,13 +112,13 @@ def check_provider(preset: str, provider: options.Provider) -> None:
         warnings.warn("`--provider cuda` has no effect with `--preset classical`", InputWarning, stacklevel=2)
 
 
-def open_input(path: Path, kind: str | None, intrinsics: str | None, rgb_only: bool, fps: float | None) -> Sequence:
+def open_input(
+    path: str | Path, kind: str | None, intrinsics: str | None, rgb_only: bool, fps: float | None = None
+) -> Sequence:
     """The sequence at `path`, with what the flags say otherwise."""
-    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, with_rate, without_depth
+    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
 
-    sequence = open_sequence(path, kind)
-    if fps is not None:
-        sequence = with_rate(sequence, fps)
+    sequence = open_sequence(path, kind, fps)
     if intrinsics is not None:
         sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
     return without_depth(sequence) if rgb_only else sequence
@@ -138,17 +139,3 @@ def make_perception(
     if perceived.random:
         warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
     return perceived
-
-
-def make_roles(sequence: Sequence, init: str, features: str) -> Roles:
-    """The classical role objects for a sequence; the one place where names become objects."""
-    from vggtgeo.models.classical import ConstantVelocity, NoDepth, OrbMatcher, SiftMatcher
-    from vggtgeo.slam.settings import Roles
-
-    roles = Roles(points={"sift": SiftMatcher, "orb": OrbMatcher}[features]())
-    if init == "constant-velocity":
-        # The ablation is a start by motion alone: nothing else may mend the pose before the window does.
-        roles = replace(roles, geometry=ConstantVelocity(), alignment=None)
-    if not sequence.has_depth:
-        roles = replace(roles, depth=NoDepth())
-    return roles

@@ -8,9 +8,11 @@ from typing import Annotated, Literal
 import typer
 
 Provider = Literal["auto", "cuda", "cpu"]
-SequenceArgument = Annotated[Path, typer.Argument(help="Folder of a sequence, or a video file.", show_default=False)]
+SequenceArgument = Annotated[
+    str, typer.Argument(help="Folder of a sequence, video file, ROS bag, webcam:0, or rtsp://...", show_default=False)
+]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
-KindOption = Annotated[str | None, typer.Option(help="Reader: 7scenes, tum, images or video; found by looking.")]
+KindOption = Annotated[str | None, typer.Option(help="Reader (see `vggtgeo data list`); found by looking.")]
 StartOption = Annotated[int, typer.Option(min=0, help="First frame.")]
 EndOption = Annotated[int | None, typer.Option(min=1, help="Frame to stop before.")]
 StrideOption = Annotated[int, typer.Option(min=1, help="Take every n-th frame.")]

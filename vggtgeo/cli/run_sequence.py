@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from rich.console import Console
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.progress import ProgressBar, print_result
 from vggtgeo.cli.view import serve_until_interrupted
-from vggtgeo.datasets import Sequence
+from vggtgeo.datasets import Frame, Sequence
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.results.files import write_settings, write_trajectories
@@ -27,6 +28,9 @@ from vggtgeo.slam.settings_table import changed, updated
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
 from vggtgeo.viewing.target import STAND_IN, open_target
+
+EARLY_SECONDS = 60.0
+"""Between two writings of the poses so far; one takes less than a second for 20,000 frames."""
 
 
 @dataclass(frozen=True)
@@ -103,15 +107,23 @@ def run_and_write(
 
 
 class _EarlyFiles(Callback):
-    """Settings and poses are on the disk before the adjustment of the whole map, should that be killed."""
+    """Settings and poses are on the disk once a minute and before the adjustment of the whole map, should the run be
+    killed.
+    """
 
     def __init__(self, stage: Path, settings: Mapping[str, Any]) -> None:
         self._stage = stage
         self._settings = settings
+        self._written = time.monotonic()
+
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
+        if time.monotonic() - self._written > EARLY_SECONDS:
+            self.on_adjust(slam)
 
     def on_adjust(self, slam: Slam) -> None:
         write_settings(self._stage / "settings.toml", self._settings)
         write_trajectories(self._stage, slam)
+        self._written = time.monotonic()
 
 
 def _rerun_callbacks(output: Output, folder: RunFolder, name: str) -> tuple[tuple[Callback, ...], str | None]:

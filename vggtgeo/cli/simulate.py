@@ -29,8 +29,9 @@ def simulate(
     from rich.progress import track
 
     from vggtgeo import simulation
-    from vggtgeo.simulation.tum_folder import write_tum_folder
+    from vggtgeo.simulation.tum_folder import check_new, write_tum_folder
 
+    check_new(output)  # before a world is built
     sensor = simulation.Sensor(exposure_time=blur, readout_time=readout, exposure_swing=exposure_swing)
     console = Console(quiet=quiet or as_json)
     sequence = simulation.simulate(scene, frames, seed, parse_size(size), rate=rate, speed=speed, sensor=sensor)
@@ -49,6 +50,6 @@ def parse_size(text: str) -> tuple[int, int]:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:
         raise InputError(f"`--size` is {text!r}; it must be two whole numbers, as in 640x480") from None
-    if min(width, height) < 16:
-        raise InputError(f"`--size` is {text!r}; both sides must be at least 16 pixels")
+    if min(width, height) < 16 or max(width, height) > 8192:
+        raise InputError(f"`--size` is {text!r}; both sides must be at least 16 pixels, and 8192 at most")
     return width, height

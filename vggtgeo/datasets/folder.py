@@ -62,6 +62,14 @@ class FolderSequence:
         """No truth, unless the layout knows one."""
         return None
 
+    def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
+        """The image in a file, see `read_image_file`; a layout whose images do not fit its depth changes them here."""
+        return read_image_file(path, least_bits)
+
+    def load_depth(self, path: Path) -> np.ndarray:
+        """The depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
+        return read_depth(path, self.depth_format)
+
     def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
         empty = 0
         bits = 8
@@ -70,7 +78,7 @@ class FolderSequence:
             read = self._read_image(file, bits)
             if read is None:
                 continue
-            if read.bits > max(bits, 8):
+            if read.bits > bits and (bits > 8 or read.bits < 16):
                 _warn(f"`{file.image}` has values of {read.bits} bits: taken for an image of so many from here on")
             bits = max(bits, read.bits)
             if read.orientation != 1 and not turned:
@@ -91,7 +99,7 @@ class FolderSequence:
 
     def _read_image(self, file: FrameFile, bits: int) -> ImageFile | None:
         try:
-            read = read_image_file(file.image, bits)
+            read = self.load_image(file.image, bits)
         except InputError as error:
             _warn(f"{error}; the frame is skipped", LeftOutWarning)
             return None
@@ -110,7 +118,7 @@ class FolderSequence:
         if file.depth is None:
             return nothing
         try:
-            depth = read_depth(file.depth, self.depth_format)
+            depth = self.load_depth(file.depth)
         except InputError as error:
             _warn(f"{error}; the frame is used without depth")
             return nothing

@@ -16,7 +16,7 @@ MOST_PIXELS = 100_000_000
 _BLOCK = 8
 _MID_GREY = 128
 _LONGEST_PERIOD = 64
-_TAIL = 192
+_SHORTEST_TAIL, _LONGEST_TAIL = 16, 192
 _ORIENTATION = 0x0112
 
 
@@ -42,11 +42,18 @@ def ends_in_grey(content: bytes, image: np.ndarray) -> bool:
     Its last block is mid grey then, and the last bytes are those of a picture. Where a picture is grey there, the data
     of many equal blocks repeat every few bytes.
     """
-    if not content.startswith(b"\xff\xd8") or not (image[-_BLOCK:, -_BLOCK:] == _MID_GREY).all():
+    if not content.startswith(b"\xff\xd8") or not (image[-1, -_BLOCK:] == _MID_GREY).all():
         return False
+    coloured = np.flatnonzero((image.reshape(len(image), -1) != _MID_GREY).any(axis=1))
+    grey_rows = len(image) - 1 - int(coloured[-1]) if len(coloured) else len(image)
+    # Two bytes are the least that a whole 16 x 16 block of one colour takes.
+    length = min(_LONGEST_TAIL, 2 * (grey_rows // 16) * (image.shape[1] // 16))
+    if length < _SHORTEST_TAIL:
+        return False  # of so few blocks nothing can be said, and little is lost
     end = content.rfind(b"\xff\xd9")
-    tail = np.frombuffer(content[max(end - _TAIL, 0) : end], np.uint8)[:-2]  # the last byte is padded
-    return not any(np.array_equal(tail[period:], tail[:-period]) for period in range(1, _LONGEST_PERIOD))
+    tail = np.frombuffer(content[max(end - length, 0) : end], np.uint8)[:-2]  # the last byte is padded
+    periods = range(1, min(_LONGEST_PERIOD, len(tail) // 2))
+    return not any(np.array_equal(tail[period:], tail[:-period]) for period in periods)
 
 
 def orientation(content: bytes) -> int:

@@ -21,7 +21,7 @@ class ImageFolder(FolderSequence):
     """Images of one folder, without depth. Truth: `groundtruth.txt` (TUM format), where there is one.
 
     Time is position / 30 s, unless all names are times: seconds with a decimal point (`12.034.png`) or
-    nanoseconds (18 or 19 digits).
+    nanoseconds (18 or 19 digits), or `with_rate` says otherwise.
     """
 
     @classmethod

@@ -27,6 +27,8 @@ _FREIBURG: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "3": ((535.4, 539.2, 320.1, 247.6), ()),
 }
+# Bonn RGB-D Dynamic, from https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset
+_BONN = (542.822841, 542.576870, 315.593520, 237.756098), (0.039903, -0.099343, -0.000730, -0.000144)
 _FREIBURG_NAME = re.compile(r"freiburg([123])|(?:^|[_-])fr([123])(?:[_-]|$)", re.IGNORECASE)
 
 
@@ -80,10 +82,14 @@ def check_plausible(where: str, camera: Camera) -> None:
             )
 
 
-def freiburg_camera(name: str, width: int, height: int) -> Camera | None:
-    """The published camera, with its distortion, where `name` says freiburg1, 2 or 3 and the size is 640 x 480."""
+def published_camera(name: str, width: int, height: int) -> Camera | None:
+    """The published camera, with its distortion, where `name` says freiburg1, 2, 3 or Bonn, of 640 x 480 pixels."""
     match = _FREIBURG_NAME.search(name)
-    if match is None or (width, height) != (640, 480):
+    if (width, height) != (640, 480):
+        return None
+    if "rgbd_bonn" in name.lower():
+        return Camera(_BONN[0], width, height, _BONN[1])
+    if match is None:
         return None
     intrinsics, distortion = _FREIBURG[match.group(1) or match.group(2)]
     return Camera(check_intrinsics(intrinsics), width, height, distortion)

@@ -2,27 +2,63 @@
 
 import os
 from pathlib import Path
+from typing import Protocol
 
+from vggtgeo.datasets.bags import RosBag, is_bag
+from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
+from vggtgeo.datasets.icl import IclNuim
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import ImageFolder
+from vggtgeo.datasets.kitti import Kitti
+from vggtgeo.datasets.live import LiveCamera, is_live
+from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
+from vggtgeo.datasets.replica import Replica
+from vggtgeo.datasets.scannet import ScanNet
 from vggtgeo.datasets.seven_scenes import SevenScenes
+from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
+from vggtgeo.datasets.views import with_rate
 from vggtgeo.io.errors import InputError
 
-_FolderReader = type[SevenScenes] | type[TumRgbd] | type[ImageFolder]
 
-FOLDER_KINDS: dict[str, _FolderReader] = {"7scenes": SevenScenes, "tum": TumRgbd, "images": ImageFolder}
-KINDS = (*FOLDER_KINDS, "video")
+class FolderReader(Protocol):
+    """A reader of one layout."""
+
+    def matches(self, folder: Path) -> bool:
+        """Whether `folder` looks like it."""
+        ...
+
+    def open(self, folder: Path) -> Sequence:
+        """The sequence in `folder`; InputError where something is wrong."""
+        ...
 
 
-def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequence:
-    """Opens a 7-Scenes folder, a TUM RGB-D folder, a folder of images, or a video file.
+FOLDER_KINDS: dict[str, FolderReader] = {
+    "euroc": Euroc,
+    "replica": Replica,
+    "scannet": ScanNet,
+    "arkitscenes": ArkitScenes,
+    "stray": StrayScanner,
+    "kitti": Kitti,
+    "tanks": TanksAndTemples,
+    "icl": IclNuim,
+    "7scenes": SevenScenes,
+    "tum": TumRgbd,
+    "images": ImageFolder,
+}
+"""Readers by name, in the order in which a folder is tried: the plain ones last."""
+KINDS = (*FOLDER_KINDS, "video", "bag", "live")
+
+
+def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: float | None = None) -> Sequence:
+    """Opens a folder of a benchmark or of images, a video file, a ROS bag, a webcam (`webcam:0`) or a stream (`rtsp://`).
 
     Args:
-        path: the folder or file.
+        path: the folder or file, or the name of a camera.
         kind: one of `KINDS` to name the reader; None to find it by looking.
+        rate: frames a second of a plain folder of images, whose files have no times (by default 30), or of a video.
 
     The camera comes from `calibration.txt` or `camera-intrinsics.txt` in the folder, else from published
     values where the name tells the camera, else it is a guess (`camera.known` is False), with an
@@ -36,11 +72,19 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequ
         vggtgeo.io.errors.InputError: `no/such/folder` does not exist; give a folder of images or a video file
 
     """
-    place = Path(path).expanduser()
     if kind is not None and kind not in KINDS:
         raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(KINDS)}")
+    if kind == "live" or (kind is None and is_live(os.fspath(path))):
+        return LiveCamera.open(os.fspath(path))
+    sequence = _open_place(Path(path).expanduser(), kind)
+    return sequence if rate is None else with_rate(sequence, rate)
+
+
+def _open_place(place: Path, kind: str | None) -> Sequence:
     if not place.exists():
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
+    if kind == "bag" or (kind is None and is_bag(place)):
+        return RosBag.open(place)
     if kind == "video" or (kind is None and not place.is_dir()):
         return _open_video(place)
     if not place.is_dir():
@@ -54,7 +98,7 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None) -> Sequ
             return reader.open(place)
     raise InputError(
         f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
-        "a TUM RGB-D folder (`rgb.txt`), or a folder of images"
+        "a TUM RGB-D folder (`rgb.txt`), another layout of `vggtgeo data list`, or a folder of images"
     )
 
 

@@ -1,7 +1,11 @@
 """7-Scenes folders: `frame-XXXXXX.color.png|jpg`, `.depth.png`, `.pose.txt`, numbered at 30 frames/s.
 
 Source: J. Shotton et al., "Scene coordinate regression forests", CVPR 2013. As published, the folder has no
-intrinsics, the depth is not registered to the colour image, and poses are those of the depth camera.
+intrinsics, the depth (where 65535 means none, too) is not registered to the colour image, and poses are those of the
+depth camera. Such a folder has no file of intrinsics: its depth is registered and its poses are moved
+to the colour camera, with a Kinect's extrinsics as others use them for these scenes (calibration of LIRIS,
+https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html). They are those of another Kinect: near
+objects stay some pixels off.
 """
 
 import re
@@ -15,6 +19,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import MILLIMETRES
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.registration import registered_depth
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
@@ -23,11 +28,26 @@ FRAMES_PER_SECOND = 30.0
 COLOUR_TRUTH = "groundtruth-colour.txt"
 _COLOUR = re.compile(r"frame-(\d+)\.color\.(?:png|jpe?g)")
 _KINECT = (525.0, 525.0, 320.0, 240.0)
+_KINECT_DEPTH = (585.0, 585.0, 320.0, 240.0)
+_TO_COLOUR = np.array(
+    [
+        [9.9996518012567637e-01, 2.6765126468950343e-03, -7.9041012313000904e-03, -2.5558943178152542e-02],
+        [-2.7409311281316700e-03, 9.9996302803027592e-01, -8.1504520778013286e-03, 1.0109636268061706e-04],
+        [7.8819942130445332e-03, 8.1718328771890631e-03, 9.9993554558014031e-01, 2.0318321729487039e-03],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Depth camera -> colour camera."""
 
 
 @dataclass(frozen=True)
 class SevenScenes(FolderSequence):
-    """One sequence. Truth: `groundtruth-colour.txt` (TUM format) if present, else the pose files."""
+    """One sequence. Truth: `groundtruth-colour.txt` (TUM format) if present, else the pose files.
+
+    as_published: depth and pose files are those of the depth camera.
+    """
+
+    as_published: bool = False
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -45,9 +65,18 @@ class SevenScenes(FolderSequence):
             for index, (number, image) in enumerate(sorted(numbered.items()))
         )
         width, height = common_size(str(folder), files)
-        camera = camera_from_folder(folder, width, height) or _published_camera(folder, width, height)
+        own = camera_from_folder(folder, width, height)
+        camera = own or _published_camera(folder, width, height)
         has_depth = depth_is_usable(str(folder), files, MILLIMETRES, width, height)
-        return cls(folder, folder.name, camera, files, MILLIMETRES, has_depth)
+        return cls(folder, folder.name, camera, files, MILLIMETRES, has_depth, own is None and camera.known)
+
+    def load_depth(self, path: Path) -> np.ndarray:
+        """The depth in the colour camera."""
+        depth = super().load_depth(path)
+        if not self.as_published:
+            return depth
+        size = (self.camera.width, self.camera.height)
+        return registered_depth(depth, _KINECT_DEPTH, self.camera.intrinsics, _TO_COLOUR, size)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses; pose files with NaN or infinity (tracking was lost) are left out with an InputWarning."""
@@ -58,7 +87,7 @@ class SevenScenes(FolderSequence):
             pose_file = file.image.with_name(file.image.name.split(".")[0] + ".pose.txt")
             if pose_file.is_file() and (pose := _read_pose(pose_file)) is not None:
                 times.append(file.timestamp)
-                poses.append(pose)
+                poses.append(pose @ np.linalg.inv(_TO_COLOUR) if self.as_published else pose)
         return Trajectory(np.array(times), np.array(poses)) if poses else None
 
 
@@ -94,8 +123,8 @@ def _published_camera(folder: Path, width: int, height: int) -> Camera:
     if (width, height) != (640, 480):
         return guess_with_warning(str(folder), width, height)
     warnings.warn(
-        f"`{folder}` has no intrinsics; taking those of the Kinect's colour camera, {_KINECT}. "
-        "In 7-Scenes as published, depth and poses belong to the depth camera (f = 585): register the depth",
+        f"`{folder}` has no intrinsics: taken as published, with the Kinect's colour camera, {_KINECT}; depth and "
+        "poses belong to its depth camera (f = 585) and are moved to the colour camera by a generic calibration",
         InputWarning,
         stacklevel=3,
     )

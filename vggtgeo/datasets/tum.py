@@ -1,7 +1,8 @@
 """TUM RGB-D folders: `rgb.txt` and `depth.txt` (lines `timestamp file`), `groundtruth.txt`, 16-bit depth /
 5000.
 
-Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. Colour and depth
+Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. ETH3D SLAM (whose
+`calibration.txt` is the one read here) and Bonn RGB-D Dynamic have the same layout. Colour and depth
 are taken at different times: an image gets the depth nearest in time, at most 0.02 s away, each depth used
 once.
 """
@@ -16,7 +17,7 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
-from vggtgeo.datasets.intrinsics import camera_from_folder, freiburg_camera, guess_with_warning
+from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
@@ -51,7 +52,7 @@ class TumRgbd(FolderSequence):
         width, height = common_size(str(folder), files)
         camera = (
             camera_from_folder(folder, width, height)
-            or freiburg_camera(folder.resolve().name, width, height)
+            or published_camera(folder.resolve().name, width, height)
             or guess_with_warning(str(folder), width, height)
         )
         has_depth = depth_is_usable(str(folder), files, FIVE_THOUSANDTHS, width, height)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
+from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
-from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -61,7 +61,7 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
         raise InputError(f"`rate` is {rate:g}; it must be a positive number of frames a second")
     if isinstance(sequence, VideoFile):
         return replace(sequence, given_rate=rate)
-    if isinstance(sequence, FolderSequence) and not isinstance(sequence, TumRgbd):
+    if isinstance(sequence, ImageFolder):
         return replace(sequence, files=tuple(replace(file, timestamp=file.index / rate) for file in sequence.files))
     raise InputError(f"`{sequence.name}` has times of its own; a rate is for videos and folders of images")
 

@@ -1,31 +1,48 @@
 """Metrics as the field computes them: callables on arrays and trajectories, no files, no printing."""
 
 from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
-from vggtgeo.evaluation.alignment import Similarity, umeyama
+from vggtgeo.evaluation.alignment import ALIGNMENTS, Alignment, Similarity, align, heading, umeyama
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, nearest_in_time
+from vggtgeo.evaluation.calibration import focal_error, scale_error
 from vggtgeo.evaluation.clouds import CloudError, cloud_error
+from vggtgeo.evaluation.consistency import Consistency, consistency
 from vggtgeo.evaluation.depth import DepthError, depth_error, depth_of_cloud
-from vggtgeo.evaluation.relative import RelativeError, relative_error, rotation_angle
-from vggtgeo.evaluation.report import TrajectoryReport, evaluate_trajectory
+from vggtgeo.evaluation.meshes import Mesh, mesh_error, surface_points
+from vggtgeo.evaluation.relative import UNITS, RelativeError, Unit, relative_error, rotation_angle
+from vggtgeo.evaluation.report import TrajectoryReport, coverage, evaluate_trajectory
 from vggtgeo.evaluation.statistics import ErrorStatistics
 
 __all__ = [
+    "ALIGNMENTS",
     "MAX_TIME_DIFFERENCE",
+    "UNITS",
     "AbsoluteError",
+    "Alignment",
     "CloudError",
+    "Consistency",
     "DepthError",
     "ErrorStatistics",
+    "Mesh",
     "RelativeError",
     "Similarity",
     "TrajectoryReport",
+    "Unit",
     "absolute_error",
+    "align",
     "associate",
     "cloud_error",
+    "consistency",
+    "coverage",
     "depth_error",
     "depth_of_cloud",
     "evaluate_trajectory",
+    "focal_error",
+    "heading",
+    "mesh_error",
     "nearest_in_time",
     "relative_error",
     "rotation_angle",
+    "scale_error",
+    "surface_points",
     "umeyama",
 ]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from vggtgeo.evaluation.alignment import Similarity, umeyama
+from vggtgeo.evaluation.alignment import VERTICAL, Alignment, Similarity, align
 from vggtgeo.evaluation.statistics import ErrorStatistics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -27,8 +27,13 @@ class AbsoluteError:
         return ErrorStatistics.of(self.errors)
 
 
-def absolute_error(estimate: Trajectory, truth: Trajectory, with_scale: bool = False) -> AbsoluteError:
-    """ATE of matched trajectories (see `associate`) after SE(3) alignment, or Sim(3) `with_scale`.
+def absolute_error(
+    estimate: Trajectory,
+    truth: Trajectory,
+    alignment: Alignment = "se3",
+    vertical: tuple[float, float, float] = VERTICAL,
+) -> AbsoluteError:
+    """ATE of matched trajectories (see `associate`) after an `alignment` (see `align`).
 
     InputError where the two differ in length.
     """
@@ -36,6 +41,6 @@ def absolute_error(estimate: Trajectory, truth: Trajectory, with_scale: bool = F
         raise InputError(
             f"`estimate` has {len(estimate)} poses, `truth` {len(truth)}; match them first with `associate`"
         )
-    alignment = umeyama(estimate.positions, truth.positions, with_scale)
-    difference = alignment.points(estimate.positions) - truth.positions
-    return AbsoluteError(np.linalg.norm(difference, axis=1), alignment)
+    carried = align(estimate, truth, alignment, vertical)
+    difference = carried.points(estimate.positions) - truth.positions
+    return AbsoluteError(np.linalg.norm(difference, axis=1), carried)

@@ -1,12 +1,22 @@
-"""The similarity that best carries one point set onto another (Umeyama's closed form)."""
+"""The motion that best carries one point set onto another: rigid, with scale, or about the vertical alone.
+
+`align` knows them by the names of the field: "none", "se3", "sim3", "yaw" (heading and position, what a system with
+gravity cannot observe; Z. Zhang and D. Scaramuzza, IROS 2018).
+"""
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+
+Alignment = Literal["none", "se3", "sim3", "yaw"]
+ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
+VERTICAL = (0.0, 0.0, 1.0)
+"""Up in the truth's world, where nothing else is said: z, as in EuRoC and TUM RGB-D."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +52,7 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], 
     the points of either set all coincide (a still camera) the scale means nothing and is 1. Source: S.
     Umeyama, IEEE PAMI 13(4), 1991. InputError for no points, other shapes, or NaN.
     """
-    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) == 0:
-        raise InputError(
-            f"`source` has shape {source.shape}, `target` {target.shape}; both must be [n, 3], n at least 1"
-        )
-    if not (np.isfinite(source).all() and np.isfinite(target).all()):
-        raise InputError("`source` or `target` has a NaN or an infinity; leave such points out")
+    _check(source, target)
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     centred = source - source_mean
     u, d, vt = np.linalg.svd((target - target_mean).T @ centred / len(source))
@@ -56,3 +61,59 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], 
     variance, covariance = float((centred**2).sum() / len(source)), float(d @ flip)
     scale = covariance / variance if with_scale and variance > 0 and covariance > 0 else 1.0
     return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)
+
+
+def heading(
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
+    vertical: tuple[float, float, float] = VERTICAL,
+) -> Similarity:
+    """The turn about `vertical` (any length) and the translation with the least `sum |R source + t - target|^2`.
+
+    With centred points s, t and the unit vector a, the sum of `t . R(theta) s` is `A cos(theta) + B sin(theta)` and a
+    constant, `A = sum t . s - (t . a)(s . a)`, `B = sum t . (a x s)`, so `theta = atan2(B, A)`. InputError as
+    `umeyama`, or for a vertical without direction.
+    """
+    _check(source, target)
+    length = float(np.linalg.norm(vertical))
+    if not (np.isfinite(length) and length > 0):
+        raise InputError(f"`vertical` is {vertical}; it must be a direction")
+    axis = np.asarray(vertical, np.float64) / length
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    s, t = source - source_mean, target - target_mean
+    level = float((s * t).sum() - (s @ axis) @ (t @ axis))
+    angle = np.arctan2(float((t * np.cross(axis, s)).sum()), level)
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return Similarity(rotation, target_mean - rotation @ source_mean)
+
+
+def align(
+    estimate: Trajectory,
+    truth: Trajectory,
+    kind: Alignment = "se3",
+    vertical: tuple[float, float, float] = VERTICAL,
+) -> Similarity:
+    """What carries the matched poses of `estimate` to those of `truth`, by their positions.
+
+    kind: "none" (both are in one frame already), "se3", "sim3", or "yaw", about `vertical`. InputError for another
+    kind, other lengths, or no pose.
+    """
+    if kind not in ALIGNMENTS:
+        raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(ALIGNMENTS)}")
+    _check(estimate.positions, truth.positions)
+    if kind == "none":
+        return Similarity(np.eye(3), np.zeros(3))
+    if kind == "yaw":
+        return heading(estimate.positions, truth.positions, vertical)
+    return umeyama(estimate.positions, truth.positions, kind == "sim3")
+
+
+def _check(source: np.ndarray, target: np.ndarray) -> None:
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) == 0:
+        raise InputError(
+            f"`source` has shape {source.shape}, `target` {target.shape}; both must be [n, 3], n at least 1"
+        )
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise InputError("`source` or `target` has a NaN or an infinity; leave such points out")

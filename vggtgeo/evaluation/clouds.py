@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree
 
 from vggtgeo.io.errors import InputError
 
@@ -50,8 +50,8 @@ def cloud_error(
             raise InputError(f"`{name}` has shape {points.shape}; it must be [n, 3], n at least 1")
         if not np.isfinite(points).all():
             raise InputError(f"`{name}` has a NaN or an infinity; leave such points out")
-    to_truth, _ = KDTree(truth).query(estimate)
-    to_estimate, _ = KDTree(estimate).query(truth)
+    to_truth, _ = cKDTree(truth).query(estimate)
+    to_estimate, _ = cKDTree(estimate).query(truth)
     precision, recall = float((to_truth <= threshold).mean()), float((to_estimate <= threshold).mean())
     total = precision + recall
     return CloudError(

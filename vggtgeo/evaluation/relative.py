@@ -7,18 +7,24 @@ Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems",
 """
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from vggtgeo.evaluation.statistics import ErrorStatistics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
+Unit = Literal["poses", "seconds", "metres"]
+UNITS: tuple[Unit, ...] = get_args(Unit)
+PATH_TOLERANCE = 0.1
+"""Share of a delta in seconds or metres by which overlapping pairs may miss it; evo's default."""
+
 
 @dataclass(frozen=True, eq=False)
 class RelativeError:
-    """Errors of the m pairs that lie `delta` poses apart.
+    """Errors of the m pairs that lie `delta` apart.
 
     Fields:
         translation: float64 [m], metres (RTE).
@@ -26,13 +32,20 @@ class RelativeError:
         direction: float64 [m], radians between the two translation directions, which knows no scale; NaN
         where
             either camera stood still.
-        delta: poses between the two of a pair.
+        delta: between the two of a pair, in `unit`.
+        unit: "poses", "seconds", or "metres" of the true path.
     """
 
     translation: Float[np.ndarray, " m"]
     rotation: Float[np.ndarray, " m"]
     direction: Float[np.ndarray, " m"]
-    delta: int
+    delta: float
+    unit: Unit = "poses"
+
+    @property
+    def interval(self) -> str:
+        """The delta with its unit, for a heading: `1 pose`, `0.5 seconds`."""
+        return f"{self.delta:g} {self.unit[:-1] if self.delta == 1 else self.unit}"
 
     @property
     def translation_statistics(self) -> ErrorStatistics:
@@ -45,29 +58,74 @@ class RelativeError:
         return ErrorStatistics.of(self.rotation)
 
 
-def relative_error(estimate: Trajectory, truth: Trajectory, delta: int = 1, all_pairs: bool = False) -> RelativeError:
-    """RPE of matched trajectories (see `associate`) over `delta` poses.
+def relative_error(
+    estimate: Trajectory, truth: Trajectory, delta: float = 1, all_pairs: bool = False, unit: Unit = "poses"
+) -> RelativeError:
+    """RPE of matched trajectories (see `associate`) over `delta`, measured along the truth.
 
     Pairs are consecutive, (0, delta), (delta, 2 delta), ..., as evo has it; with `all_pairs` they overlap:
-    (0, delta), (1, 1 + delta), ... No pair (a trajectory shorter than delta) gives empty arrays. InputError
-    where the two differ in length or `delta` is below 1.
+    (0, delta), (1, 1 + delta), ... In seconds and metres a pair ends with the first pose at least `delta` on;
+    overlapping pairs with the nearest one, if that is not off by more than a tenth. No pair (a trajectory shorter than
+    delta) gives empty arrays. InputError where the two differ in length, or for an impossible `delta` or `unit`.
     """
     if len(estimate) != len(truth):
         raise InputError(
             f"`estimate` has {len(estimate)} poses, `truth` {len(truth)}; match them first with `associate`"
         )
-    if delta < 1:
-        raise InputError(f"`delta` is {delta}; it must be at least 1 pose")
-    first = np.arange(0, max(len(estimate) - delta, 0), 1 if all_pairs else delta)
-    estimated = _motion(estimate.poses[first], estimate.poses[first + delta])
-    true = _motion(truth.poses[first], truth.poses[first + delta])
+    first, second = pairs(truth, delta, all_pairs, unit)
+    estimated = _motion(estimate.poses[first], estimate.poses[second])
+    true = _motion(truth.poses[first], truth.poses[second])
     error = _motion(true, estimated)
     return RelativeError(
         translation=np.linalg.norm(error[:, :3, 3], axis=1),
         rotation=rotation_angle(error[:, :3, :3]),
         direction=_angle_between(estimated[:, :3, 3], true[:, :3, 3]),
         delta=delta,
+        unit=unit,
     )
+
+
+def pairs(
+    trajectory: Trajectory, delta: float, all_pairs: bool = False, unit: Unit = "poses"
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Rows of the first and the second pose of each pair that lies `delta` apart; see `relative_error`."""
+    if unit not in UNITS:
+        raise InputError(f"`unit` is {unit!r}; it must be one of {', '.join(UNITS)}")
+    if unit == "poses":
+        if delta < 1 or delta != int(delta):
+            raise InputError(f"`delta` is {delta}; it must be at least 1 pose, a whole number")
+        first = np.arange(0, max(len(trajectory) - int(delta), 0), 1 if all_pairs else int(delta))
+        return first, first + int(delta)
+    if not (np.isfinite(delta) and delta > 0):
+        raise InputError(f"`delta` is {delta}; it must be more than 0 {unit}")
+    if unit == "seconds":
+        way = trajectory.timestamps - trajectory.timestamps[:1]
+    else:
+        steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+        way = np.concatenate([np.zeros(min(len(trajectory), 1)), np.cumsum(steps)])
+    return _overlapping(way, delta) if all_pairs else _consecutive(way, delta)
+
+
+def _consecutive(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
+    """`way` grows along the rows; each pair begins where the one before ended."""
+    delta -= 1e-9 * delta  # times and paths are sums: a delta that is met exactly must count as met
+    ends, row = [], 0
+    while row < len(way):
+        ends.append(row)
+        row = max(int(np.searchsorted(way, way[row] + delta)), row + 1)
+    rows = np.array(ends, int)
+    return rows[:-1], rows[1:]
+
+
+def _overlapping(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
+    """From each row to the one after it whose distance is nearest to `delta`; the first of equals."""
+    first = np.arange(max(len(way) - 1, 0))
+    after = np.clip(np.searchsorted(way, way[first] + delta), first + 1, len(way) - 1)
+    before = np.maximum(np.searchsorted(way, way[np.maximum(after - 1, 0)]), first + 1)
+    to_after, to_before = np.abs(way[after] - way[first] - delta), np.abs(way[before] - way[first] - delta)
+    second = np.where(to_before <= to_after, before, after)
+    near = np.minimum(to_before, to_after) <= PATH_TOLERANCE * delta
+    return first[near], second[near]
 
 
 def rotation_angle(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:

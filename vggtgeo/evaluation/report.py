@@ -6,28 +6,61 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
+from vggtgeo.evaluation.alignment import VERTICAL
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
-from vggtgeo.evaluation.relative import RelativeError, relative_error
+from vggtgeo.evaluation.relative import RelativeError, Unit, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
 MINIMUM_MATCHES = 3
+FEW_MATCHES = 10
+"""An alignment takes up to seven numbers out of the errors; with fewer poses the rest says little."""
+LEAST_COVERAGE = 0.5
+LONGEST_GAP = 1.0
+"""Seconds between two estimated poses that still count as followed."""
+ABSURD_SCALE = 3.0
+"""A scale beyond this factor, either way: other units, or no metric estimate at all."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryReport:
-    """Fields: matched, estimated, true: poses compared, in the estimate, in the truth; se3 and sim3: ATE
-    after either alignment; relative: RPE as estimated; relative_sim3: RPE after the scale of the Sim(3)
-    alignment.
+    """Fields: matched, estimated, true: poses compared, in the estimate, in the truth; coverage: share of the truth's
+    duration that the estimate follows, gaps above a second left out; se3 and sim3, unaligned, yaw: ATE after either
+    alignment, after none, and after heading and position alone; relative: RPE as estimated; relative_sim3: RPE after
+    the scale of the Sim(3) alignment.
     """
 
     matched: int
     estimated: int
     true: int
+    coverage: float
     se3: AbsoluteError
     sim3: AbsoluteError
+    unaligned: AbsoluteError
+    yaw: AbsoluteError
     relative: RelativeError
     relative_sim3: RelativeError
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes these numbers doubtful, a sentence each."""
+        found = []
+        scale = self.sim3.alignment.scale
+        if self.matched < FEW_MATCHES:
+            found.append(f"only {self.matched} poses match: the alignment hides most of their error")
+        elif self.matched < 0.5 * min(self.estimated, self.true):
+            found.append(
+                f"only {self.matched} of {min(self.estimated, self.true)} poses match: are the clocks the same?"
+            )
+        if self.coverage < LEAST_COVERAGE:
+            found.append(
+                f"the estimate follows {100 * self.coverage:.0f} % of the truth's duration; the rest is not judged"
+            )
+        if not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE:
+            found.append(
+                f"the scale is {scale:.3g}: the estimate is not in metres, and Sim(3) errors say nothing of that"
+            )
+        return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
         """See `as_dict`."""
@@ -38,7 +71,7 @@ class TrajectoryReport:
         moved, turned = pairs.translation_statistics.rmse, np.degrees(pairs.rotation_statistics.rmse)
         return (
             f"{self.matched} poses: ATE {se3:.3f} m after SE(3), {sim3:.3f} m after Sim(3) (scale "
-            f"{self.sim3.alignment.scale:.4f}); RPE over {pairs.delta}: {moved:.3f} m, {turned:.3f} deg"
+            f"{self.sim3.alignment.scale:.4f}); RPE over {pairs.interval}: {moved:.3f} m, {turned:.3f} deg"
         )
 
     __repr__ = __str__
@@ -52,13 +85,18 @@ class TrajectoryReport:
             "matched_poses": self.matched,
             "estimated_poses": self.estimated,
             "true_poses": self.true,
+            "coverage": self.coverage,
             "scale": self.sim3.alignment.scale,
             "ate_se3_m": asdict(self.se3.statistics),
             "ate_sim3_m": asdict(self.sim3.statistics),
-            "rpe_delta_poses": self.relative.delta,
+            "ate_unaligned_m": asdict(self.unaligned.statistics),
+            "ate_yaw_m": asdict(self.yaw.statistics),
+            "rpe_delta": self.relative.delta,
+            "rpe_unit": self.relative.unit,
             "rpe_translation_m": translations[0],
             "rpe_translation_sim3_m": translations[1],
             "rpe_rotation_deg": _plain(asdict(type(self.se3.statistics).of(angles))),
+            "warnings": list(self.warnings),
         }
 
 
@@ -66,13 +104,16 @@ def evaluate_trajectory(
     estimate: Trajectory,
     truth: Trajectory,
     max_dt: float = MAX_TIME_DIFFERENCE,
-    delta: int = 1,
+    delta: float = 1,
     all_pairs: bool = False,
+    unit: Unit = "poses",
+    vertical: tuple[float, float, float] = VERTICAL,
 ) -> TrajectoryReport:
-    """Matches the two by time (within `max_dt` seconds) and measures ATE and RPE (over `delta` matched
-    poses).
+    """Matches the two by time (within `max_dt` seconds) and measures ATE and RPE.
 
-    InputError where fewer than three poses match: an alignment would hide any error.
+    delta, unit: of the RPE's pairs: matched poses, seconds, or metres of the true path. vertical: up in the truth's
+    world, for the alignment of heading and position. InputError where fewer than three poses match: an alignment would
+    hide any error.
 
     Example:
         >>> import vggtgeo as vg
@@ -87,16 +128,32 @@ def evaluate_trajectory(
             f"{len(matched)} poses match within {max_dt:g} s; at least {MINIMUM_MATCHES} are needed: allow a "
             "larger `max_dt`, or give longer trajectories"
         )
-    sim3 = absolute_error(matched, reference, with_scale=True)
+    sim3 = absolute_error(matched, reference, "sim3")
     return TrajectoryReport(
         matched=len(matched),
         estimated=len(estimate),
         true=len(truth),
-        se3=absolute_error(matched, reference),
+        coverage=coverage(estimate, truth),
+        se3=absolute_error(matched, reference, "se3"),
         sim3=sim3,
-        relative=relative_error(matched, reference, delta, all_pairs),
-        relative_sim3=relative_error(sim3.alignment.trajectory(matched), reference, delta, all_pairs),
+        unaligned=absolute_error(matched, reference, "none"),
+        yaw=absolute_error(matched, reference, "yaw", vertical),
+        relative=relative_error(matched, reference, delta, all_pairs, unit),
+        relative_sim3=relative_error(sim3.alignment.trajectory(matched), reference, delta, all_pairs, unit),
     )
+
+
+def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGEST_GAP) -> float:
+    """Share of the truth's duration that lies between two poses of the estimate at most `longest_gap` seconds apart.
+
+    NaN for a truth without duration.
+    """
+    if len(truth) < 2:
+        return float("nan")
+    begin, end = truth.timestamps[[0, -1]]
+    times = np.clip(estimate.timestamps, begin, end)
+    followed = np.diff(estimate.timestamps) <= longest_gap
+    return float(np.diff(times)[followed].sum() / (end - begin))
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:

@@ -92,7 +92,7 @@ def _align(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory
     if truth is None:
         return _Drawn(estimate, places, None, None)
     try:
-        error = absolute_error(*associate(estimate, truth), with_scale)
+        error = absolute_error(*associate(estimate, truth), "sim3" if with_scale else "se3")
     except InputError:
         return _Drawn(estimate, places, None, None)
     alignment = error.alignment

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
+
+_TAKEN = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 
 class LockedError(OSError):
@@ -27,7 +30,9 @@ def locked(path: Path) -> Iterator[None]:
         handle = path.open("a+", encoding="utf-8")
         try:
             _lock(handle)
-        except OSError:
+        except OSError as error:
+            if error.errno not in _TAKEN:
+                break  # a file system without locks: better no lock than no run
             handle.seek(0)
             said = handle.read().strip()
             handle.close()

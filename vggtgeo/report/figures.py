@@ -37,7 +37,7 @@ _WIDTH = 4.6
 
 def trajectory_svg(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory, with_scale: bool) -> str:
     """Top and side view of the path."""
-    return _svg(trajectory_figure(estimate, truth, keyframes, with_scale, title=None, width=_WIDTH + 0.4))
+    return svg(trajectory_figure(estimate, truth, keyframes, with_scale, title=None, width=_WIDTH + 0.4))
 
 
 def residuals_svg(records: Sequence[WindowRecord]) -> str:
@@ -55,11 +55,11 @@ def residuals_svg(records: Sequence[WindowRecord]) -> str:
     for unit, axes in rows.items():
         axes.set_ylabel("pixels" if unit == "px" else unit)
         axes.set_ylim(bottom=0)
-        _calm(axes)
+        calm(axes)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize=9, labelcolor="#333333", ncols=2)
     rows[kinds[-1]].set_xlabel("seconds of the sequence")
-    return _svg(figure)
+    return svg(figure)
 
 
 def picture(image: UInt8[np.ndarray, "h w 3"], width: int, quality: int = 82) -> str:
@@ -89,7 +89,8 @@ def _map_colours(share: np.ndarray) -> np.ndarray:
     return np.asarray(255 * mpl.colormaps["viridis"](share)[..., :3], np.uint8)
 
 
-def _calm(axes: Any) -> None:
+def calm(axes: Any) -> None:
+    """Axes in the quiet colours of the page."""
     axes.grid(color="#e3e3e3", lw=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(colors="#333333", labelsize=9)
@@ -99,7 +100,7 @@ def _calm(axes: Any) -> None:
         spine.set_color("#bbbbbb")
 
 
-def _svg(figure: Figure) -> str:
+def svg(figure: Figure) -> str:
     """The `<svg>` element, text as text, transparent, its colours the page's; the same bytes for the same figure."""
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "vggtgeo"}):

@@ -89,7 +89,8 @@ def write_page(
     """
     trajectory = frame_trajectory(slam)
     low, high = _depth_range(slam)
-    text = _template().render(
+    text = template("vggtgeo.report", "page.html.j2").render(
+        style=style(),
         title=title,
         facts=_facts(slam, trajectory, cloud, summary),
         simulated=bool(summary.get("simulated")),
@@ -118,10 +119,16 @@ def write_page(
     write_text(path, text)
 
 
-def _template() -> jinja2.Template:
-    text = (files("vggtgeo.report") / "page.html.j2").read_text(encoding="utf-8")
+def template(package: str, name: str) -> jinja2.Template:
+    """The template of a page, a file of `package`; what is put into it is escaped."""
+    text = (files(package) / name).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(text)
+
+
+def style() -> str:
+    """The style sheet of all pages: light and dark, desk and phone."""
+    return (files("vggtgeo.report") / "style.css").read_text(encoding="utf-8")
 
 
 def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[Fact]:

@@ -13,6 +13,7 @@ import tomli_w
 
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.io.files import atomic_open, write_text
+from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
@@ -31,9 +32,18 @@ NO_METRES = "5000 counts are one unit of trajectory.txt, which is no metre: the 
 
 
 def write_trajectories(folder: Path, slam: Slam) -> None:
-    """`trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world."""
-    frame_trajectory(slam).save_tum(folder / "trajectory.txt")
-    keyframe_trajectory(slam).save_tum(folder / "keyframes.txt")
+    """`trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world.
+
+    Of a map in pieces they hold the one of most frames, `trajectory-2.txt` and `keyframes-2.txt` the next, and so on.
+    """
+    for piece in range(max(len(pieces_by_size(slam)), 1)):
+        frame_trajectory(slam, piece).save_tum(folder / piece_file("trajectory", piece))
+        keyframe_trajectory(slam, piece).save_tum(folder / piece_file("keyframes", piece))
+
+
+def piece_file(name: str, piece: int) -> str:
+    """File of a piece of the map, counted from 0 by size."""
+    return f"{name}-{piece + 1}.txt" if piece else f"{name}.txt"
 
 
 def write_depth(

@@ -28,6 +28,7 @@ from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
+from vggtgeo.slam.connected import main_piece
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.presets import Perception
@@ -141,7 +142,8 @@ def _concluded(
     hooks.each("on_stage", "dense map")
     with clock.measure("dense map"):
         depths = tuple(fused_depths(slam.keyframes, slam.intrinsics))
-        cloud = map_points(slam.keyframes, slam.intrinsics, depths)
+        keyframes, own_depths = main_piece(slam, depths)
+        cloud = map_points(keyframes, slam.intrinsics, own_depths)
     hooks.each("on_finish", slam, cloud)
     hooks.each("on_stage", "verdict")
     with clock.measure("verdict"):
@@ -193,6 +195,8 @@ class _Source:
         if isinstance(self.frames, FrameStream):
             return None
         length = len(self.frames)
+        if not length:  # a camera that is running
+            return None
         return len(range(start, length if end is None else min(length, end), stride))
 
 

@@ -21,9 +21,10 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
 from vggtgeo.report import write_page
-from vggtgeo.results.files import write_depth, write_settings
+from vggtgeo.results.files import write_depth, write_settings, write_trajectories
 from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.summary import compare, summarise, with_writing
+from vggtgeo.slam.connected import main_piece
 from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -90,7 +91,8 @@ class Result:
         truth: camera -> world, where it is known.
         """
         verdict, depths = judge(slam, evidence), tuple(fused_depths(slam.keyframes, slam.intrinsics))
-        cloud = map_points(slam.keyframes, slam.intrinsics, depths)
+        keyframes, own_depths = main_piece(slam, depths)
+        cloud = map_points(keyframes, slam.intrinsics, own_depths)
         summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=len(cloud))
         return cls.assemble(RunRecord(slam, depths, truth=truth), cloud, verdict, summary)
 
@@ -169,8 +171,11 @@ class Result:
         flags = {name.replace("_", "-"): value for name, value in used.items()}
         plain = {**self.summary, "settings": {name.replace("-", "_"): value for name, value in used.items()}}
         write_settings(place / "settings.toml", flags)
-        self.trajectory.save_tum(place / "trajectory.txt")
-        self.keyframes.save_tum(place / "keyframes.txt")
+        if self.record is not None:
+            write_trajectories(place, self.record.slam)
+        else:
+            self.trajectory.save_tum(place / "trajectory.txt")
+            self.keyframes.save_tum(place / "keyframes.txt")
         self.cloud.save_ply(place / "map.ply")
         self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
         if depth and self.record is not None:

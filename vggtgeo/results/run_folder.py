@@ -8,12 +8,15 @@ folder holds files of one run only, without a summary, and `unfinished/` says so
 
 from __future__ import annotations
 
+import errno
+import glob
 import os
 import shutil
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
@@ -29,7 +32,9 @@ NAMES = (
     SUMMARY,
     "settings.toml",
     "trajectory.txt",
+    "trajectory-[0-9]*.txt",
     "keyframes.txt",
+    "keyframes-[0-9]*.txt",
     "map.ply",
     "trajectory.png",
     "report.html",
@@ -37,7 +42,7 @@ NAMES = (
     "run.rrd",
     "view.rrd",
 )
-"""All that a run may leave, in the order in which what is old is taken away."""
+"""All that a run may leave, as patterns, in the order in which what is old is taken away."""
 RESERVE = 32 * 2**20
 """Bytes that must be free before the first frame, and are held until the results are written: a map of 300,000 points,
 page and trajectories of 10,000 frames take less than 20 MB."""
@@ -69,13 +74,14 @@ class RunFolder:
             self.release_reserve()
             (self.stage / _NOTE).unlink(missing_ok=True)
             new = sorted(self.stage.iterdir(), key=lambda path: path.name == SUMMARY)
-            strange = [path.name for path in new if path.name not in NAMES and path.suffix != ".rrd"]
+            strange = [path.name for path in new if not _is_known(path.name)]
             if strange:
                 raise ValueError(
                     f"`NAMES` lacks {strange}: what a run leaves must be known, to be replaced by the next"
                 )
-            for name in dict.fromkeys((*NAMES, *_old_recording(self.folder))):
-                _remove(self.folder / name)
+            for pattern in (*NAMES, *map(glob.escape, _old_recording(self.folder))):
+                for path in sorted(self.folder.glob(pattern)):
+                    _remove(path)
             for path in new:
                 os.replace(path, self.folder / path.name)
 
@@ -139,11 +145,20 @@ def _begun(run: RunFolder, reserve: int) -> RunFolder:
         )
         if reserve and hasattr(os, "posix_fallocate"):
             with (run.stage / _RESERVED).open("wb") as file:
-                os.posix_fallocate(file.fileno(), 0, reserve)
+                _allocate(file.fileno(), reserve)
     except OSError as error:
         _remove(run.stage)
         raise _not_written(run.folder, error, reserve) from None
     return run
+
+
+def _allocate(file: int, size: int) -> None:
+    """Takes the space on the disk; some file systems cannot promise any."""
+    try:
+        os.posix_fallocate(file, 0, size)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):
+            raise
 
 
 def _end(stage: Path) -> None:
@@ -162,10 +177,14 @@ def _refuse_input(place: Path, source: Path | None) -> None:
     if not place.is_dir() or (place / SUMMARY).is_file():
         return
     for path in place.iterdir():
-        if path.name in _MARKS or (path.suffix.lower() in IMAGE_SUFFIXES and path.name not in NAMES):
+        if path.name in _MARKS or (path.suffix.lower() in IMAGE_SUFFIXES and not _is_known(path.name)):
             raise InputError(
                 f"`{place}` holds images or a sequence (`{path.name}`); give another folder for the results with `-o`"
             )
+
+
+def _is_known(name: str) -> bool:
+    return name.endswith(".rrd") or any(fnmatchcase(name, pattern) for pattern in NAMES)
 
 
 def _not_written(place: Path, error: OSError, reserve: int = 0) -> InputError:

@@ -12,6 +12,8 @@ from typing import Any
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.results.files import piece_file
+from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
@@ -50,7 +52,7 @@ def summarise(
         "frames_tracked": tracked,
         "keyframes": len(slam.keyframes),
         "pairs": len(slam.pairs),
-        "origins": len(slam.origins),
+        "pieces": pieces(slam),
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
         "scale": scale_name(slam, verdict),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
@@ -60,6 +62,21 @@ def summarise(
         **counts,
     }
     return values if report is None else {**values, "truth": report.as_dict()}
+
+
+def pieces(slam: Slam) -> list[dict[str, Any]]:
+    """The pieces of the map, the one of most frames first: their file, first and last frame, poses, keyframes.
+
+    Nothing ties pieces to each other; of a map in one piece this is one entry.
+    """
+    found = []
+    for piece, numbers in enumerate(pieces_by_size(slam)):
+        inside = set(numbers)
+        own = [record.frame for record in slam.frames if record.tracked and record.reference in inside]
+        ends = [min(own), max(own)] if own else []
+        file = piece_file("trajectory", piece)
+        found.append({"trajectory": file, "frames": ends, "poses": len(own), "keyframes": len(numbers)})
+    return found
 
 
 def with_writing(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -136,7 +137,7 @@ def simulate(
         ("rate", rate),
         ("speed", 1.0 if speed is None else speed),
     ):
-        if value <= 0:
+        if not 0 < value < math.inf:
             raise InputError(f"`{name}` is {value}; it must be positive")
     build, walk = WORLDS[scene]
     motion = HandheldMotion.along(walk, seed)

@@ -26,8 +26,7 @@ def write_tum_folder(sequence: SyntheticSequence, folder: str | os.PathLike[str]
     Raises InputError if `folder` is there and not empty, or cannot be written.
     """
     target = Path(folder)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"`{target}` is there and not an empty folder; give the name of a new one")
+    check_new(target)
     for part in ("rgb", "depth"):
         (target / part).mkdir(parents=True, exist_ok=True)
     names = []
@@ -44,6 +43,12 @@ def write_tum_folder(sequence: SyntheticSequence, folder: str | os.PathLike[str]
     for part in ("rgb", "depth") if sequence.has_depth else ("rgb",):
         lines = "".join(f"{time:.6f} {part}/{name}\n" for time, name in names)
         write_text(target / f"{part}.txt", f"# {sequence.name} (simulated)\n# timestamp filename\n{lines}")
+
+
+def check_new(folder: Path) -> None:
+    """InputError if `folder` is there and not an empty folder."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"`{folder}` is there and not an empty folder; give the name of a new one")
 
 
 def _depth_code(depth: np.ndarray) -> np.ndarray:

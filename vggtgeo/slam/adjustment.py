@@ -104,7 +104,7 @@ def _observed(
     read = lambda name: np.concatenate([points.read(key_points, name), lines.read(samples, name)])
     prior, sigma = read("prior"), read("sigma")
     has_prior = np.isfinite(prior) & np.isfinite(sigma)
-    depths = np.concatenate([depths, np.where(np.isfinite(prior[len(points.host) :]), prior[len(points.host) :], 0.5)])
+    depths = np.concatenate([depths, read("inverse_depth")[len(points.host) :]])
     weight = np.where(has_prior, _prior_trust(read("prior_confidence"), read("confidence"), settings), 0.0)
     observations = Observations(
         edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),

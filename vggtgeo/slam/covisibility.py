@@ -57,7 +57,7 @@ def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> f
     """Share of world points that fall into the image of `keyframe`."""
     if not len(points):
         return 0.0
-    height, width = keyframe.image.shape[:2]
+    height, width = keyframe.size
     with np.errstate(invalid="ignore"):
         x, y = rigid.project(points, keyframe.pose, intrinsics).T
         inside = (x > 0) & (x < width) & (y > 0) & (y < height)
@@ -81,16 +81,21 @@ def match_keyframes(
     points = roles.points.match(first.features, second.features, None)
     points = points.select(_consistent(points, first, relative, intrinsics, settings))
     view = RelativeView(relative, intrinsics, first.line_depths)
-    lines = roles.line_matches.match(first.lines, second.lines, view)
-    if len(points) < settings.matching.least_matches and len(lines) < settings.matching.least_line_matches:
+    lines = roles.line_matches.match(first.lines, second.lines, view) if settings.line.in_edges else _NO_LINES
+    asked = settings.matching
+    # Points and lines count together: half of what each alone would need is enough where both are there.
+    if len(points) / asked.least_matches + len(lines) / asked.least_line_matches < 1:
         return None
     return Pair(first.number, second.number, points, lines)
 
 
+_NO_LINES = LineMatches(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+
+
 def without_matches(first: int, second: int) -> Pair:
     """A pair of keyframes that is known to overlap though nothing was matched."""
-    none, nowhere, empty = np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
-    return Pair(first, second, PointMatches(none, none, nowhere, nowhere, empty), LineMatches(none, none, empty))
+    none, nowhere = np.zeros(0, int), np.zeros((0, 2))
+    return Pair(first, second, PointMatches(none, none, nowhere, nowhere, np.zeros(0)), _NO_LINES)
 
 
 def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Directed]:

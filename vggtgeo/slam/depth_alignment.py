@@ -41,7 +41,7 @@ class SurfaceRows:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A keyframe's depth as points float64 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = none.
+    """A keyframe's depth as points float32 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = none.
 
     sigma: standard deviation of the depth, metres, [h, w].
     """
@@ -57,7 +57,10 @@ class Surface:
         middle = _block_medians(keyframe.depth)
         coarse = pinhole.coarser(intrinsics, CELL)
         points = pinhole.grid_rays(middle.shape, coarse) * middle[..., None]
-        return cls(points, _normals(points), _block_medians(keyframe.depth_sigma) * middle, coarse)
+        sigma = _block_medians(keyframe.depth_sigma) * middle
+        # Those of all keyframes are in memory together: half a megabyte each in single precision.
+        single = (image.astype(np.float32) for image in (points, _normals(points), sigma))
+        return cls(*single, coarse)
 
     @cached_property
     def rows(self) -> SurfaceRows:

@@ -40,6 +40,11 @@ class Description:
         """The key points; takes as long as the matcher's `describe` when it is first asked."""
         return self._describe()
 
+    @property
+    def described(self) -> bool:
+        """Whether somebody has asked for the key points."""
+        return "features" in self.__dict__
+
     def view_by(self, intrinsics: np.ndarray) -> RgbdView | None:
         """The view, if there is one that was made with these intrinsics, float64 [4]."""
         if self._intrinsics is None or np.abs(self._intrinsics - intrinsics).max() > SAME_CAMERA:

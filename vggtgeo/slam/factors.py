@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -133,17 +133,23 @@ def _baselines(own: Sequence[MeasuredBaseline], places: Mapping[int, int], room:
 
 
 def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, int], room: int) -> RelativePose:
+    placed = [replace(factor, first=places[factor.first], second=places[factor.second]) for factor in own]
+    return RelativePose(**relative_pose_rows(placed, room), kernel=Cauchy(jnp.asarray(TIE_WIDTH)))
+
+
+def relative_pose_rows(own: Sequence[MeasuredRelativePose], room: int | None = None) -> dict[str, Array]:
+    """Fields of a `RelativePose` term, padded to `room` observations; the motions name rows of the problem."""
+    room = len(own) if room is None else room
     poses = np.tile(np.eye(4), (room, 1, 1))
     for row, factor in enumerate(own):
         poses[row] = factor.pose
-    return RelativePose(
-        first=_padded([places[factor.first] for factor in own], room),
-        second=_padded([places[factor.second] for factor in own], room),
-        measured=jnp.asarray(rigid.to_quaternion(poses)),
-        root=_roots([factor.information for factor in own], 6, room),
-        weight=_present(own, room),
-        kernel=Cauchy(jnp.asarray(TIE_WIDTH)),
-    )
+    return {
+        "first": _padded([factor.first for factor in own], room),
+        "second": _padded([factor.second for factor in own], room),
+        "measured": jnp.asarray(rigid.to_quaternion(poses)),
+        "root": _roots([factor.information for factor in own], 6, room),
+        "weight": _present(own, room),
+    }
 
 
 def _padded(rows: list[int], room: int) -> Array:

@@ -33,13 +33,13 @@ FLOW_SIGMA = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """A pose by key points, the matches that it was sought by, and their points in the world, float64 [m, 3].
+    """A pose by key points, the number of matches that it was sought by, and their points in the world, float64 [m, 3].
 
     sigma: standard deviation of a match, pixels.
     """
 
     guess: PoseGuess
-    matches: PointMatches
+    matches: int
     points: np.ndarray
     sigma: float
 
@@ -81,4 +81,6 @@ def located_by_flow(
     points = points[arrived]
     guess = geometry.locate(PoseQuery(image, intrinsics, points, matches.pixels_j, matches.confidence, predicted))
     agree = guess.inlier_count >= max(LEAST_SHARE * len(arrived), LEAST_INLIERS)
-    return Located(guess, matches, points, FLOW_SIGMA) if guess.result is GeometryResult.SUCCESS and agree else None
+    return (
+        Located(guess, len(matches), points, FLOW_SIGMA) if guess.result is GeometryResult.SUCCESS and agree else None
+    )

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
-from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures
+from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
 from vggtgeo.slam.description import Description
+from vggtgeo.slam.keyframe_images import KeyframeImages, array_of
 from vggtgeo.slam.settings import Roles, SlamSettings
 
 
@@ -33,30 +34,59 @@ class Slots:
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; what the
-    roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each sample); and
-    place, what it looks like as a whole, float32 [n] of unit length, None = not known.
+    """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; its images;
+    what the roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each
+    sample); and place, what it looks like as a whole, float32 [n] of unit length, None = not known.
 
-    depth: float16 [H, W] metres, NaN = none (its rounding, 0.5 mm at 1 m, is below any sensor's noise); depth_sigma:
-    float16 [H, W], its relative standard deviation as the role states it; depth_confidence: uint8 [H, W], 255 is 1. A
-    map lives as long as the run, so what it holds is small.
+    A map lives as long as the run, so what it holds is small: see `KeyframeImages`.
     """
 
     number: int
     frame: int
     timestamp: float
     pose: np.ndarray
-    image: np.ndarray
+    images: KeyframeImages
     features: Features
     lines: LineFeatures
     line_depths: np.ndarray
-    depth: np.ndarray
-    depth_sigma: np.ndarray
-    depth_confidence: np.ndarray
     points: Slots
     samples: Slots
     sample_segment: np.ndarray
     place: np.ndarray | None = None
+
+    @property
+    def image(self) -> np.ndarray:
+        """uint8 [H, W, 3] RGB."""
+        return array_of(self.images.colour)
+
+    @property
+    def depth(self) -> np.ndarray:
+        """float16 [H, W], metres, NaN = none."""
+        return array_of(self.images.depth)
+
+    @property
+    def depth_sigma(self) -> np.ndarray:
+        """float16 [H, W], relative standard deviation of the depth."""
+        return array_of(self.images.depth_sigma)
+
+    @property
+    def depth_confidence(self) -> np.ndarray:
+        """uint8 [H, W], 255 is 1."""
+        return array_of(self.images.depth_confidence)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the image, pixels."""
+        height, width = self.images.colour.shape[:2]
+        return height, width
+
+    def compressed(self) -> Keyframe:
+        """The keyframe with its images compressed."""
+        return self if self.images.small else replace(self, images=self.images.compressed())
+
+    def expanded(self) -> Keyframe:
+        """The keyframe with its images as arrays, to be looked at often."""
+        return replace(self, images=self.images.expanded()) if self.images.small else self
 
 
 def make_keyframe(
@@ -67,13 +97,17 @@ def make_keyframe(
     roles: Roles,
     settings: SlamSettings,
     intrinsics: np.ndarray,
+    lines: LineFeatures | None = None,
 ) -> Keyframe:
-    """Run the roles that only keyframes need, and read depth and confidence at key points and line samples."""
+    """Run the roles that only keyframes need, and read depth and confidence at key points and line samples.
+
+    lines: the frame's segments, where tracking has found them already.
+    """
     with ThreadPoolExecutor(1, thread_name_prefix="describe") as pool:
         described = pool.submit(lambda: description.features)  # beside the rest: it takes as long as all of that
         depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
         confidence = roles.confidence.confidence(frame.image)
-        lines = _detect_lines(frame, roles, settings)
+        lines = find_lines(frame.image, roles, settings) if lines is None else lines
         features = described.result()
     ends = lines.segments.endpoints
     line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
@@ -86,13 +120,15 @@ def make_keyframe(
         frame=frame.index,
         timestamp=frame.timestamp,
         pose=pose,
-        image=frame.image,
+        images=KeyframeImages(
+            frame.image,
+            depth.depth.astype(np.float16),
+            depth.sigma_rel.astype(np.float16),
+            np.rint(255 * depth.confidence).astype(np.uint8),
+        ),
         features=features,
         lines=lines,
         line_depths=line_depths,
-        depth=depth.depth.astype(np.float16),
-        depth_sigma=depth.sigma_rel.astype(np.float16),
-        depth_confidence=np.rint(255 * depth.confidence).astype(np.uint8),
         points=points,
         samples=_with_line_depth(samples, on_line),
         sample_segment=segment,
@@ -100,11 +136,11 @@ def make_keyframe(
     )
 
 
-def _detect_lines(frame: Frame, roles: Roles, settings: SlamSettings) -> LineFeatures:
-    segments = roles.lines.detect(frame.image)
+def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineFeatures:
+    """The described segments of an image; none where the settings leave lines out."""
     if not settings.line.use_lines:
-        segments = type(segments)(segments.endpoints[:0], segments.scores[:0])
-    return roles.line_matches.describe(frame.image, segments)
+        return roles.line_matches.describe(image, Segments(np.zeros((0, 2, 2)), np.zeros(0)))
+    return roles.line_matches.describe(image, roles.lines.detect(image))
 
 
 def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) -> Slots:

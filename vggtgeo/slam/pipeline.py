@@ -14,15 +14,15 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.covisibility import without_matches
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.keyframe import Keyframe, make_keyframe
+from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pieces import join_pieces
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, sight_of, view_of, wait
+from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, revisit, sight_of, view_of, wait
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking import Expectation, Sight, Track, tie_between, track
+from vggtgeo.slam.tracking import Expectation, Sight, Track, refined_by_map, tie_between, tie_to, track, track_by_map
 from vggtgeo.slam.window import adjust, enter
 
 LOST_PATIENCE = 10
@@ -87,7 +87,7 @@ def _follow(
     slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock
 ) -> Slam:
     with clock.measure("track"):
-        sight = sight_of(frame, description, slam, roles)
+        sight = _with_lines(sight_of(frame, description, slam, roles), roles, settings)
         found = _find(slam, sight, roles, settings)
     if not found.accepted and slam.lost:
         with clock.measure("relocalise"):
@@ -119,7 +119,22 @@ def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Tra
         if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
             break
     assert best is not None
-    return best
+    # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
+    if not settings.tracking.search_map or (best.accepted and not sight.description.described):
+        return best
+    piece = slam.keyframes[slam.origins[-1] :]
+    if not best.accepted:
+        source = view_of(best.keyframe, slam, roles)
+        joint = track_by_map(sight, piece, best.keyframe, source, expected, slam.intrinsics, roles)
+        return joint if joint.accepted else best
+    return refined_by_map(best, sight, piece, expected, slam.intrinsics)
+
+
+def _with_lines(sight: Sight, roles: Roles, settings: SlamSettings) -> Sight:
+    """The sight with a way to its segments, where lines take part in tracking."""
+    if not settings.line.in_tracking:
+        return sight
+    return replace(sight, find_lines=lambda: find_lines(sight.frame.image, roles, settings))
 
 
 def _rank(found: Track) -> tuple[bool, int]:
@@ -137,12 +152,14 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         return replace(slam, frames=(*slam.frames, record_of(frame, found)))
     number = len(slam.keyframes)
     with clock.measure("keyframe"):
-        keyframe = make_keyframe(number, frame, found.pose, sight.description, roles, settings, slam.intrinsics)
+        keyframe = make_keyframe(
+            number, frame, found.pose, sight.description, roles, settings, slam.intrinsics, sight.found_lines
+        )
     with clock.measure("match keyframes"):
-        tie = MeasuredRelativePose(found.keyframe.number, number, found.relative, found.information)
+        tie = tie_to(found, number)
         if found.keyframe.number not in slam.window:
             slam = _window_around(slam, found.keyframe.number, settings)
-        slam = enter(slam, keyframe, roles, settings)
+        slam = enter(slam, keyframe, roles, settings, tied_to=found.keyframe.number)
         slam = replace(slam, factors=(*slam.factors, tie), reference=(number, sight.view))
         slam = _with_pair(slam, tie)
         slam = constrain_rotation(slam, settings)
@@ -218,12 +235,17 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     What the two keyframes know of each other by this frame ties them.
     """
     near = _nearest(slam, found, settings)
-    if near is None:
+    again = None
+    if near is not None:
+        expected = Expectation(found.pose, slam.velocity)
+        again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
+        if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
+            again = None  # drift may have put another keyframe there
+    if again is None:
+        again = revisit(slam, sight, found.pose, roles)
+    if again is None or _needs_keyframe(again, settings):
         return slam, found
-    expected = Expectation(found.pose, slam.velocity)
-    again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
-    if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
-        return slam, found
+    near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
         return slam, again
     return replace(slam, factors=(*slam.factors, tie_between(found, again))), again

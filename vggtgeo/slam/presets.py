@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from typing import Any
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.io.network_files import networks_folder
+from vggtgeo.models.classical import ConstantVelocity, NoDepth, OrbMatcher, SiftMatcher
 from vggtgeo.models.onnx.bounds import (
     BoundedConfidence,
     BoundedDepth,
@@ -40,6 +41,7 @@ from vggtgeo.models.onnx.moge2 import MogeDepth
 from vggtgeo.models.onnx.registry import NETWORKS
 from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
+from vggtgeo.models.roles import PointMatcher
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.slam.settings import Roles
 
@@ -49,6 +51,7 @@ NEEDED = {
     "paper": ("vggt", "dinov3", "moge2", "letr", "mast3r_encoder", "mast3r_decoder"),
 }
 """The networks of each preset, by their names in the registry."""
+_FEATURES: dict[str, Callable[[], PointMatcher]] = {"sift": SiftMatcher, "orb": OrbMatcher}
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +89,24 @@ class Perception:
     def warning(self) -> str:
         """What a user must know before reading any result of random weights."""
         return f"the weights of {', '.join(self.random)} are random: this result means nothing"
+
+
+def classical_roles(has_depth: bool = True, start: str = "pnp", features: str = "sift") -> Roles:
+    """The classical role objects, for a sequence with or without depth.
+
+    start: how a new frame's pose starts, "pnp" or "constant-velocity". features: "sift" or "orb". InputError for
+    others.
+    """
+    if features not in _FEATURES or start not in ("pnp", "constant-velocity"):
+        raise InputError(
+            f"`features` is {features!r} and `start` {start!r}; they must be one of {', '.join(_FEATURES)}, and of "
+            "pnp, constant-velocity"
+        )
+    roles = Roles(points=_FEATURES[features]())
+    if start == "constant-velocity":
+        # The ablation is a start by motion alone: nothing else may mend the pose before the window does.
+        roles = replace(roles, geometry=ConstantVelocity(), alignment=None)
+    return roles if has_depth else replace(roles, depth=NoDepth())
 
 
 def perception(

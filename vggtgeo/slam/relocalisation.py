@@ -20,6 +20,9 @@ from vggtgeo.slam.tracking import Expectation, Sight, Track, track
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
+MOST_DRIFT = 0.05
+"""Share of the way that drift may have moved a place by, to be looked for while the run goes on; RGB-D tracking alone
+drifts by 1 to 2 %."""
 
 
 def relocalise(
@@ -31,6 +34,33 @@ def relocalise(
         if found.evidence.certain:
             return found
     return None
+
+
+def revisit(slam: Slam, sight: Sight, pose: np.ndarray, roles: Roles) -> Track | None:
+    """The frame's pose by an old keyframe that shows the same place, wherever drift has put it: a loop that is closed
+    while the run goes on. The camera goes on from there, and the last adjustment spreads what the loop was off.
+
+    pose: where the frame is by the current estimate, world -> camera. One keyframe is verified at most, as that costs
+    as much as a tracked frame: one that looks as much like the frame as those of the window do, and that drift may have
+    put here. Without metric depth the unit drifts, too, and loops wait for the end.
+    """
+    recent = slam.window[0] if slam.window else 0
+    centres = np.array([rigid.centre(keyframe.pose) for keyframe in slam.keyframes])
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    way = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # from each keyframe to the newest
+    within = np.linalg.norm(centres - rigid.centre(pose), axis=1) < MOST_DRIFT * way
+    old = [k for k in slam.keyframes[:recent] if k.place is not None and within[k.number]]
+    place = place_vector(sight.features) if slam.metric and old else None
+    if place is None:
+        return None
+    near = [slam.keyframes[number].place for number in slam.window]
+    usual = np.median([known @ place for known in near if known is not None] or [1.0])
+    similarity = [float(k.place @ place) for k in old if k.place is not None]
+    best = int(np.argmax(similarity))
+    if similarity[best] < usual:
+        return None
+    found = track(sight, old[best], view_of(old[best], slam, roles), None, slam.intrinsics, roles)
+    return found if found.accepted and found.evidence.certain else None
 
 
 def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Keyframe, ...]:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from vggtgeo.geometry import rigid
 from vggtgeo.slam.rgbd_view import LEVELS, RgbdView, Samples
 
 FARTHEST = 0.15
@@ -71,7 +72,7 @@ class RgbdAlignment:
                 if edges is None and surface is None:
                     return None
                 change = _solve(*self._normal_equations(edges, surface))
-                motion = _exponential(change) @ motion
+                motion = rigid.exponential(change) @ motion
                 if np.abs(change).max() < (1e-5 if level == 0 else 1e-4):
                     break
         return self._judged(source, target, motion)
@@ -200,11 +201,3 @@ def _biweight(residual: np.ndarray, scale: float) -> np.ndarray:
     share = residual * np.float32(1 / (TUKEY * scale))
     inner = np.maximum(1 - share * share, 0)
     return inner * inner
-
-
-def _exponential(tangent: np.ndarray) -> np.ndarray:
-    """Exp on SO(3) x R^3: to first order the exponential of SE(3), and as good a retraction."""
-    motion = np.eye(4)
-    motion[:3, :3] = cv2.Rodrigues(tangent[3:])[0]
-    motion[:3, 3] = tangent[:3]
-    return motion

@@ -18,8 +18,10 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.description import Description
-from vggtgeo.slam.global_adjustment import adjust_all, close_loops
+from vggtgeo.slam.global_adjustment import adjust_all
+from vggtgeo.slam.loops import close_loops
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import RgbdView
@@ -113,10 +115,11 @@ def finish(
         return adjust_all(slam, settings)
 
 
-def frame_trajectory(slam: Slam) -> Trajectory:
-    """Camera -> world of every frame that has a pose.
+def frame_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
+    """Camera -> world of every frame that has a pose in a piece of the map, by default the one of most frames.
 
-    A frame without one (lost, or before a start) is left out.
+    A frame without one (lost, or before a start) is left out. Pieces are tied by nothing, so that their poses mean
+    nothing to each other: each has a trajectory of its own.
 
     Example:
         >>> import vggtgeo as vg
@@ -125,8 +128,9 @@ def frame_trajectory(slam: Slam) -> Trajectory:
 
     """
     times, poses = frame_poses(slam)
-    tracked = np.array([record.tracked for record in slam.frames], bool)
-    return Trajectory(times[tracked], rigid.invert(poses[tracked]))
+    own = set(pieces_by_size(slam)[piece]) if slam.keyframes else set()
+    chosen = np.array([record.tracked and record.reference in own for record in slam.frames], bool)
+    return Trajectory(times[chosen], rigid.invert(poses[chosen]))
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
@@ -151,10 +155,11 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     return times, poses
 
 
-def keyframe_trajectory(slam: Slam) -> Trajectory:
-    """Camera -> world of the keyframes."""
-    poses = rigid.invert(np.array([keyframe.pose for keyframe in slam.keyframes]).reshape(-1, 4, 4))
-    return Trajectory(np.array([keyframe.timestamp for keyframe in slam.keyframes]), poses)
+def keyframe_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
+    """Camera -> world of the keyframes of a piece of the map, by default the one of most frames."""
+    own = [slam.keyframes[number] for number in pieces_by_size(slam)[piece]] if slam.keyframes else []
+    poses = rigid.invert(np.array([keyframe.pose for keyframe in own]).reshape(-1, 4, 4))
+    return Trajectory(np.array([keyframe.timestamp for keyframe in own]), poses)
 
 
 def _described(

@@ -62,7 +62,7 @@ class Selection:
             counts[local[edge.host]][edge.line_slots] += 1 + 0.1 * edge.line_confidence
         chosen = []
         for keyframe, count in zip(keyframes, counts, strict=True):
-            known = np.isfinite(keyframe.samples.prior)
+            known = np.isfinite(keyframe.samples.inverse_depth)
             taken = np.ones(len(known), bool)
             if settings.line.two_ends_lines:
                 taken = spread_samples(keyframe.sample_segment, settings.line.segment_samples)

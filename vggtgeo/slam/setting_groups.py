@@ -26,6 +26,8 @@ class TrackingSettings(CheckedSettings):
     group: ClassVar[str] = "tracking"
     least_inliers: int = whole(50, at_least=1)
     """A frame with fewer tracked inliers becomes a keyframe."""
+    search_map: bool = switch(True)
+    """Search the points of all keyframes in view near where the pose says, and refine it by them."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,10 @@ class LineSettings(CheckedSettings):
 
     group: ClassVar[str] = "line"
     use_lines: bool = switch(True)
+    in_tracking: bool = switch(True)
+    """Let the segments of a keyframe take part in the pose of a frame."""
+    in_edges: bool = switch(True)
+    """Let matched segments take part in the edges between keyframes."""
     line_gate: float = positive(12.0)
     """Largest distance of a line sample from its matched segment, before each adjustment, pixels."""
     line_spacing: float = positive(10.0)

@@ -2,47 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
-import cv2
 import numpy as np
-from scipy.stats import chi2 as chi_square
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import pose_information
-from vggtgeo.models.roles import Features, GeometryResult, PointMatcher, PoseGuess, PoseQuery
+from vggtgeo.models.roles import (
+    Features,
+    GeometryResult,
+    LineFeatures,
+    PointMatcher,
+    PoseGuess,
+    PoseQuery,
+)
 from vggtgeo.slam.description import Description
-from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, tangent, worst_sigma
+from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.following import Located, located_by_flow
+from vggtgeo.slam.fusion import Motion, agreed, drawn_to, lines_wanted, with_lines, with_systematic
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.map_points import joint_matches, refine_by_map
 from vggtgeo.slam.rgbd_alignment import Aligned
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles
 
 PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
-SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
-"""What no number of samples removes (calibration, rolling shutter, clocks): metres, radians, share of the motion.
-Measured on pairs of frames, the dense alignment against the truth by the squared Mahalanobis distance, whose median
-should be 5.3: where the truth is exact (icl-office) the samples' own information is right (3.7 to 5.4, 1 to 8 frames
-apart). On the HoloLens clips, whose truth and camera are off by a pixel, it is 30 to 80 times that; with this floor 4.1
-to 5.7 (1 and 3 frames apart)."""
-AGREEMENT_GATE = float(chi_square.ppf(0.9999, 6))
-"""Of the squared Mahalanobis distance between the poses by points and by the picture, below which they are averaged."""
-LARGEST_DISAGREEMENT = 0.15
-"""Metres between them, beyond which many points are believed rather than the picture."""
+SEARCH_RADIUS = 8.0
+"""Pixels around the place where a point of the map must be: four standard deviations of a match."""
+ROUGH_RADIUS = 60.0
+"""The same where only the motion so far tells the place: its 6 degrees are 52 px at a focal length of 500."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A frame as it is tracked. view: None where the map is tracked by points alone."""
+    """A frame as it is tracked. view: None where its picture as a whole plays no part. find_lines: finds and describes
+    its segments; None where they play no part.
+    """
 
     frame: Frame
     description: Description
     view: RgbdView | None
+    find_lines: Callable[[], LineFeatures] | None = None
+
+    @cached_property
+    def lines(self) -> LineFeatures | None:
+        """The segments, found when they are first asked for."""
+        return None if self.find_lines is None else self.find_lines()
+
+    @property
+    def found_lines(self) -> LineFeatures | None:
+        """The segments, where they were asked for."""
+        found: LineFeatures | None = self.__dict__.get("lines")
+        return found
 
     @property
     def features(self) -> Features:
@@ -60,20 +76,26 @@ class Expectation:
     step: np.ndarray
     waited: int = 0
 
+    def motion_from(self, keyframe: Keyframe) -> Motion:
+        """The expected motion from a keyframe, and how well it is known."""
+        information = step_information(self.step) / (self.waited + 1)
+        return Motion(self.pose @ rigid.invert(keyframe.pose), information)
+
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """A frame's pose against one keyframe.
 
-    pose: float64 [4, 4], world -> camera. information: float64 [6, 6] of the motion from the keyframe to the frame,
-    over its left tangent, translation first. result: why there is no pose, where there is none.
+    pose: float64 [4, 4], world -> camera. measured: float64 [6, 6], what all samples know of the motion from the
+    keyframe to the frame, over its left tangent, translation first. result: why there is no pose, where there is none.
     """
 
     keyframe: Keyframe
     pose: np.ndarray
-    information: np.ndarray
+    measured: np.ndarray
     evidence: Evidence
     result: GeometryResult
+    alone: Track | None = None
 
     @property
     def accepted(self) -> bool:
@@ -83,6 +105,11 @@ class Track:
     def relative(self) -> np.ndarray:
         """Keyframe camera -> frame camera."""
         return self.pose @ rigid.invert(self.keyframe.pose)
+
+    @property
+    def information(self) -> np.ndarray:
+        """What is left of `measured` where the errors that no sample removes are counted in."""
+        return with_systematic(self.measured, self.relative)
 
 
 def track(
@@ -107,18 +134,102 @@ def track(
     if located is None:
         matcher = roles.points if aligner is None else roles.coarse_points
         located = _by_descriptors(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
-    guess, matches = located.guess, located.matches
+    return _placed(sight, keyframe, views, expected, located, intrinsics, roles)
+
+
+def track_by_map(
+    sight: Sight,
+    keyframes: Iterable[Keyframe],
+    reference: Keyframe,
+    source: RgbdView | None,
+    expected: Expectation,
+    intrinsics: np.ndarray,
+    roles: Roles,
+) -> Track:
+    """The pose of a frame from the points of all keyframes in view together, where no keyframe alone has enough.
+
+    They are searched around where the motion so far leads. Picture and lines are those of `reference`.
+    """
+    points, pixels, confidence = joint_matches(
+        sight.features, tuple(keyframes), expected.pose, intrinsics, ROUGH_RADIUS
+    )
+    query = PoseQuery(sight.frame.image, intrinsics, points, pixels, confidence, expected.pose)
+    located = Located(roles.geometry.locate(query), len(points), points, PIXEL_SIGMA)
+    views = None if source is None or sight.view is None else (source, sight.view)
+    return _placed(sight, reference, views, expected, located, intrinsics, roles)
+
+
+def _placed(
+    sight: Sight,
+    keyframe: Keyframe,
+    views: tuple[RgbdView, RgbdView] | None,
+    expected: Expectation | None,
+    located: Located,
+    intrinsics: np.ndarray,
+    roles: Roles,
+) -> Track:
+    """The pose by key points, then by picture, surface and lines from there, or from where the motion so far leads."""
+    guess = located.guess
     known = guess.result is GeometryResult.SUCCESS
-    dense = None
+    aligner, dense = roles.alignment, None
     if aligner is not None and views is not None and (known or expected):
         dense = aligner.align(*views, guess.pose @ rigid.invert(keyframe.pose))
-    if not known and dense is None:
-        return Track(keyframe, guess.pose, np.zeros((6, 6)), _seen(guess, len(matches)), guess.result)
-    return _fused(keyframe, located, dense, expected, intrinsics)
+    by_points = None
+    if known:
+        information = pose_information(guess.pose, located.points[guess.inliers], intrinsics, located.sigma)
+        by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
+    evidence = _seen(guess, located.matches, by_points, dense)
+    prior = None if expected is None else expected.motion_from(keyframe)
+    found = agreed(by_points, dense, evidence)
+    if found is not None and prior is not None:
+        found = drawn_to(found, prior)
+    if lines_wanted(found, prior) and sight.lines is not None:
+        found, evidence = with_lines(found, prior, evidence, keyframe, sight.lines, intrinsics, roles.line_matches)
+    if found is None:
+        return Track(keyframe, guess.pose, np.zeros((6, 6)), evidence, guess.result)
+    return _judged(rigid.orthonormal(found.motion @ keyframe.pose), found.information, evidence, keyframe, expected)
+
+
+def refined_by_map(
+    found: Track,
+    sight: Sight,
+    keyframes: Iterable[Keyframe],
+    expected: Expectation | None,
+    intrinsics: np.ndarray,
+) -> Track:
+    """The same with what the points of all other keyframes in view know of the pose."""
+    refined = refine_by_map(
+        sight.features,
+        tuple(keyframes),
+        found.keyframe,
+        found.pose,
+        found.information,
+        intrinsics,
+        with_systematic,
+        radius=SEARCH_RADIUS,
+        sigma=PIXEL_SIGMA,
+    )
+    if refined is None:
+        return found
+    # What no sample removes is common to all keyframes, and counted once.
+    measured = found.measured + refined.information
+    evidence = replace(found.evidence, map_points=refined.points)
+    better = _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, expected)
+    return replace(better, alone=found)
+
+
+def tie_to(found: Track, number: int) -> MeasuredRelativePose:
+    """What the track of a frame that is now keyframe `number` says of its motion from the one it was tracked against.
+
+    What other keyframes know of it enters by their own edges: in the tie it would count twice.
+    """
+    own = found.alone or found
+    return MeasuredRelativePose(own.keyframe.number, number, own.relative, own.information)
 
 
 def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
     """What two tracks of one frame say of the motion between their keyframes."""
+    first, second = first.alone or first, second.alone or second
     motion = rigid.invert(second.relative) @ first.relative
     # Both errors are tangents at the frame; carried to the second keyframe by the adjoint of its motion.
     carry = rigid.adjoint(rigid.invert(second.relative))
@@ -154,98 +265,36 @@ def _by_descriptors(
         window_poses=tuple(member.pose for member in window),
         window_depths=tuple(member.depth for member in window) if roles.metric else (),
     )
-    return Located(roles.geometry.locate(query), matches, points, PIXEL_SIGMA)
+    return Located(roles.geometry.locate(query), len(matches), points, PIXEL_SIGMA)
 
 
-def _fused(
-    keyframe: Keyframe,
-    located: Located,
-    dense: Aligned | None,
-    expected: Expectation | None,
-    intrinsics: np.ndarray,
+def _judged(
+    pose: np.ndarray, measured: np.ndarray, evidence: Evidence, keyframe: Keyframe, expected: Expectation | None
 ) -> Track:
-    """One pose from points, picture and, weakly, the motion: the mean by information, in the motion's tangent space."""
-    back, guess = rigid.invert(keyframe.pose), located.guess
-    evidence = _seen(guess, len(located.matches))
-    by_points = None
-    if guess.result is GeometryResult.SUCCESS:
-        known = pose_information(guess.pose, located.points[guess.inliers], intrinsics, located.sigma)
-        by_points = _Motion(guess.pose @ back, known)
-    if dense is not None:
-        evidence = _with_picture(evidence, dense)
-    found = _agreed(by_points, dense, evidence)
-    motion, information = found.motion, found.information
-    if expected is not None:
-        # A direction that is seen badly goes on as the motion did; what was measured does not gain by it.
-        prior = step_information(expected.step) / (expected.waited + 1)
-        off = tangent(expected.pose @ back @ rigid.invert(motion))
-        motion = _moved(np.linalg.solve(information + prior, prior @ off)) @ motion
-    information = _with_systematic(information, motion)
-    sigma_translation, sigma_rotation = worst_sigma(information)
-    pose = rigid.orthonormal(motion @ keyframe.pose)
-    agreement = float("nan")
-    if by_points is not None and dense is not None:
-        agreement = float(np.linalg.norm(by_points.motion[:3, 3] - dense.motion[:3, 3]))
+    """A pose with how well it is known in its worst direction, and how far it is from what was expected."""
+    track = Track(keyframe, pose, measured, evidence, GeometryResult.SUCCESS)
+    sigma_translation, sigma_rotation = worst_sigma(track.information)
     evidence = replace(
         evidence,
         sigma_translation=sigma_translation,
         sigma_rotation=sigma_rotation,
         chi2=float("nan") if expected is None else step_chi2(pose, expected.pose, expected.step, expected.waited),
-        agreement=agreement,
     )
-    return Track(keyframe, pose, information, evidence, GeometryResult.SUCCESS)
+    return replace(track, evidence=evidence)
 
 
-@dataclass(frozen=True, eq=False)
-class _Motion:
-    """Keyframe camera -> frame camera, and its information over the left tangent."""
-
-    motion: np.ndarray
-    information: np.ndarray
-
-
-def _agreed(by_points: _Motion | None, dense: Aligned | None, evidence: Evidence) -> _Motion:
-    """The mean of both where they agree to within their noise, else the one with the better evidence."""
+def _seen(guess: PoseGuess, matches: int, by_points: Motion | None, dense: Aligned | None) -> Evidence:
+    evidence = Evidence(matches=matches, inliers=guess.inlier_count, error=guess.error)
     if dense is None:
-        assert by_points is not None
-        return by_points
-    by_picture = _Motion(dense.motion, dense.information)
-    if by_points is None:
-        return by_picture
-    off = tangent(by_points.motion @ rigid.invert(dense.motion))
-    noise = [np.linalg.inv(_with_systematic(one.information, one.motion)) for one in (by_points, by_picture)]
-    if off @ np.linalg.solve(noise[0] + noise[1], off) < AGREEMENT_GATE:
-        both = by_points.information + dense.information
-        mean = np.linalg.solve(both + 1e-9 * np.eye(6), by_points.information @ off)
-        return _Motion(_moved(mean) @ dense.motion, both)
-    # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
-    near = np.linalg.norm(off[:3]) < LARGEST_DISAGREEMENT or not evidence.points_strong
-    return by_picture if evidence.dense_fair and near else by_points
-
-
-def _seen(guess: PoseGuess, matches: int) -> Evidence:
-    return Evidence(matches=matches, inliers=guess.inlier_count, error=guess.error)
-
-
-def _with_picture(evidence: Evidence, dense: Aligned) -> Evidence:
+        return evidence
+    apart = float("nan")
+    if by_points is not None:
+        apart = float(np.linalg.norm(by_points.motion[:3, 3] - dense.motion[:3, 3]))
     return replace(
         evidence,
         correlation=dense.correlation,
         edges=dense.edges,
         surface=dense.surface,
         overlap=dense.overlap,
+        agreement=apart,
     )
-
-
-def _with_systematic(information: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    length, angle = (np.linalg.norm(part) for part in np.split(tangent(motion), 2))
-    metres, radians, share = SYSTEMATIC
-    floor = np.repeat([metres + share * length, radians + share * angle], 3) ** 2
-    return np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + np.diag(floor))
-
-
-def _moved(step: np.ndarray) -> np.ndarray:
-    motion = np.eye(4)
-    motion[:3, :3] = cv2.Rodrigues(step[3:])[0]
-    motion[:3, 3] = step[:3]
-    return motion

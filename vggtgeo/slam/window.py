@@ -21,7 +21,9 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
+from vggtgeo.slam.gauge import Gauge, gauge_notes, with_one_gauge
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.line_triangulation import with_segment_depths
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
@@ -98,11 +100,15 @@ def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
     )
 
 
-def make_room(slam: Slam, settings: SlamSettings) -> Slam:
-    """Marginalise the oldest keyframe of a full window, by the last window that was solved with it."""
+def make_room(slam: Slam, settings: SlamSettings, needed: int | None = None) -> Slam:
+    """Marginalise the oldest keyframe of a full window, by the last window that was solved with it.
+
+    needed: a keyframe that stays, because the next one is tied to it.
+    """
     if len(slam.window) < settings.window.size:
         return slam
-    leaving, staying = slam.window[0], slam.window[1:]
+    leaving = next(number for number in slam.window if number != needed)
+    staying = tuple(number for number in slam.window if number != leaving)
     if slam.solved is None or leaving not in slam.solved[0].keyframes:
         return replace(slam, window=staying)
     adjustment, state = slam.solved
@@ -110,25 +116,28 @@ def make_room(slam: Slam, settings: SlamSettings) -> Slam:
     return replace(slam, window=staying, prior=WindowPrior(adjustment.keyframes, prior))
 
 
-def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings) -> Slam:
-    """Add a keyframe to the window and match it to the others."""
-    slam = make_room(slam, settings)
+def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, tied_to: int | None = None) -> Slam:
+    """Add a keyframe, which was tracked against `tied_to`, to the window and match it to the others.
+
+    The images of those outside the window are compressed.
+    """
+    slam = make_room(slam, settings, tied_to)
     matched = map_in_threads(
         lambda number: match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics), slam.window
     )
     pairs = tuple(pair for pair in matched if pair is not None)
-    return replace(
-        slam,
-        keyframes=(*slam.keyframes, keyframe),
-        window=(*slam.window, keyframe.number),
-        pairs=(*slam.pairs, *pairs),
-    )
+    inside = (*slam.window, keyframe.number)
+    kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in slam.keyframes)
+    return replace(slam, keyframes=(*kept, keyframe), window=inside, pairs=(*slam.pairs, *pairs))
 
 
 def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
+    slam = slam if slam.metric else _with_line_depths(slam)
     members = [slam.keyframes[number] for number in slam.window]
-    adjustment = window_problem(slam, members, settings)
+    adjustment, gauge = window_problem(slam, members, settings)
+    told = (note for note in gauge_notes(gauge, adjustment.keyframes, "window") if note not in slam.notes)
+    slam = replace(slam, notes=(*slam.notes, *told))
     solution = solve_jit(adjustment.problem, adjustment.initial, solver=window_solver(settings))
     if not np.isfinite(float(solution.energy)):
         return replace(slam, notes=(*slam.notes, f"window at keyframe {members[-1].number}: {solution.message}"))
@@ -147,12 +156,24 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     )
 
 
-def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> Adjustment:
-    """The problem of the current window."""
+def _with_line_depths(slam: Slam) -> Slam:
+    """The state with the depths of segments that the window's views tell.
+
+    Not beside measured depth: what that leaves out is glass, mirrors and what is far away.
+    """
+    inside = {number: slam.keyframes[number] for number in slam.window}
+    keyframes = list(slam.keyframes)
+    for number, keyframe in with_segment_depths(inside, window_edges(slam), slam.intrinsics).items():
+        keyframes[number] = keyframe
+    return replace(slam, keyframes=tuple(keyframes))
+
+
+def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> tuple[Adjustment, Gauge]:
+    """The problem of the current window, each of its connected pieces held."""
     numbers = tuple(keyframe.number for keyframe in members)
     places = {number: row for row, number in enumerate(numbers)}
     prior = no_prior(settings.window.size) if slam.prior is None else slam.prior.aligned(numbers, settings.window.size)
-    return build(
+    adjustment = build(
         members,
         window_edges(slam),
         slam.intrinsics,
@@ -160,17 +181,19 @@ def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) 
         size=window_size(settings),
         given_intrinsics=slam.given_intrinsics,
         intrinsics_sigma=slam.intrinsics_sigma,
-        fixed_pose=_gauge(numbers, slam),
+        fixed_pose=_held(numbers, slam),
         terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric))),
     )
+    problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(members), slam.metric)
+    return replace(adjustment, problem=problem), gauge
 
 
-def _gauge(numbers: tuple[int, ...], slam: Slam) -> np.ndarray:
-    """Which members are held: origins of the map, and what the window hangs on; never nothing at all."""
-    fixed = np.isin(numbers, (*slam.origins, *slam.held))
-    if slam.prior is None and not fixed.any():
-        fixed[0] = True
-    return fixed
+def _held(numbers: tuple[int, ...], slam: Slam) -> np.ndarray:
+    """Which members hold the window: what it hangs on, where the camera came back to an old part of the map, else the
+    origins of the map.
+    """
+    hung = np.isin(numbers, slam.held)
+    return hung if hung.any() else np.isin(numbers, slam.origins)
 
 
 def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.run import frame_poses
 from vggtgeo.slam.state import Slam
 
@@ -21,7 +22,7 @@ class Estimate:
 
     frames: int [n]; times: float64 [n], s; poses: float64 [n, 4, 4], world -> camera; tracked: bool [n].
     intrinsics: fx, fy, cx, cy at the end; given: before the run; sigma: of their prior, pixels. metric: lengths are
-    metres. inliers: int [n], matches that agreed with the pose; is_keyframe: bool [n]. origins: how many parts the map
+    metres. inliers: int [n], matches that agreed with the pose; is_keyframe: bool [n]. pieces: how many parts the map
     has. started: whether there ever was a map.
     """
 
@@ -35,7 +36,7 @@ class Estimate:
     metric: bool
     inliers: np.ndarray
     is_keyframe: np.ndarray
-    origins: int = 1
+    pieces: int = 1
     started: bool = True
 
     @classmethod
@@ -54,7 +55,7 @@ class Estimate:
             slam.metric,
             np.array([record.inliers for record in slam.frames], int),
             np.isin([record.frame for record in slam.frames], [keyframe.frame for keyframe in slam.keyframes]),
-            len(slam.origins),
+            max(len(pieces_by_size(slam)), 1),
             known,
         )
 

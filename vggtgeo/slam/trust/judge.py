@@ -19,6 +19,7 @@ from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
 from vggtgeo.slam.trust.speed import check_speed
 from vggtgeo.slam.trust.steps import breaks, check_steps, steps
 from vggtgeo.slam.trust.still_points import check_parts, divide
+from vggtgeo.slam.trust.surfaces import check_surfaces
 
 
 def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
@@ -31,8 +32,10 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     by_frame = {noted.frame: noted for noted in evidence}
     aligned = [by_frame[frame] for frame in estimate.frames if frame in by_frame]
     found = [*input_findings, *check_record(estimate), *check_speed(estimate)]
+    if estimate.started and estimate.metric:
+        found += check_surfaces(slam.keyframes, estimate.intrinsics)
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
-        height, width = slam.keyframes[0].image.shape[:2]
+        height, width = slam.keyframes[0].size
         found += _images(estimate, aligned, (width, height))
     return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)
 

@@ -38,8 +38,11 @@ def check_record(estimate: Estimate) -> list[Finding]:
         found.append(Finding("lost", "degraded", text, start, end, local=not serious))
     if share < LEAST_TRACKED:
         found.append(Finding("lost", "failed", f"only {100 * share:.0f} % of the frames were tracked"))
-    if estimate.origins > 1:
-        text = f"the map is in {estimate.origins} parts; how they lie to each other is only predicted"
+    if estimate.pieces > 1:
+        text = (
+            f"the map is in {estimate.pieces} parts that nothing ties to each other; trajectory.txt and map.ply hold "
+            "the one of most frames, trajectory-2.txt the next"
+        )
         found.append(Finding("parts", "degraded", text))
     return found
 

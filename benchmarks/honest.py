@@ -1,0 +1,86 @@
+"""Are the stated uncertainties of tracking true? Errors of tracked motions on clips with truth, in standard deviations.
+
+    python benchmarks/honest.py ../shared/data/icl-office ../shared/data/redkitchen --frames 100
+
+Each frame states the standard deviation of its pose relative to its keyframe in the worst direction, and each keyframe
+the full information of the motion that it was tracked by. A row a clip: the share of frames whose error is within three
+standard deviations (honest: at least 95 %), of translation and of rotation, the median error and the median statement;
+then the median squared Mahalanobis distance of the keyframes' motions (honest: 5.3, chi-square of 6 degrees of freedom)
+and by what the standard deviations would have to be multiplied for that. The truth of the real clips has errors of its
+own (`../shared/data/README.md`): that of icl-office alone is exact.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2 as chi_square
+from short_runs import Piece
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.evidence import tangent
+from vggtgeo.slam.state import Slam
+
+HEADER = (
+    "| clip | frames | within 3 sigma: translation | rotation | median error, mm | stated | median error, deg | stated "
+    "| motions of keyframes: median distance | sigma times |\n" + "|---" * 10 + "|"
+)
+
+
+def main() -> None:
+    """Run every clip and print the table."""
+    options = _options()
+    print(HEADER)
+    for path in options.clips:
+        piece = Piece.of(path, options.frames)
+        slam = piece.run()
+        true = rigid.invert(piece.truth.poses)
+        row_of = {frame.index: row for row, frame in enumerate(piece.frames)}
+        print(_row(piece.name, slam, true, row_of), flush=True)
+
+
+def _row(name: str, slam: Slam, true: np.ndarray, row_of: dict[int, int]) -> str:
+    frames = []
+    for record in slam.frames:
+        reference = row_of[slam.keyframes[record.reference].frame]
+        arrived = record.arrival is not None or row_of[record.frame] == reference
+        if record.tracked and not arrived and np.isfinite(record.evidence.sigma_translation):
+            off = _error(record.relative, true[reference], true[row_of[record.frame]])
+            stated = record.evidence.sigma_translation, record.evidence.sigma_rotation
+            frames.append((np.linalg.norm(off[:3]), np.linalg.norm(off[3:]), *stated))
+    moved, turned, sigma_moved, sigma_turned = np.array(frames).T
+    distances = []
+    for tie in slam.ties:
+        first, second = (row_of[slam.keyframes[number].frame] for number in tie.keyframes)
+        off = _error(tie.pose, true[first], true[second])
+        distances.append(off @ tie.information @ off)
+    typical = float(np.median(distances))
+    cells = (
+        *(
+            f"{100 * np.mean(error < 3 * sigma):.0f} %"
+            for error, sigma in ((moved, sigma_moved), (turned, sigma_turned))
+        ),
+        *(f"{1e3 * np.median(value):.1f}" for value in (moved, sigma_moved)),
+        *(f"{np.rad2deg(np.median(value)):.3f}" for value in (turned, sigma_turned)),
+        f"{typical:.1f}",
+        f"{np.sqrt(typical / chi_square.ppf(0.5, 6)):.2f}",
+    )
+    return "| " + " | ".join((name, str(len(moved)), *cells)) + " |"
+
+
+def _error(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Tangent of a motion's error, translation first; `first` and `second` are true, world -> camera."""
+    return tangent(motion @ first @ rigid.invert(second))
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clips", type=Path, nargs="+")
+    parser.add_argument("--frames", type=int, default=100)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

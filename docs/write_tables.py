@@ -1,0 +1,65 @@
+"""Puts the tables of finished suites into the documents, between their marks.
+
+.venv/bin/python docs/write_tables.py [RUN_FOLDER]     (of the suite `paper`; runs/paper if left out)
+.venv/bin/python docs/write_tables.py --clips [RUN_FOLDER]     (of the suite `clips`, into the README; runs/clips)
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.benchmark import figures, markdown
+from vggtgeo.benchmark.suite import load_suite
+from vggtgeo.io.files import atomic_path, write_text
+
+DOCS = Path(__file__).resolve().parent
+BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+
+
+def with_tables(page: str, tables: str) -> str:
+    """The page with `tables` between its two marks."""
+    head, rest = page.split(BEGIN)
+    return head + BEGIN + "\n" + tables.strip() + "\n" + END + rest.split(END)[1]
+
+
+def load_rows(file: Path) -> list[dict[str, Any]]:
+    """The rows of `runs.csv`, numbers as numbers."""
+    with file.open(encoding="utf-8") as stream:
+        return [{name: _value(text) for name, text in row.items() if text} for row in csv.DictReader(stream)]
+
+
+def main() -> None:
+    """Rewrite the document from the folder named on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--clips", action="store_true", help="the table of the README")
+    arguments = parser.parse_args()
+    name = "clips" if arguments.clips else "paper"
+    folder = arguments.folder or Path("runs") / name
+    suite, rows = load_suite(name), load_rows(folder / "runs.csv")
+    if arguments.clips:
+        good = [row for row in rows if row["status"] == "ok"]
+        page, tables = DOCS.parent / "README.md", markdown.details(suite, good)
+    else:
+        page, tables = DOCS / "paper-tables.md", (folder / "tables.md").read_text().partition("\n\n")[2]
+        with atomic_path(DOCS / "paper-tables.png") as temporary:
+            figures.ablation_figure(suite, rows).savefig(temporary, dpi=130, format="png", facecolor="white")
+    write_text(page, with_tables(page.read_text(), tables))
+
+
+def _value(text: str) -> Any:
+    if text in ("True", "False"):
+        return text == "True"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Suites: what their files may say, and the runs that follow from them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tiny_sequences
+import tiny_suites as tiny
+
+from vggtgeo.benchmark.inputs import find_sequence
+from vggtgeo.benchmark.jobs import jobs_of
+from vggtgeo.benchmark.protocols import PROTOCOLS
+from vggtgeo.benchmark.provenance import input_hash, source_digest
+from vggtgeo.benchmark.published import published
+from vggtgeo.benchmark.suite import limited, load_suite, read_suite, shipped
+from vggtgeo.io.errors import InputError
+
+WANTED = {"paper", "tum", "7scenes", "euroc", "replica", "tanks", "simulated", "quick", "clips"}
+
+
+def test_every_suite_that_comes_along_can_be_read() -> None:
+    # Proves that the shipped files are right, their settings and their published tables too. Oracle: the checks of the
+    # pipeline's settings, made when a suite is read; the list of the documentation.
+    assert set(shipped()) >= WANTED
+    for name in shipped():
+        suite = load_suite(name)
+        assert suite.title
+        assert len({job.name for job in jobs_of(suite, ())}) == len(jobs_of(suite, ()))
+        for table in suite.published:
+            assert published(table).rows
+
+
+def test_the_paper_is_what_it_was() -> None:
+    # Proves the plan of the paper's tables: five seeds of the ablations on office and corridor, the full system alone
+    # in the hall, three seeds of the rest. Oracle: counted by hand.
+    jobs = jobs_of(load_suite("paper"), ())
+    count = lambda sequence, setting: sum((job.sequence, job.setting) == (sequence, setting) for job in jobs)
+    assert [count(name, "full") for name in ("office", "hall", "corridor")] == [5, 5, 5]
+    assert [count(name, "A") for name in ("office", "hall", "corridor")] == [5, 0, 5]
+    assert [count(name, "manhattan") for name in ("office", "hall", "corridor")] == [3, 0, 3]
+    assert len(jobs) == 103
+    full = next(job for job in jobs if (job.sequence, job.setting) == ("corridor", "full"))
+    assert full.spec["set"]["keyframes"]["keyframe_distance"] == 0.5
+    assert full.spec["set"]["weights"] == {"confidence_gain": 4.0, "confidence_floor": 0.5}
+    assert full.spec["set"]["refinement"] == {"global_adjustment": False}
+    assert full.spec["key_points"] == 600
+
+
+def test_runs_are_settings_upon_the_sequence_upon_the_suite() -> None:
+    # Proves the order in which settings of the pipeline are laid over each other, and seeds. Oracle: by hand.
+    text = tiny.TEXT.replace("seeds = 3", "seeds = 3\nfirst_seed = 7")
+    text = text.replace("\n[[seq", "\n[set.window]\nsize = 6\nwindow_iterations = 5\n\n[[seq", 1)
+    text = text.replace("frames = 4 }\n\n[[seq", "frames = 4 }\n[sequence.set.window]\nsize = 7\n\n[[seq", 1)
+    text += "[setting.set.window]\nwindow_iterations = 4\n"
+    jobs = tiny.jobs(text)
+    assert [job.name for job in jobs[:4]] == ["walk.full.7", "walk.bare.7", "walk.full.8", "walk.bare.8"]
+    walk, bare = jobs[0].spec["set"], jobs[1].spec["set"]
+    assert walk == {"window": {"size": 7, "window_iterations": 5}}
+    assert bare == {"line": {"use_lines": False}, "window": {"size": 7, "window_iterations": 4}}
+
+
+def test_a_fingerprint_changes_with_what_a_result_depends_on(tmp_path: Path) -> None:
+    # Proves that settings, seed, code and the content of a recording count, and where it lies does not.
+    jobs = tiny.jobs()
+    prints = {job.fingerprint("a") for job in jobs} | {jobs[0].fingerprint("b")}
+    assert len(prints) == len(jobs) + 1
+    moved = replace(jobs[0], spec={**jobs[0].spec, "path": "/elsewhere"})
+    assert moved.fingerprint("a") == jobs[0].fingerprint("a")
+    folder = tiny_sequences.tum(tmp_path / "tum")
+    before = input_hash(folder)
+    assert before == input_hash(folder)
+    (folder / "groundtruth.txt").write_text((folder / "groundtruth.txt").read_text().replace(" 0 ", " 1 ", 1))
+    assert input_hash(folder) != before
+    assert len(source_digest()) == 12
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("title =", "titel ="), r"`tiny.toml` has the key `titel`; it may have name, title"),
+        (('scene = "room", frames = 4 }', 'scene = "room" }\npath = "x"'), "either a `path` or a table `simulate`"),
+        (("use_lines", "use_line"), r"\[\[setting\]\] 2: `line.use_line` is no setting; the nearest is"),
+        (('baseline = "full"', 'baseline = "best"'), "`baseline` is 'best', which is no setting"),
+        (('name = "bare"', 'name = "full"'), "setting full: each name may be there once"),
+        (('name = "walk"', 'name = "../walk"'), "`name` is '../walk'"),
+        (('name = "hall"', 'name = "hall"\nprotocol = "orb"'), "`protocol` is 'orb'; it must be one of every-frame"),
+        (('name = "bare"', 'name = "bare"\nsequences = ["attic"]'), r"names the sequences \['attic'\]"),
+        (('name = "bare"', 'name = "bare"\nstart_of_pose = "window"'), "`start_of_pose` is 'window'"),
+        (("seeds = 3", "seeds = 0"), "`seeds` is 0; it must be positive"),
+        (("seeds = 3", "seeds = "), "is no TOML"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named(change: tuple[str, str], message: str) -> None:
+    # Proves that a misspelt or impossible entry ends before the first run, with its place.
+    with pytest.raises(InputError, match=message):
+        tiny.suite(tiny.TEXT.replace(*change, 1))
+
+
+def test_a_part_of_a_suite_keeps_what_belongs_together() -> None:
+    # Proves the choice of sequences, settings, seeds and frames, and the refusal of a name that is not there.
+    part = limited(tiny.suite(), ("hall",), ("bare",), seeds=1, first_seed=5, frames=2)
+    (job,) = jobs_of(part, ())
+    assert (job.name, job.spec["simulate"]["frames"], part.base) == ("hall.bare.5", 2, "bare")
+    with pytest.raises(InputError, match=r"`settings` holds \['E'\]; choose among full, bare"):
+        limited(tiny.suite(), settings=("E",))
+    hall = limited(load_suite("paper"), ("hall",))
+    assert {job.setting for job in jobs_of(hall, ())} == {"full"}
+
+
+def test_a_recording_is_found_below_any_data_folder(tmp_path: Path) -> None:
+    # Proves that a benchmark's own folder may lie in between, and that what is absent is None, no error.
+    tiny_sequences.tum(tmp_path / "b" / "tum" / "fr1" / "desk")
+    folders = (tmp_path / "a", tmp_path / "b")
+    assert find_sequence("fr1/desk", folders) == (tmp_path / "b" / "tum" / "fr1" / "desk").resolve()
+    assert find_sequence("desk", folders) == (tmp_path / "b" / "tum" / "fr1" / "desk").resolve()
+    assert find_sequence("xyz", folders) is None
+    text = tiny.TEXT.replace('simulate = { scene = "hall", frames = 4 }', 'path = "desk"')
+    assert [job.present for job in jobs_of(read_suite(text, "t", "t"), folders)][-1]
+    assert not tiny.jobs(text)[-1].present
+
+
+def test_protocols_say_whose_they_are() -> None:
+    # Proves that each preset has its stride, its poses, and an error of the table.
+    assert all(one.poses in ("all", "keyframes") and one.stride >= 1 and one.about for one in PROTOCOLS.values())
+    assert (PROTOCOLS["mast3r-slam"].stride, PROTOCOLS["mast3r-slam"].poses) == (2, "keyframes")

@@ -1,0 +1,302 @@
+"""From rows to tables: statistics, Markdown, CSV, Parquet, the page, other systems' trajectories and figures."""
+
+import csv
+import io
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_suites as tiny
+from scipy.stats import ttest_rel
+from typer.testing import CliRunner
+
+from vggtgeo.benchmark import cells, markdown, runner
+from vggtgeo.benchmark.external import external_rows
+from vggtgeo.benchmark.figures import ablation_figure
+from vggtgeo.benchmark.measure import trajectory_errors
+from vggtgeo.benchmark.page import write_page
+from vggtgeo.benchmark.published import published
+from vggtgeo.benchmark.runner import BenchReport
+from vggtgeo.benchmark.statistics import Summary, paired
+from vggtgeo.benchmark.table import as_csv, columns, write_parquet
+from vggtgeo.cli.main import make_app
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+
+EXTERNAL = '\n[[external]]\nname = "other"\ntitle = "Other-SLAM"\nfiles = "other/{sequence}.txt"\n'
+
+
+def row(sequence: str, setting: str, seed: int, cm: float | None, **more: object) -> dict:
+    """A row of the table."""
+    known = {"status": "ok", "verdict": "good", "frames": 10, "tracked": 9, "protocol": "every-frame", "metric": True}
+    errors = {} if cm is None else {"ate_se3_m": cm / 100, "ate_sim3_m": cm / 200, "scale": 1.0}
+    return {"suite": "tiny", "sequence": sequence, "setting": setting, "seed": seed, **known, **errors, **more}
+
+
+ROWS = [
+    *(row("walk", "full", seed, cm) for seed, cm in enumerate((2.0, 4.0, 3.0))),
+    *(row("walk", "bare", seed, cm) for seed, cm in enumerate((5.0, 9.0, 7.0))),
+    *(row("hall", "full", seed, cm) for seed, cm in enumerate((8.0, 8.5, 9.0))),
+    *(row("hall", "bare", seed, cm) for seed, cm in enumerate((7.0, 8.0, 7.5))),
+]
+
+
+def test_summaries_are_those_of_the_textbook() -> None:
+    # Proves mean, deviation and interval, that NaN is left out, and that one number has no interval. Oracle: scipy's
+    # paired t-test, whose interval is that of the mean difference.
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 12))
+    found = Summary.of(np.append(a - b, np.nan))
+    low, high = ttest_rel(a, b).confidence_interval(0.95)
+    np.testing.assert_allclose([found.mean - found.half, found.mean + found.half], [low, high], rtol=1e-12)
+    assert (found.count, found.deviation) == (12, pytest.approx(np.std(a - b, ddof=1)))
+    assert found.differs == (low > 0 or high < 0)
+    one = Summary.of(np.array([5.0]))
+    assert (one.mean, np.isnan(one.half), one.differs) == (5.0, True, False)
+    assert cells.number_cell(one, 2) == "5.00"
+
+
+def test_differences_are_taken_run_by_run() -> None:
+    # Proves that pairs are of one sequence and seed, and that a run without partner is left out. Oracle: by hand.
+    rows = [row("walk", "full", 1, 4.0), row("walk", "bare", 0, 5.0), row("walk", "bare", 1, 9.0), *ROWS[6:]]
+    np.testing.assert_allclose(100 * paired(rows, "bare", "full", "ate_se3_m", "walk"), [5.0])
+    np.testing.assert_allclose(100 * paired(rows, "bare", "full", "ate_se3_m"), [-1.0, -0.5, -1.5, 5.0])
+    np.testing.assert_allclose(paired([*ROWS[:3], row("walk", "bare", 0, None)], "bare", "full", "ate_se3_m"), [])
+
+
+def test_tables_mark_the_best_and_the_second() -> None:
+    # Proves the numbers of the tables and their marks, and that a bar in a title does not break a row. Oracle: by hand.
+    text = markdown.page(tiny.suite(), ROWS)
+    assert "| full system | **3.00 ± 1.00** | <u>8.50 ± 0.50</u> | **5.75** |" in text
+    assert "| without \\| lines | <u>7.00 ± 2.00</u> | **7.50 ± 0.50** | <u>7.25</u> |" in text
+    assert "| without \\| lines | walk | 3 | **+4.00 ± 2.48** | **+2.00 ± 1.24** |" in text
+    assert "| without \\| lines | hall | 3 | -1.00 ± 1.24 |" in text
+    assert "| walk | full system | 3 | 27/30 | 3.00 ± 1.00 | 1.50 ± 0.50 | 1.0000 ± 0.0000 | 3 good |" in text
+
+
+def test_a_mean_is_over_the_sequences_that_all_have() -> None:
+    # Proves that a system that is missing on a hard sequence gets no better mean by it. Oracle: by hand.
+    rows = [one for one in ROWS if (one["sequence"], one["setting"]) != ("hall", "bare")]
+    rows += [row("extra", "full", 0, 1.0), row("extra", "bare", 0, 3.0)]
+    suite = tiny.suite(tiny.TEXT.replace("[[setting]]", '[[sequence]]\nname = "extra"\npath = "x"\n\n[[setting]]', 1))
+    assert cells.matrix_heads(suite, rows, cells.SE3) == ["walk", "hall", "extra", "mean of 2"]
+    lines = dict(cells.matrix(suite, rows, cells.SE3))
+    assert [one.text for one in lines["without | lines"]] == ["7.00 ± 2.00", "", "3.00", "5.00"]
+
+
+def test_a_free_scale_has_no_error_at_true_scale() -> None:
+    # Proves that runs without a scale are called free after SE(3), in the table and in the differences, and are
+    # compared after Sim(3). Oracle: by hand.
+    rows = [*ROWS[:3], *({**one, "metric": False} for one in ROWS[3:6])]
+    text = markdown.page(tiny.suite(), rows)
+    assert "| without \\| lines | free |" in text
+    assert "| without \\| lines | walk | 3 |  | **+2.00 ± 1.24** |" in text
+    assert "| walk | without \\| lines | 3 | 27/30 | free | 3.50 ± 1.00 |" in text
+
+
+def test_what_has_no_result_is_told() -> None:
+    # Proves that crashes and recordings that are not there are in the page, and in no mean.
+    rows = [*ROWS[:2], row("walk", "full", 2, None, status="crash", message="ended by SIGSEGV")]
+    rows.append(row("hall", "full", 0, None, status="absent"))
+    text = markdown.page(tiny.suite(), rows)
+    assert "| walk | full | 2 | crash | ended by SIGSEGV |" in text
+    assert "Not there: hall" in text
+    assert "| full system | 3.00 ± 1.41 |" in text
+
+
+def test_the_table_comes_back_from_csv_and_parquet(tmp_path: Path) -> None:
+    # Proves that every value is in both files, in one order of columns, with nothing for what a run has not. Oracle:
+    # the rows.
+    parquet = pytest.importorskip("pyarrow.parquet", reason="PyArrow is not installed")
+    rows = [*ROWS[:2], row("walk", "full", 2, None, status="crash", message="a, b\nc", f_score=1)]
+    back = list(csv.DictReader(io.StringIO(as_csv(rows))))
+    write_parquet(tmp_path / "runs.parquet", rows)
+    table = parquet.read_table(tmp_path / "runs.parquet").to_pylist()
+    assert list(back[0]) == list(table[0]) == columns(rows)
+    for given, text, typed in zip(rows, back, table, strict=True):
+        for name in columns(rows):
+            assert typed[name] == given.get(name)
+            assert text[name] == ("" if given.get(name) is None else str(given[name]))
+
+
+def test_other_systems_are_rows_of_their_own(tmp_path: Path) -> None:
+    # Proves that a trajectory of another system is measured against the truth of the suite's run, after both
+    # alignments, and that a file that is no trajectory is a row that says so. Oracle: a scaled truth: SE(3) sees it.
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(40, 3)).cumsum(axis=0)
+    truth = Trajectory(np.arange(40) / 10, poses)
+    scaled = poses.copy()
+    scaled[:, :3, 3] *= 1.25
+    truth.save_tum(tmp_path / "out/runs/walk.full.0/truth.txt")
+    Trajectory(truth.timestamps, scaled).save_tum(tmp_path / "other/walk.txt")
+    suite = tiny.suite(tiny.TEXT + EXTERNAL)
+    (found,) = external_rows(suite, tiny.jobs(), tmp_path / "out/runs", tmp_path)
+    assert (found["setting"], found["sequence"], found["status"]) == ("other", "walk", "ok")
+    assert found["ate_sim3_m"] == pytest.approx(0.0, abs=1e-9)
+    assert found["scale"] == pytest.approx(0.8)
+    assert found["ate_se3_m"] > 0.1
+    (tmp_path / "other/walk.txt").write_text("nothing")
+    (broken,) = external_rows(suite, tiny.jobs(), tmp_path / "out/runs", tmp_path)
+    assert broken["status"] == "error"
+
+
+def test_relative_errors_of_a_free_scale_are_taken_after_it() -> None:
+    # Proves that RTE of an estimate without scale is that after the Sim(3) alignment. Oracle: a scaled truth has none.
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(1).normal(size=(60, 3)).cumsum(axis=0)
+    scaled = poses.copy()
+    scaled[:, :3, 3] *= 3
+    times = np.arange(60) / 10
+    free, _ = trajectory_errors(Trajectory(times, scaled), Trajectory(times, poses), metric=False)
+    metric, _ = trajectory_errors(Trajectory(times, scaled), Trajectory(times, poses), metric=True)
+    assert free["rte_1s_m"] == pytest.approx(0.0, abs=1e-9)
+    assert metric["rte_1s_m"] > 1.0
+    assert "scale is 0.333" in metric["warnings"]
+    assert trajectory_errors(Trajectory(times[:2], poses[:2]), Trajectory(times, poses))[0]["matched"] == 0
+
+
+def test_published_figures_have_source_and_protocol_and_stand_apart() -> None:
+    # Proves that figures of others are never in a table of own ones. Oracle: the section they are in.
+    table = published("tum-freiburg1")
+    assert table.source
+    assert table.protocol
+    assert table.rows["ORB-SLAM3"][0] is None
+    text = markdown.page(tiny.suite(tiny.TEXT.replace("seeds = 3", 'seeds = 3\npublished = ["tum-freiburg1"]')), ROWS)
+    before, _, after = text.partition("## Published by others")
+    assert "DROID-SLAM" not in before
+    assert "| DROID-SLAM (uncalibrated)* | 0.202 |" in after
+    assert "Not measured here" in after
+    with pytest.raises(InputError, match="there is no published table `x`"):
+        published("x")
+
+
+class _Page(HTMLParser):
+    """Counts elements, and notes what the page would load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loaded: list[str] = []
+        self.links: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attributes: list) -> None:
+        values = dict(attributes)
+        if tag not in ("meta", "link", "br", "img"):
+            self.open.append(tag)
+        self.loaded += [values[name] for name in ("src",) if values.get(name)]
+        self.links += [values["href"]] if tag == "a" else []
+
+    def handle_startendtag(self, tag: str, attributes: list) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_page_holds_everything_and_loads_nothing(tmp_path: Path) -> None:
+    # Proves that the page is one well-formed file with tables, drawings, verdicts, links to runs that are there, and
+    # the text of a message escaped. Oracle: a parser.
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(40, 3)).cumsum(axis=0)
+    for name in ("estimate", "truth"):
+        Trajectory(np.arange(40) / 10, poses).save_tum(tmp_path / f"runs/walk.full.0/{name}.txt")
+    (tmp_path / "runs/walk.full.0/report.html").write_text("")
+    crash = row("walk", "bare", 9, None, status="crash", message="<b>bad</b>")
+    suite = tiny.suite(tiny.TEXT.replace("seeds = 3", 'seeds = 3\npublished = ["averages"]') + EXTERNAL)
+    timed = [{**one, "seconds_tracking": 2.0, "seconds_window": 1.0, "peak_memory_gb": 0.5} for one in ROWS]
+    write_page(tmp_path / "report.html", suite, [*timed, crash], tmp_path)
+    text = (tmp_path / "report.html").read_text()
+    page = _Page()
+    page.feed(text)
+    assert page.open == []
+    assert page.loaded == []
+    assert "runs/walk.full.0/report.html" in page.links
+    assert all((tmp_path / link).is_file() for link in page.links)
+    assert "<b>bad</b>" in page.text
+    assert "<b>bad" not in text
+    assert text.count("<svg") == 3
+    for wanted in (
+        "3.00 ± 1.00",
+        "Against full system",
+        "+4.00 ± 2.48",
+        "Time and memory",
+        "Published by others",
+        "crash",
+    ):
+        assert wanted in page.text, wanted
+
+
+def test_a_suite_without_any_result_has_a_page(tmp_path: Path) -> None:
+    # Proves that a batch in which everything failed can be looked at, and drawn.
+    rows = [row("walk", "full", 0, None, status="crash", message="x")]
+    write_page(tmp_path / "report.html", tiny.suite(), rows, tmp_path)
+    assert "crash" in (tmp_path / "report.html").read_text()
+    assert markdown.page(tiny.suite(), rows)
+    assert ablation_figure(tiny.suite(), rows) is not None
+
+
+def test_the_report_of_a_batch(tmp_path: Path) -> None:
+    # Proves what `vggtgeo.bench` hands back, and its files.
+    report = BenchReport(tiny.suite(), tuple(ROWS), tmp_path)
+    assert set(report.write(tmp_path)) >= {"report.html", "tables.md", "runs.csv"}
+    assert (tmp_path / "tables.md").read_text() == report.markdown()
+    assert report.to_dict()["rows"][0]["sequence"] == "walk"
+    assert "12 of 12 runs" in repr(report)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("nosuch",), "`nosuch` is no suite and no TOML file; suites that come along: 7scenes"),
+        (("quick", "--sequences", "attic"), "`sequences` holds ['attic']; choose among office"),
+        (("quick", "--settings", ","), "`settings` holds nothing"),
+        (("quick", "--data", "/no/such/place"), "`data` is `/no/such/place`, which is no folder"),
+    ],
+)
+def test_a_wrong_argument_is_one_line(arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    # Proves that a wrong name ends before any work, with what can be chosen.
+    outcome = CliRunner().invoke(make_app(), ["bench", "-o", str(tmp_path / "out"), *arguments])
+    assert outcome.exit_code == 2
+    assert message in outcome.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_runs_a_suite_and_prints_its_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves the command from the file to the tables, with a stand-in for the runs. Oracle: the text of the report, and
+    # the errors of the stand-in.
+    plain = runner.all_rows
+    monkeypatch.setattr(runner, "all_rows", lambda *given: plain(*given, command=tiny.worker()))
+    (tmp_path / "tiny.toml").write_text(tiny.TEXT)
+    arguments = ["bench", str(tmp_path / "tiny.toml"), "-o", str(tmp_path / "out"), "--seeds", "1", "--workers", "2"]
+    outcome = CliRunner().invoke(make_app(), arguments)
+    assert outcome.exit_code == 0, outcome.output
+    assert outcome.stdout.strip() == (tmp_path / "out/tables.md").read_text().strip()
+    assert "walk, bare, seed 0: ATE 2.40 cm after SE(3), 4/4 frames, good (simulated)" in outcome.stderr
+    assert "| full system | **1.40** | **1.40** | **1.40** |" in outcome.stdout
+    listed = CliRunner().invoke(make_app(), ["bench", "list"])
+    assert "The paper's tables, simulated" in listed.stdout
+
+
+def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    # Proves that nothing is run whose result could not be written.
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a file"):
+        runner.bench("quick", tmp_path / "file")
+
+
+@pytest.mark.slow  # compiles; notebooks/evaluate.ipynb runs the same path
+def test_two_real_runs_from_start_to_tables(tmp_path: Path) -> None:
+    # Proves that worker, stubs, pipeline and metrics fit together. Oracle: a run without lines gives other numbers; a
+    # trajectory within 5 cm; depth and map compared with the exact ones.
+    report = runner.bench("paper-small", tmp_path, sequences=["room"], settings=["full", "C"], seeds=1)
+    assert [row["status"] for row in report.rows] == ["ok", "ok"], report.rows
+    assert all(0 < row["ate_se3_m"] < 0.05 for row in report.rows)
+    assert report.rows[0]["ate_se3_m"] != report.rows[1]["ate_se3_m"]
+    assert all(0 < row["depth_rmse_m"] < row["depth_prior_rmse_m"] < 1 for row in report.rows)
+    assert all(0.3 < row["f_score"] <= 1 for row in report.rows)
+    assert report.rows[0]["simulated"] is True

@@ -1,0 +1,269 @@
+"""Readers of the benchmarks' layouts, each on a tiny recording of just that layout."""
+
+import itertools
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tiny_layouts as tiny
+import tiny_sequences
+from scipy.spatial.transform import Rotation
+
+from vggtgeo.datasets import Sequence, open_sequence
+from vggtgeo.datasets.live import LiveCamera, is_live
+from vggtgeo.datasets.registration import registered_depth
+from vggtgeo.datasets.seven_scenes import _TO_COLOUR
+from vggtgeo.datasets.tanks import inside_crop
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.results.reconstruction import _Source
+
+CAMERA = Camera(tiny_sequences.INTRINSICS, tiny_sequences.WIDTH, tiny_sequences.HEIGHT)
+LOSSLESS = (tiny.scannet, tiny.euroc, tiny.icl, tiny.kitti, tiny.arkit)
+
+
+def _open(path: Path, kind: str | None = None) -> Sequence:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        return open_sequence(path, kind)
+
+
+def _check(sequence: Sequence, kind: str, camera: tuple[float, ...] = tiny_sequences.INTRINSICS) -> list:
+    """What all of them share: three frames in order, their times rising, the camera known."""
+    assert type(sequence).__name__ == kind
+    assert len(sequence) == tiny.COUNT
+    frames = list(sequence.frames())
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert [frame.image[3, 5, 0] for frame in frames] == pytest.approx([0, 1, 2], abs=2)
+    assert all(a.timestamp < b.timestamp for a, b in itertools.pairwise(frames))
+    assert sequence.camera.intrinsics == pytest.approx(camera)
+    assert [frame.index for frame in sequence.frames(1, None, 2)] == [1]
+    return frames
+
+
+def test_replica(tmp_path: Path) -> None:
+    # Proves camera and unit of `cam_params.json`, times, poses. Oracle: what was written.
+    sequence = _open(tiny.replica(tmp_path / "room0"))
+    frames = _check(sequence, "Replica")
+    assert frames[1].depth[3, 7] == pytest.approx((1000 + 10 + 7) / 6553.5)
+    assert np.isnan(frames[0].depth[0, 0])
+    truth = sequence.ground_truth()
+    assert truth.positions[:, 0].tolist() == [0, 1, 2]
+    np.testing.assert_allclose(truth.timestamps, [frame.timestamp for frame in frames])
+
+
+def test_scannet_brings_images_to_the_depth_camera(tmp_path: Path) -> None:
+    # Proves that a pixel of the image shows what the depth of that pixel measures, that lost poses are left out with a
+    # word, and that depth is in millimetres. Oracle: the place that each pixel of the large image has as colour.
+    sequence = _open(tiny.scannet(tmp_path / "scene0000_00"))
+    frames = _check(sequence, "ScanNet")
+    assert frames[0].image.shape[:2] == frames[0].depth.shape == (30, 40)
+    x, y = np.meshgrid(np.arange(40), np.arange(30))
+    inner = slice(3, -3)
+    assert np.abs(frames[0].image[inner, inner, 1] - (2.0 * x + 0.5)[inner, inner]).max() <= 1
+    assert np.abs(frames[0].image[inner, inner, 2] - (2.0 * y + 0.5)[inner, inner]).max() <= 1
+    assert frames[2].depth[3, 7] == pytest.approx(1.027)
+    with pytest.warns(InputWarning, match="1 of 3 poses have a NaN or an infinity"):
+        assert sequence.ground_truth().positions[:, 0].tolist() == [0, 2]
+
+
+def test_euroc_is_the_left_camera(tmp_path: Path) -> None:
+    # Proves nanoseconds, distortion, a word about the IMU, and poses of the body moved to the camera. Oracle: a camera
+    # that looks along the body's x axis, 0.1 m before it.
+    with pytest.warns(InputWarning, match="the IMU is not used"):
+        sequence = open_sequence(tiny.euroc(tmp_path / "MH_01_easy"))
+    frames = _check(sequence, "Euroc")
+    assert sequence.name == "MH_01_easy"
+    assert sequence.camera.distortion == (-0.28, 0.07, 0.0002, 1.8e-05)
+    assert frames[1].timestamp == pytest.approx(1403636579.813555584, abs=1e-6)
+    truth = sequence.ground_truth()
+    np.testing.assert_allclose(truth.positions[:, 0], [0.1, 1.1, 2.1])
+    np.testing.assert_allclose(truth.rotations[1] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+
+
+def test_icl_is_mirrored_with_its_truth(tmp_path: Path) -> None:
+    # Proves that a camera with a negative fy becomes one with a positive, and that truth and images still belong
+    # together. Oracle: a point projected by the original camera and pose, and by the mirrored ones.
+    sequence = _open(tiny.icl(tmp_path / "lr0"))
+    _check(sequence, "IclNuim", (481.2, 480.0, 319.5, 239.5))
+    truth = sequence.ground_truth()
+    np.testing.assert_allclose(truth.timestamps, np.array([1, 2]) / 30)
+    original = np.eye(4)
+    original[:3, :3] = Rotation.from_quat([0, 0, np.sin(0.2), np.cos(0.2)]).as_matrix()
+    original[:3, 3] = [1, 2, 2]
+    point = np.array([1.4, 2.9, 5.0])
+    seen = original[:3, :3].T @ (point - original[:3, 3])
+    pixel = 481.2 * seen[0] / seen[2] + 319.5, -480.0 * seen[1] / seen[2] + 239.5
+    mirrored = truth.poses[1]
+    seen = mirrored[:3, :3].T @ (point * [1, -1, 1] - mirrored[:3, 3])
+    found = 481.2 * seen[0] / seen[2] + 319.5, 480.0 * seen[1] / seen[2] + 239.5
+    np.testing.assert_allclose(found, pixel, atol=1e-9)
+    assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1.0)
+
+
+def test_tanks_and_temples(tmp_path: Path) -> None:
+    # Proves the log, the similarity to the scanner's frame, and the crop. Oracle: what was written; points by hand, one
+    # of them in the notch of the polygon.
+    folder = tiny.tanks(tmp_path / "Ignatius")
+    sequence = _open(folder)
+    assert type(sequence).__name__ == "TanksAndTemples"
+    assert not sequence.camera.known
+    truth = sequence.ground_truth()
+    np.testing.assert_allclose(truth.positions, [[0, 0, 5], [2, 0, 5], [4, 0, 5]])
+    np.testing.assert_allclose(truth.rotations[1], np.eye(3), atol=1e-12)
+    points = np.array([[1.0, 0, 0.5], [1.0, 2, 0.5], [1.0, 0, 1.5], [0.2, 0, 1.5], [3.0, 0, 0.5]])
+    assert inside_crop(folder / "Ignatius.json", points).tolist() == [True, False, False, True, False]
+
+
+def test_kitti(tmp_path: Path) -> None:
+    # Proves the rectified camera, times, and that the grey camera's poses are moved to the colour camera. Oracle: 6 cm.
+    sequence = _open(tiny.kitti(tmp_path / "dataset"))
+    frames = _check(sequence, "Kitti")
+    assert frames[2].timestamp == pytest.approx(0.2074)
+    np.testing.assert_allclose(sequence.ground_truth().positions[:, 0], [-0.06, 0.94, 1.94])
+
+
+def test_arkit_scenes(tmp_path: Path) -> None:
+    # Proves depth of fewer pixels enlarged, the middle of the frames' intrinsics, and inverted poses.
+    sequence = _open(tiny.arkit(tmp_path / "41069021"))
+    frames = _check(sequence, "ArkitScenes")
+    assert frames[1].depth.shape == (30, 40)
+    assert frames[1].depth[9, 14:16] == pytest.approx([1.017, 1.017])
+    np.testing.assert_allclose(sequence.ground_truth().positions[:, 0], [0, 1, 2])
+
+
+def test_stray_scanner(tmp_path: Path) -> None:
+    # Proves that a phone's video of 1920 pixels is halved with its camera, depth without trust left out, times those of
+    # ARKit. Oracle: by hand; the centre of the image stays the centre.
+    sequence = _open(tiny.stray(tmp_path / "ab12"))
+    assert type(sequence).__name__ == "StrayScanner"
+    frames = list(sequence.frames())
+    assert frames[0].image.shape == (720, 960, 3)
+    assert [frame.timestamp for frame in frames] == pytest.approx([100.0, 100.1, 100.2])
+    assert [frame.image[9, 9, 0] for frame in frames] == pytest.approx([40, 100, 160], abs=6)
+    assert sequence.camera.intrinsics == pytest.approx((700.0, 700.0, 479.5, 359.5))
+    assert frames[1].depth.shape == (720, 960)
+    assert frames[1].depth[3, 900] == pytest.approx(1.010 + 0.060)
+    assert np.isnan(frames[1].depth[15 * 5 + 7, 900])
+    assert sequence.ground_truth().positions[:, 0].tolist() == [0, 1, 2]
+
+
+def test_bonn_has_its_published_camera(tmp_path: Path) -> None:
+    # Proves that the Bonn benchmark, which has the layout of TUM RGB-D, gets its own camera.
+    sequence = open_sequence(tiny.bonn(tmp_path / "rgbd_bonn_balloon"))
+    assert type(sequence).__name__ == "TumRgbd"
+    assert sequence.camera.intrinsics[0] == 542.822841
+    assert len(sequence.camera.distortion) == 4
+
+
+def test_seven_scenes_as_published_is_registered(tmp_path: Path) -> None:
+    # Proves that depth and poses of the depth camera are moved to the colour camera where the folder has no intrinsics,
+    # and nowhere else. Oracle: the world point of a pixel of depth, seen by either camera.
+    depth = np.full((480, 640), 65535, np.uint16)
+    depth[200:260, 300:360] = 1500
+    for number in range(2):
+        stem = tmp_path / "seq-01" / f"frame-{number:06d}"
+        tiny_sequences.write_image(stem.with_suffix(".color.png"), tiny_sequences.image(number, 640, 480))
+        tiny_sequences.write_image(stem.with_suffix(".depth.png"), depth)
+        np.savetxt(stem.with_suffix(".pose.txt"), tiny_sequences.pose(number))
+    with pytest.warns(InputWarning, match="taken as published"):
+        sequence = open_sequence(tmp_path / "seq-01")
+    frame = list(sequence.frames())[1]
+    point = np.array([(330 - 320) / 585 * 1.5, (230 - 240) / 585 * 1.5, 1.5])
+    world = point + [1.0, 0, 0]
+    pose = np.linalg.inv(sequence.ground_truth().poses[1])
+    seen = pose[:3, :3] @ world + pose[:3, 3]
+    u, v = 525 * seen[0] / seen[2] + 320, 525 * seen[1] / seen[2] + 240
+    assert frame.depth[round(v), round(u)] == pytest.approx(seen[2], abs=2e-3)
+    np.testing.assert_allclose(seen, _TO_COLOUR[:3, :3] @ point + _TO_COLOUR[:3, 3], atol=1e-9)
+    assert 0.6 < np.isfinite(frame.depth).sum() / 3600 < 1.1
+    tiny_sequences.write_calibration(tmp_path / "seq-01", (525.0, 525.0, 320.0, 240.0))
+    prepared = open_sequence(tmp_path / "seq-01")
+    assert next(prepared.frames()).depth[230, 330] == pytest.approx(1.5)
+    np.testing.assert_allclose(prepared.ground_truth().positions[:, 0], [0, 1])
+
+
+def test_registered_depth_keeps_the_nearer_surface() -> None:
+    # Proves that the same camera gives the same depth, and that of two points on a pixel the nearer one stays. Oracle:
+    # the map itself; a small camera that sees many pixels on one.
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 3, (30, 40)).astype(np.float32)
+    depth[rng.random((30, 40)) < 0.3] = np.nan
+    same = registered_depth(depth, tiny_sequences.INTRINSICS, tiny_sequences.INTRINSICS, np.eye(4), (40, 30))
+    np.testing.assert_allclose(same, depth, rtol=1e-6)
+    small = registered_depth(depth, (35.0, 35.0, 20.0, 15.0), (0.01, 0.01, 0.0, 0.0), np.eye(4), (1, 1))
+    assert small[0, 0] == np.nanmin(depth)
+    behind = np.eye(4)
+    behind[2, 3] = -5.0
+    assert np.isnan(registered_depth(depth, (35.0, 35.0, 20.0, 15.0), (35.0, 35.0, 20.0, 15.0), behind, (40, 30))).all()
+
+
+@pytest.mark.parametrize("ros2", [False, True])
+def test_bags_of_ros(tmp_path: Path, ros2: bool) -> None:
+    # Proves images, depth paired by time, camera with its distortion, and truth, of both generations of ROS. Oracle:
+    # what was written.
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    sequence = open_sequence(tiny.bag(tmp_path / ("bag" if ros2 else "a.bag"), ros2))
+    frames = _check(sequence, "RosBag")
+    np.testing.assert_array_equal(frames[2].image, tiny_sequences.image(2))
+    assert frames[1].depth[3, 7] == pytest.approx(1.017)
+    assert np.isnan(frames[0].depth[0, 0])
+    assert sequence.camera.distortion == (0.1, -0.02, 0.0, 0.0, 0.0)
+    assert sequence.ground_truth().positions[:, 0].tolist() == [0, 1, 2]
+    assert [frame.timestamp for frame in frames] == pytest.approx([50.0, 50.1, 50.2])
+
+
+def test_a_stream_is_read_until_it_ends(tmp_path: Path) -> None:
+    # Proves names of webcams and streams, frames as they come with rising times, no password in a name, and a run on a
+    # stream, whose length nobody knows. Oracle: a file served as a stream.
+    assert is_live("webcam")
+    assert is_live("webcam:1")
+    assert is_live("rtsp://user:secret@10.0.0.2/stream")
+    assert not is_live("clip.mp4")
+    assert "secret" not in LiveCamera("rtsp://user:secret@10.0.0.2/s", CAMERA).name
+    file = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    for number in range(5):
+        writer.write(np.full((48, 64, 3), 40 * number, np.uint8))
+    writer.release()
+    with pytest.warns(InputWarning, match="no intrinsics found"):
+        stream = open_sequence(f"file:{file}", kind="live")
+    frames = list(stream.frames(1, None, 2))
+    assert [frame.index for frame in frames] == [1, 3]
+    assert frames[0].timestamp < frames[1].timestamp
+    assert [int(frame.image.mean()) for frame in frames] == pytest.approx([40, 120], abs=4)
+    with pytest.raises(InputError, match="cannot be opened"):
+        open_sequence("rtsp://127.0.0.1:9/nothing")
+
+
+def test_a_folder_of_images_takes_a_rate(tmp_path: Path) -> None:
+    # Proves `rate` on a plain folder, and its refusal where the recording has times of its own.
+    folder = tiny_sequences.images(tmp_path / "images")
+    assert [frame.timestamp for frame in open_sequence(folder, rate=5.0).frames()] == pytest.approx([0.0, 0.2, 0.4])
+    with pytest.raises(InputError, match="`rate` is 0"):
+        open_sequence(folder, rate=0.0)
+    with pytest.raises(InputError, match="has times of its own"):
+        open_sequence(tiny_sequences.tum(tmp_path / "tum"), rate=5.0)
+
+
+@pytest.mark.parametrize("write", LOSSLESS, ids=lambda write: write.__name__)
+def test_a_spoilt_file_of_poses_is_named(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    # Proves that a truth that cannot be read is an InputError that names the file, in every layout that has one.
+    folder = write(tmp_path / "x")
+    sequence = _open(folder)
+    files = [*tmp_path.rglob("*.traj"), *tmp_path.rglob("*.freiburg"), *tmp_path.rglob("poses/*.txt")]
+    files += [*tmp_path.rglob("state_ground*/data.csv"), *tmp_path.rglob("pose/*.txt")]
+    assert files
+    for file in files:
+        file.write_text("1 2 three\n")
+    with pytest.raises(InputError, match="expected"):
+        sequence.ground_truth()
+
+
+def test_a_run_on_a_stream_has_no_total(tmp_path: Path) -> None:
+    # Proves that an unknown length is told as None to what shows the progress. Oracle: the callback.
+    stream = LiveCamera("webcam", CAMERA)
+    assert _Source("x", stream, None).count(0, None, 1) is None

@@ -1,0 +1,215 @@
+"""Tiny recordings in the layouts of the benchmarks, as they are downloaded; see `tiny_sequences` for their contents."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tiny_sequences import HEIGHT, INTRINSICS, WIDTH, depth_codes, image, pose, tum_line, write_image
+
+COUNT = 3
+YAW = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def _matrix(values: np.ndarray) -> str:
+    return "\n".join(" ".join(f"{value:.9f}" for value in row) for row in values) + "\n"
+
+
+def replica(folder: Path) -> Path:
+    """A room of NICE-SLAM's Replica, its camera beside it; depth in 1 / 6553.5 m."""
+    for number in range(COUNT):
+        write_image(folder / f"results/frame{number:06d}.jpg", image(number))
+        write_image(folder / f"results/depth{number:06d}.png", depth_codes(number))
+    (folder / "traj.txt").write_text("".join(" ".join(map(str, pose(n).ravel())) + "\n" for n in range(COUNT)))
+    fx, fy, cx, cy = INTRINSICS
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "scale": 6553.5}
+    (folder.parent / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return folder
+
+
+def scannet(folder: Path) -> Path:
+    """An exported scan: colour of twice the pixels, millimetres, the second pose lost."""
+    for number in range(COUNT):
+        write_image(folder / f"color/{number}.png", image(number, 2 * WIDTH, 2 * HEIGHT))
+        write_image(folder / f"depth/{number}.png", depth_codes(number))
+        matrix = pose(number) if number != 1 else np.full((4, 4), -np.inf)
+        (folder / f"pose/{number}.txt").parent.mkdir(exist_ok=True)
+        (folder / f"pose/{number}.txt").write_text(_matrix(matrix))
+    fx, fy, cx, cy = INTRINSICS
+    for name, factor in (("color", 2.0), ("depth", 1.0)):
+        matrix = np.eye(4)
+        # the centre of pixel (0, 0) is the origin: a point at x in the small image lies at 2 x + 0.5 in the large one
+        shift = 0.5 * (factor - 1)
+        matrix[:2, :3] = [[factor * fx, 0, factor * cx + shift], [0, factor * fy, factor * cy + shift]]
+        (folder / "intrinsic").mkdir(exist_ok=True)
+        (folder / f"intrinsic/intrinsic_{name}.txt").write_text(_matrix(matrix))
+    return folder
+
+
+def euroc(folder: Path) -> Path:
+    """A flight: the camera looks along the body's x axis, 0.1 m before its centre; body poses at 200 Hz."""
+    base, start = folder / "mav0", 1403636579763555584
+    lines, truth = (
+        ["#timestamp [ns],filename\n"],
+        ["#timestamp, p x, y, z [m], q w, x, y, z\n"],
+    )
+    for number in range(COUNT):
+        time = start + 50_000_000 * number
+        write_image(base / f"cam0/data/{time}.png", image(number))
+        lines.append(f"{time},{time}.png\n")
+        truth.append(f"{time},{number},0,0,1,0,0,0,0,0,0,0,0,0,0,0,0\n")
+    (base / "cam0/data.csv").write_text("".join(lines))
+    extrinsics = YAW.copy()
+    extrinsics[0, 3] = 0.1
+    (base / "cam0/sensor.yaml").write_text(
+        "sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n"
+        f"  data: [{', '.join(map(str, extrinsics.ravel()))}]\n"
+        f"intrinsics: [{', '.join(map(str, INTRINSICS))}] #fu, fv, cu, cv\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]\n"
+    )
+    for name, text in (("state_groundtruth_estimate0", "".join(truth)), ("imu0", "#nothing\n")):
+        (base / name).mkdir()
+        (base / name / "data.csv").write_text(text)
+    return folder
+
+
+def icl(folder: Path) -> Path:
+    """The TUM-compatible form: the truth begins with frame 1; rising by y, turning about z."""
+    lines, truth = [], []
+    for number in range(COUNT):
+        write_image(folder / f"rgb/{number}.png", image(number, 640, 480))
+        write_image(folder / f"depth/{number}.png", depth_codes(number, 640, 480))
+        lines.append(f"{number} depth/{number}.png {number} rgb/{number}.png\n")
+        truth.append(f"{number} 1 {number} 2 0 0 {np.sin(0.1 * number)} {np.cos(0.1 * number)}\n")
+    (folder / "associations.txt").write_text("".join(lines))
+    (folder / "livingRoom0.gt.freiburg").write_text("".join(truth[1:]))
+    return folder
+
+
+def tanks(folder: Path) -> Path:
+    """A scene with its log, its alignment to the scanner (twice as large, moved along z) and its crop."""
+    log = []
+    for number in range(COUNT):
+        write_image(folder / f"{number + 1:06d}.jpg", image(number))
+        log.append(f"{number} {number} 0\n" + _matrix(pose(number)))
+    (folder / f"{folder.name}_COLMAP_SfM.log").write_text("".join(log))
+    alignment = np.diag([2.0, 2.0, 2.0, 1.0])
+    alignment[2, 3] = 5.0
+    (folder / f"{folder.name}_trans.txt").write_text(_matrix(alignment))
+    corners = [[0, 0, 0], [2, 0, 0], [2, 0, 2], [1, 0, 1], [0, 0, 2]]
+    crop = {"orthogonal_axis": "Y", "axis_min": -1.0, "axis_max": 1.0, "bounding_polygon": corners}
+    (folder / f"{folder.name}.json").write_text(json.dumps(crop))
+    return folder
+
+
+def kitti(folder: Path) -> Path:
+    """A drive of the odometry benchmark, colour; the truth beside it, of the grey camera 6 cm to the right."""
+    place = folder / "sequences" / "07"
+    for number in range(COUNT):
+        write_image(place / f"image_2/{number:06d}.png", image(number))
+    fx, fy, cx, cy = INTRINSICS
+    rows = {"P0": [fx, 0, cx, 0], "P2": [fx, 0, cx, 0.06 * fx]}
+    lines = [f"{name}: " + " ".join(map(str, [*row, 0, fy, cy, 0, 0, 0, 1, 0])) + "\n" for name, row in rows.items()]
+    (place / "calib.txt").write_text("".join(lines))
+    (place / "times.txt").write_text("".join(f"{0.1037 * number:e}\n" for number in range(COUNT)))
+    (folder / "poses").mkdir()
+    (folder / "poses/07.txt").write_text("".join(" ".join(map(str, pose(n)[:3].ravel())) + "\n" for n in range(COUNT)))
+    return place
+
+
+def arkit(folder: Path) -> Path:
+    """A recording of ARKitScenes, its depth of half the pixels; the poses are world -> camera."""
+    lines = []
+    for number in range(COUNT):
+        stem = f"41069021_{305.377 + 0.1 * number:.3f}.png"
+        write_image(folder / "lowres_wide" / stem, image(number))
+        write_image(folder / "lowres_depth" / stem, depth_codes(number, WIDTH // 2, HEIGHT // 2))
+        camera = folder / "lowres_wide_intrinsics" / stem.replace(".png", ".pincam")
+        camera.parent.mkdir(exist_ok=True)
+        camera.write_text(f"{WIDTH} {HEIGHT} " + " ".join(str(value + 0.1 * (number - 1)) for value in INTRINSICS))
+        lines.append(f"{305.377 + 0.1 * number:.3f} 0 0 0 {-number} 0 0\n")
+    (folder / "lowres_wide.traj").write_text("".join(lines))
+    return folder
+
+
+def stray(folder: Path) -> Path:
+    """A recording of Stray Scanner: a video of 1920 x 1440, depth of 64 x 48, one row of it without trust."""
+    folder.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(folder / "rgb.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (1920, 1440))
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw\n"]
+    for number in range(COUNT):
+        writer.write(np.full((1440, 1920, 3), 60 * number + 40, np.uint8))
+        write_image(folder / f"depth/{number:06d}.png", depth_codes(number, 64, 48))
+        trust = np.full((48, 64), 2, np.uint8)
+        trust[5] = 0
+        write_image(folder / f"confidence/{number:06d}.png", trust)
+        rows.append(f"{100.0 + 0.1 * number}, {number:06d}, {number}, 0, 0, 0, 0, 0, 1\n")
+    writer.release()
+    (folder / "odometry.csv").write_text("".join(rows))
+    (folder / "camera_matrix.csv").write_text("1400.0, 0.0, 959.5\n0.0, 1400.0, 719.5\n0.0, 0.0, 1.0\n")
+    return folder
+
+
+def bonn(folder: Path) -> Path:
+    """One image in the layout of TUM RGB-D, of the size that the published camera has."""
+    for name in ("rgb", "depth"):
+        pixels = image(0, 640, 480) if name == "rgb" else depth_codes(0, 640, 480)
+        write_image(folder / name / "1.0.png", pixels)
+        (folder / f"{name}.txt").write_text(f"1.0 {name}/1.0.png\n")
+    (folder / "groundtruth.txt").write_text(tum_line(1.0, 0))
+    return folder
+
+
+def bag(path: Path, ros2: bool) -> Path:
+    """Images 0.1 s apart, depth in millimetres 5 ms later, the camera, and the truth of a marker."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
+    kinds = store.types
+    writer = Writer2(path, version=9) if ros2 else Writer1(path)
+    header = lambda time: _header(kinds, time, ros2)
+    with writer:
+        topics = {
+            "/camera/color/image_raw": "sensor_msgs/msg/Image",
+            "/camera/color/camera_info": "sensor_msgs/msg/CameraInfo",
+            "/camera/aligned_depth/image_raw": "sensor_msgs/msg/Image",
+            "/mocap/pose": "geometry_msgs/msg/PoseStamped",
+        }
+        connections = {name: writer.add_connection(name, kind, typestore=store) for name, kind in topics.items()}
+
+        def write(topic: str, time: float, message: object) -> None:
+            kind = topics[topic]
+            raw = store.serialize_cdr(message, kind) if ros2 else store.serialize_ros1(message, kind)
+            writer.write(connections[topic], int(time * 1e9), raw)
+
+        for number in range(COUNT):
+            time = 50.0 + 0.1 * number
+            for topic, later, encoding, pixels in (
+                ("/camera/color/image_raw", 0.0, "rgb8", image(number)),
+                ("/camera/aligned_depth/image_raw", 0.005, "16UC1", depth_codes(number)),
+            ):
+                data = np.frombuffer(pixels.tobytes(), np.uint8)
+                step = len(data) // HEIGHT
+                image_kind = kinds["sensor_msgs/msg/Image"]
+                write(topic, time + later, image_kind(header(time + later), HEIGHT, WIDTH, encoding, 0, step, data))
+            write("/camera/color/camera_info", time, _camera_info(kinds, header(time), ros2))
+            place = kinds["geometry_msgs/msg/Point"](float(number), 0.0, 0.0)
+            turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+            value = kinds["geometry_msgs/msg/Pose"](place, turn)
+            write("/mocap/pose", time, kinds["geometry_msgs/msg/PoseStamped"](header(time), value))
+    return path
+
+
+def _header(kinds: dict, time: float, ros2: bool) -> object:
+    stamp = kinds["builtin_interfaces/msg/Time"](int(time), round((time % 1) * 1e9))
+    return kinds["std_msgs/msg/Header"](stamp, "c") if ros2 else kinds["std_msgs/msg/Header"](0, stamp, "c")
+
+
+def _camera_info(kinds: dict, header: object, ros2: bool) -> object:
+    fx, fy, cx, cy = INTRINSICS
+    matrix = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
+    region = kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    values = (np.array([0.1, -0.02, 0.0, 0.0, 0.0]), matrix, np.eye(3).ravel(), np.zeros(12))
+    return kinds["sensor_msgs/msg/CameraInfo"](header, HEIGHT, WIDTH, "plumb_bob", *values, 0, 0, region)

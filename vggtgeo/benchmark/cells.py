@@ -1,0 +1,204 @@
+"""Numbers as they stand in a table, the same for Markdown and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vggtgeo.benchmark.protocols import PROTOCOLS
+from vggtgeo.benchmark.statistics import Summary, paired, select, values
+from vggtgeo.benchmark.store import Row
+from vggtgeo.benchmark.suite import Suite
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: a number of the rows, in the unit of its head. better: -1 where less is better, 1 where
+    more is, 0 where neither.
+    """
+
+    head: str
+    name: str
+    factor: float = 1.0
+    digits: int = 2
+    better: int = -1
+
+
+SE3 = Column("ATE SE(3) cm", "ate_se3_m", 100.0)
+SIM3 = Column("ATE Sim(3) cm", "ate_sim3_m", 100.0)
+DETAILS = (
+    SE3,
+    SIM3,
+    Column("scale", "scale", 1.0, 4, 0),
+    Column("RTE cm/s", "rte_1s_m", 100.0),
+    Column("RRE deg/s", "rre_1s_deg"),
+    Column("depth RMSE cm", "depth_rmse_m", 100.0),
+    Column("AbsRel %", "depth_abs_rel", 100.0),
+    Column("F-score %", "f_score", 100.0, 1, 1),
+    Column("frames/s", "frames_per_second", 1.0, 1, 0),
+    Column("memory GB", "peak_memory_gb", 1.0, 2, 0),
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A text, and its place among those it is compared with: 1 the best, 2 the second, 0 for all others."""
+
+    text: str
+    place: int = 0
+
+
+def number_cell(summary: Summary, digits: int) -> str:
+    """Mean and standard deviation; one number alone; nothing where there is none."""
+    if not summary.count:
+        return ""
+    mean = f"{summary.mean:.{digits}f}"
+    return mean if np.isnan(summary.deviation) else f"{mean} ± {summary.deviation:.{digits}f}"
+
+
+def interval_cell(summary: Summary, digits: int) -> str:
+    """A mean difference with its 95 % interval; without one where one pair is all there is."""
+    if not summary.count:
+        return ""
+    mean = f"{summary.mean:+.{digits}f}"
+    return f"{mean} (one pair)" if np.isnan(summary.half) else f"{mean} ± {summary.half:.{digits}f}"
+
+
+FREE = "free"
+"""In the place of an error at true scale of runs that do not claim one."""
+
+
+def comparable(rows: Sequence[Row], column: Column) -> list[Row]:
+    """The rows whose number in a column means something: an error after SE(3) of a scale that is free does not."""
+    return [row for row in rows if column is not SE3 or row.get("metric") is not False]
+
+
+def summary_of(rows: Sequence[Row], column: Column) -> Summary:
+    """The summary of a column in its unit."""
+    return Summary.of(column.factor * values(comparable(rows, column), column.name))
+
+
+def text_of(rows: Sequence[Row], column: Column) -> str:
+    """`summary_of` as text."""
+    free = bool(rows) and not comparable(rows, column)
+    return FREE if free else number_cell(summary_of(rows, column), column.digits)
+
+
+def ranked(groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]:
+    """A cell of a column for each group of rows."""
+    return placed([summary_of(own, column) for own in groups], [text_of(own, column) for own in groups], column)
+
+
+def placed(summaries: Sequence[Summary], texts: Sequence[str], column: Column) -> list[Cell]:
+    """Cells with the best and the second best marked, where there are two or more to compare."""
+    means = [summary.mean for summary in summaries]
+    known = sorted({round(mean, column.digits) for mean in means if np.isfinite(mean)}, reverse=column.better > 0)
+    if not column.better or len(known) < 2:
+        return [Cell(text) for text in texts]
+    place = lambda mean: known.index(round(mean, column.digits)) + 1 if np.isfinite(mean) else 0
+    return [Cell(text, rank if (rank := place(mean)) <= 2 else 0) for text, mean in zip(texts, means, strict=True)]
+
+
+def settings_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
+    """Settings and other systems with a row, in the order of the suite."""
+    there = {row["setting"] for row in rows}
+    return [table.name for table in (*suite.setting, *suite.external) if table.name in there]
+
+
+def sequences_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
+    """Sequences with a row, in the order of the suite."""
+    there = {row["sequence"] for row in rows}
+    return [table.name for table in suite.sequence if table.name in there]
+
+
+def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str, list[Cell]]]:
+    """A row a setting, a column a sequence, and the mean over the sequences that all of them have a number for."""
+    settings, sequences = settings_of(suite, rows), sequences_of(suite, rows)
+    groups = {name: [select(rows, name, setting) for setting in settings] for name in sequences}
+    by_column = [ranked(groups[name], column) for name in sequences]
+    common = _common(suite, rows, column)
+    if len(common) > 1:
+        means = [
+            float(np.mean([summary_of(groups[name][row], column).mean for name in common]))
+            for row in range(len(settings))
+        ]
+        averages = [Summary(1, mean, mean, np.nan, np.nan) for mean in means]
+        by_column.append(placed(averages, [number_cell(one, column.digits) for one in averages], column))
+    return [(suite.title_of(setting), [cells[row] for cells in by_column]) for row, setting in enumerate(settings)]
+
+
+def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
+    """The sequences that every setting has a number for: a mean over others would favour who fails on the hard ones."""
+    settings = settings_of(suite, rows)
+    return [
+        name
+        for name in sequences_of(suite, rows)
+        if all(summary_of(select(rows, name, setting), column).count for setting in settings)
+    ]
+
+
+def matrix_heads(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
+    """The heads of `matrix`."""
+    sequences, common = sequences_of(suite, rows), _common(suite, rows, column)
+    mean = "mean" if len(common) == len(sequences) else f"mean of {len(common)}"
+    return [*sequences, mean] if len(common) > 1 else sequences
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What a setting changes, run by run. sequence: its name, or "all". cells: one a column."""
+
+    setting: str
+    sequence: str
+    pairs: int
+    cells: tuple[Cell, ...]
+
+
+COMPARED = (SE3, SIM3, DETAILS[4], DETAILS[5], DETAILS[7])
+
+
+def differences(suite: Suite, rows: Sequence[Row]) -> list[Difference]:
+    """Setting minus baseline on the same sequence and seed; a place of 1 (better) or 2 (worse) where the 95 % interval
+    leaves zero out.
+    """
+    found = []
+    for setting in settings_of(suite, rows):
+        if setting == suite.base:
+            continue
+        names: list[str | None] = [*sequences_of(suite, rows)]
+        for sequence in [*names, None] if len(names) > 1 else names:
+            lists = [
+                column.factor * paired(comparable(rows, column), setting, suite.base, column.name, sequence)
+                for column in COMPARED
+            ]
+            pairs = max(len(one) for one in lists)
+            if pairs:
+                cells = tuple(_difference(Summary.of(one), column) for one, column in zip(lists, COMPARED, strict=True))
+                found.append(Difference(suite.title_of(setting), sequence or "all", pairs, cells))
+    return found
+
+
+def _difference(summary: Summary, column: Column) -> Cell:
+    better = summary.mean * column.better > 0
+    return Cell(interval_cell(summary, column.digits), (1 if better else 2) if summary.count and summary.differs else 0)
+
+
+def verdicts(rows: Sequence[Row]) -> str:
+    """How runs ended: their verdicts, and what ended without one, with counts where there are several."""
+    words = [str(row.get("verdict") or row["status"]) for row in rows]
+    counts = {word: words.count(word) for word in dict.fromkeys(words)}
+    return ", ".join(word if len(words) == 1 else f"{count} {word}" for word, count in counts.items())
+
+
+def tracked(rows: Sequence[Row]) -> str:
+    """Frames tracked of frames read, all runs together."""
+    known = [row for row in rows if row.get("frames")]
+    return f"{sum(row['tracked'] for row in known)}/{sum(row['frames'] for row in known)}" if known else ""
+
+
+def protocol_text(rows: Sequence[Row]) -> str:
+    """The protocols in words."""
+    names = dict.fromkeys(str(row["protocol"]) for row in rows)
+    return "; ".join(f"{name}: {PROTOCOLS[name].about}" for name in names)

@@ -1,0 +1,123 @@
+"""Runs on a Ray cluster (`pip install "vggtgeo[cluster]"`): a run is a task with processors and, if asked for, a GPU.
+
+A task starts the same process with the same limits as `scheduling` does, and hands back its row and its small files,
+which the driver writes into the store: a result is taken once, whatever was tried how often. Ray starts a task again
+whose worker or node is gone. Recordings must lie under the same path on every node. A driver that dies is called again.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.benchmark.jobs import Job
+from vggtgeo.benchmark.processes import Limits, run_limited
+from vggtgeo.benchmark.scheduling import Command, Finished, described, worker_command
+from vggtgeo.benchmark.store import Store
+from vggtgeo.benchmark.worker import JOB, LOG, ROW
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_path
+
+RETRIES = 3
+"""Of a task whose worker or node is gone."""
+LARGEST_FILE = 2**24
+"""Bytes: larger ones (maps, recordings) stay where they were made, and go with them."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """address: of the cluster's head, "auto" for the one of this machine, "local" to start one here for this batch.
+    cpus, gpus: of each run.
+    """
+
+    address: str = "auto"
+    cpus: float = 1.0
+    gpus: float = 0.0
+
+
+def run_jobs_on_cluster(
+    jobs: Sequence[Job],
+    store: Store,
+    limits: Limits,
+    cluster: Cluster,
+    finished: Finished | None = None,
+    command: Command = worker_command,
+) -> None:
+    """Run `jobs` wherever the cluster has room, and store their rows as they come.
+
+    InputError where Ray is not installed, or no cluster answers at the address.
+    """
+    if not jobs:
+        return
+    ray = _connected(cluster)
+    task = ray.remote(num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=RETRIES)(run_remotely)
+    try:
+        waiting = {}
+        for job in jobs:
+            text = json.dumps(store.described(job))
+            waiting[task.remote(text, limits, command, cluster.cpus)] = job
+        while waiting:
+            done, _ = ray.wait(list(waiting), num_returns=1)
+            for reference in done:
+                job = waiting.pop(reference)
+                row = _taken(ray, reference, job, store)
+                if finished is not None:
+                    finished(job, row)
+    finally:
+        ray.shutdown()
+
+
+def run_remotely(job: str, limits: Limits, command: Command, cpus: float) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """One run on the node that this is called on: how it ended, and its files by name."""
+    with tempfile.TemporaryDirectory(prefix="vggtgeo-bench-") as made:
+        place, scratch = Path(made) / json.loads(job)["name"], Path(made) / "scratch"
+        place.mkdir()
+        scratch.mkdir()
+        (place / JOB).write_text(job, encoding="utf-8")
+        began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        ending = run_limited(command(place, scratch), place / LOG, limits)
+        files = [path for path in sorted(place.iterdir()) if path.is_file() and path.stat().st_size <= LARGEST_FILE]
+        contents = {path.name: path.read_bytes() for path in files if not path.name.startswith(".")}
+    return {**described(ending, contents.get(LOG, b"")), "started": began, "cpus": cpus}, contents
+
+
+def _taken(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[str, Any]:
+    """The result of a task in the store; a row that says so where Ray gave it up."""
+    place = store.begin(job)
+    try:
+        ending, contents = ray.get(reference)
+    except ray.exceptions.RayError as error:
+        message = str(error).strip().splitlines()
+        return store.complete(
+            job, status="crash", message=f"the cluster gave it up: {message[0] if message else error!r}"
+        )
+    for name, content in contents.items():
+        if name not in (JOB, ROW):
+            with atomic_path(place / name) as temporary:
+                temporary.write_bytes(content)
+    if ROW in contents:
+        with atomic_path(place / ROW) as temporary:
+            temporary.write_bytes(contents[ROW])
+    return store.complete(job, **ending)
+
+
+def _connected(cluster: Cluster) -> Any:
+    try:
+        import ray
+    except ImportError:
+        raise InputError("a cluster needs Ray: pip install 'vggtgeo[cluster]'") from None
+    try:
+        ray.init(
+            address=None if cluster.address == "local" else cluster.address,
+            log_to_driver=False,
+            include_dashboard=False if cluster.address == "local" else None,
+        )
+    except (ConnectionError, ValueError) as error:
+        text = str(error).splitlines()[0]
+        raise InputError(f"no Ray cluster at `{cluster.address}` ({text}); start one with `ray start --head`") from None
+    return ray

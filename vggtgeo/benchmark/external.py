@@ -1,0 +1,50 @@
+"""Trajectories that other systems wrote, measured as the suite's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from vggtgeo.benchmark.jobs import Job
+from vggtgeo.benchmark.measure import trajectory_errors
+from vggtgeo.benchmark.store import Row
+from vggtgeo.benchmark.suite import Suite
+from vggtgeo.datasets import open_sequence
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+
+
+def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> list[Row]:
+    """A row for each file of `[[external]]` that is there; `files` is relative to the folder `base`.
+
+    The truth is that of a run on the same sequence and seed (`runs`), or of the recording.
+    """
+    found: list[Row] = []
+    for table in suite.external:
+        places: dict[Path, Job] = {}
+        for job in jobs:
+            file = base / table.files.format(sequence=job.sequence, seed=job.seed)
+            if file.is_file():
+                places.setdefault(file, job)
+        found += [_row(suite, table.name, job, file, runs) for file, job in places.items()]
+    return found
+
+
+def _row(suite: Suite, name: str, job: Job, file: Path, runs: Path) -> Row:
+    row = {"suite": suite.name, "sequence": job.sequence, "setting": name, "seed": job.seed, "external": str(file)}
+    row |= {"protocol": job.spec["protocol"], "status": "ok", "simulated": bool(job.spec["simulate"])}
+    try:
+        truth = _truth(job, runs)
+        if truth is None:
+            return {**row, "status": "error", "message": "there is no truth to compare with"}
+        errors, _ = trajectory_errors(Trajectory.load_tum(file), truth)
+    except InputError as error:
+        return {**row, "status": "error", "message": str(error)}
+    return {**row, **errors}
+
+
+def _truth(job: Job, runs: Path) -> Trajectory | None:
+    kept = sorted(runs.glob(f"{job.sequence}.*.{job.seed}/truth.txt"))
+    if kept:
+        return Trajectory.load_tum(kept[0])
+    return open_sequence(job.spec["path"], job.spec["kind"]).ground_truth() if job.spec["path"] else None

@@ -1,0 +1,182 @@
+"""The drawings of a suite: ablations, paths, errors along the path, time and memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from vggtgeo.benchmark import cells
+from vggtgeo.benchmark.statistics import Summary, select, values
+from vggtgeo.benchmark.store import Row
+from vggtgeo.benchmark.suite import Suite
+from vggtgeo.evaluation import align, associate
+from vggtgeo.figures.plots import NotebookFigure, view_axes
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.report.figures import calm
+
+_FULL, _OTHER, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
+LINES = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8e5fb0", "#b0413e", "#7a7a2a", "#3b9aa5", "#a05a2c")
+_ROW, _MARGIN = 0.32, 0.9
+"""Inches."""
+_MOST_LINES = 8
+
+
+def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
+    """The error of each setting (logarithmic), a panel a sequence: a dot a run, a bar at the mean, its interval."""
+    good = [row for row in rows if row["status"] == "ok"]
+    column = headline(good)
+    panels = {
+        name: [key for key in cells.settings_of(suite, good) if np.isfinite(_errors(good, name, key, column)).any()]
+        for name in cells.sequences_of(suite, good)
+    }
+    panels = {name: keys for name, keys in panels.items() if keys}
+    heights = [_ROW * len(keys) + _MARGIN for keys in panels.values()]
+    figure = NotebookFigure(figsize=(width, sum(heights) + 0.5 if panels else 1.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    if not panels:
+        return figure
+    drawn = figure.subplots(len(panels), 1, height_ratios=heights, squeeze=False)[:, 0]
+    for axes, (name, keys) in zip(drawn, panels.items(), strict=True):
+        _draw_panel(axes, suite, [_errors(good, name, key, column) for key in keys], keys)
+        axes.set_title(name, loc="left", fontsize=10, color=_INK)
+    drawn[-1].set_xlabel(f"{column.head}; dots: runs, bars: means with 95 % intervals", fontsize=9, color=_INK)
+    return figure
+
+
+def headline(rows: Sequence[Row]) -> cells.Column:
+    """The error that is drawn: after SE(3) where every run is metric, else after Sim(3)."""
+    metric = all(row.get("metric") is not False and not row.get("external") for row in rows)
+    return cells.SE3 if metric else cells.SIM3
+
+
+def _errors(rows: Sequence[Row], sequence: str, setting: str, column: cells.Column) -> np.ndarray:
+    found = column.factor * values(cells.comparable(select(rows, sequence, setting), column), column.name)
+    return np.asarray(found[np.isfinite(found) & (found > 0)])
+
+
+def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Sequence[str]) -> None:
+    for row, (key, numbers) in enumerate(zip(keys, errors, strict=True)):
+        colour = _FULL if key == suite.base else _OTHER
+        summary = Summary.of(numbers)
+        axes.plot(numbers, np.full(len(numbers), row), "o", ms=5, color=colour, alpha=0.55, mec="none")
+        axes.plot([summary.mean] * 2, [row - 0.32, row + 0.32], color=colour, lw=2.5)
+        if np.isfinite(summary.half):
+            low = max(summary.mean - summary.half, 0.3 * float(numbers.min()))
+            axes.plot([low, summary.mean + summary.half], [row, row], color=colour, lw=1.2)
+        if key == suite.base:
+            axes.axvline(summary.mean, color=_FULL, lw=0.8, ls=":")
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_yticks(range(len(keys)), [suite.title_of(key).replace("`", "") for key in keys])
+    axes.set_ylim(len(keys) - 0.4, -0.6)
+    axes.grid(axis="x", color=_GRID, lw=0.7, which="both")
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=_INK, labelsize=9)
+    for spine in axes.spines.values():
+        spine.set_color("#bbbbbb")
+
+
+class Path3:
+    """An estimate after alignment, the truth it is compared with, and the error of each pose, metres."""
+
+    def __init__(self, title: str, estimate: Trajectory, truth: Trajectory, with_scale: bool) -> None:
+        matched, reference = associate(estimate, truth)
+        alignment = align(matched, reference, "sim3" if with_scale else "se3")
+        self.title, self.truth = title, truth
+        self.estimate = alignment.trajectory(matched)
+        self.errors = np.linalg.norm(self.estimate.positions - reference.positions, axis=1)
+
+
+def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[Path3]:
+    """The first run of each setting on a sequence that left its trajectory and the truth."""
+    found = []
+    for setting in cells.settings_of(suite, rows):
+        for row in select(rows, sequence, setting)[:1]:
+            place = folder / "runs" / f"{sequence}.{setting}.{row['seed']}"
+            estimate = Path(str(row["external"])) if row.get("external") else place / "estimate.txt"
+            truth = _truth_file(place, folder, sequence, row["seed"])
+            try:
+                pair = Trajectory.load_tum(estimate), Trajectory.load_tum(truth)
+                found.append(Path3(suite.title_of(setting).replace("`", ""), *pair, row.get("metric") is False))
+            except InputError:
+                continue
+    return found[:_MOST_LINES]
+
+
+def _truth_file(place: Path, folder: Path, sequence: str, seed: object) -> Path:
+    own = place / "truth.txt"
+    return own if own.is_file() else next(iter(sorted((folder / "runs").glob(f"{sequence}.*.{seed}/truth.txt"))), own)
+
+
+def paths_figure(given: Sequence[Path3], width: float = 5.0) -> NotebookFigure:
+    """The paths from above, with the truth; and the error along the time."""
+    figure = NotebookFigure(figsize=(width, 1.25 * width), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, along = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
+    view, origin = view_axes(given[0].truth), given[0].truth.positions[0]
+    flat = lambda trajectory: ((trajectory.positions - origin) @ view.T)[:, :2].T
+    above.plot(*flat(given[0].truth), color="#333333", lw=1.0, ls="--", label="truth")
+    for number, one in enumerate(given):
+        colour = LINES[number % len(LINES)]
+        above.plot(*flat(one.estimate), color=colour, lw=1.2, label=one.title)
+        along.plot(one.estimate.timestamps - one.truth.timestamps[0], 100 * one.errors, color=colour, lw=1.0)
+    above.set_aspect("equal", adjustable="datalim")
+    above.set_xlabel("m")
+    above.legend(
+        frameon=False, fontsize=8, labelcolor="#333333", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.1)
+    )
+    along.set_xlabel("seconds")
+    along.set_ylabel("error cm")
+    along.set_ylim(bottom=0)
+    for axes in (above, along):
+        calm(axes)
+    return figure
+
+
+_STAGES_LEFT_OUT = frozenset({"seconds_all", "seconds_wall", "seconds_process"})
+
+
+def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
+    """Seconds of each stage, and the peak memory, means over runs; a row a sequence and setting."""
+    groups = [
+        (f"{sequence}, {suite.title_of(setting)}".replace("`", ""), own)
+        for sequence in cells.sequences_of(suite, rows)
+        for setting in cells.settings_of(suite, rows)
+        if (own := [row for row in select(rows, sequence, setting) if not row.get("external")])
+    ]
+    names = {name for row in rows for name in row if name.startswith("seconds_")} - _STAGES_LEFT_OUT
+    totals = {name: float(np.nansum([_mean(own, name) for _, own in groups])) for name in names}
+    stages = [
+        name for name in sorted(names, key=lambda name: -totals[name]) if totals[name] > 0.01 * sum(totals.values())
+    ]
+    figure = NotebookFigure(figsize=(width, 0.28 * len(groups) + 1.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    time, memory = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
+    left = np.zeros(len(groups))
+    for number, name in enumerate(stages):
+        seconds = np.nan_to_num([_mean(own, name) for _, own in groups])
+        label = name.removeprefix("seconds_").replace("_", " ")
+        time.barh(range(len(groups)), seconds, left=left, color=LINES[number % len(LINES)], height=0.6, label=label)
+        left += seconds
+    memory.barh(range(len(groups)), [_mean(own, "peak_memory_gb") for _, own in groups], color="#bbbbbb", height=0.6)
+    time.set_yticks(range(len(groups)), [name for name, _ in groups])
+    time.set_ylim(len(groups) - 0.4, -0.6)
+    time.set_xlabel("seconds, by stage")
+    memory.set_xlabel("memory GB")
+    for axes in (time, memory):
+        calm(axes)
+    if stages:
+        figure.legend(loc="outside lower center", frameon=False, fontsize=8, labelcolor="#333333", ncols=5)
+    return figure
+
+
+def _mean(rows: Sequence[Row], column: str) -> float:
+    return Summary.of(values(rows, column)).mean

@@ -1,0 +1,94 @@
+"""From a suite to runs: each with everything it depends on, as plain values."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.benchmark.inputs import find_sequence
+from vggtgeo.benchmark.protocols import PROTOCOLS
+from vggtgeo.benchmark.provenance import input_hash
+from vggtgeo.benchmark.suite import SequenceTable, SettingTable, Suite
+from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings_table import Tables, changed, updated
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run. spec: what it depends on, plain values; `path` in it is None where the recording is not there."""
+
+    sequence: str
+    setting: str
+    seed: int
+    spec: Mapping[str, Any]
+    input_hash: str = ""
+
+    @property
+    def name(self) -> str:
+        """Unique in a suite; the name of its folder."""
+        return f"{self.sequence}.{self.setting}.{self.seed}"
+
+    @property
+    def present(self) -> bool:
+        """Whether there is something to run on."""
+        return bool(self.spec["simulate"]) or self.spec["path"] is not None
+
+    def fingerprint(self, source: str) -> str:
+        """Changes with all that the result depends on; source: digest of the code."""
+        spec = {key: value for key, value in self.spec.items() if key != "path"}  # data may move
+        parts = [self.sequence, self.setting, self.seed, spec, self.input_hash, source]
+        text = json.dumps(parts, sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
+    """All runs of a suite, sequence by sequence; recordings are looked for in the folders `data`."""
+    roots = tuple(data)
+    found = []
+    for sequence in suite.sequence:
+        place = find_sequence(sequence.path, roots) if sequence.path else None
+        digest = "" if place is None else input_hash(place)
+        settings = [table for table in suite.setting if not table.sequences or sequence.name in table.sequences]
+        specs = {setting.name: _spec(suite, sequence, setting, place) for setting in settings}
+        count = max((table.seeds or suite.seeds for table in settings), default=0)
+        for seed in range(suite.first_seed, suite.first_seed + count):
+            for setting in settings:
+                if seed - suite.first_seed < (setting.seeds or suite.seeds):
+                    found.append(Job(sequence.name, setting.name, seed, specs[setting.name], digest))
+    return found
+
+
+def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: Path | None) -> dict[str, Any]:
+    protocol = sequence.protocol or suite.protocol
+    settings = SlamSettings()
+    for tables in (suite.set, sequence.set, setting.set):
+        settings = updated(settings, tables)
+    roles = {key: value for key, value in asdict(setting).items() if key in _ROLES}
+    return {
+        **roles,
+        "path": None if place is None else str(place),
+        "kind": sequence.kind,
+        "simulate": dict(sequence.simulate),
+        "protocol": protocol,
+        "stride": PROTOCOLS[protocol].stride,
+        "poses": PROTOCOLS[protocol].poses,
+        "start": sequence.start,
+        "end": sequence.end,
+        "rgb_only": sequence.rgb_only or setting.rgb_only,
+        "key_points": sequence.key_points,
+        "references": dict(sequence.references),
+        "threshold": sequence.threshold,
+        "set": _plain(changed(settings)),
+        "pages": suite.pages,
+    }
+
+
+_ROLES = ("calibrated", "perception", "features", "start_of_pose", "depth_errors")
+
+
+def _plain(tables: Tables) -> dict[str, dict[str, Any]]:
+    return {group: dict(values) for group, values in tables.items()}

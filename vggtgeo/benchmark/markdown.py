@@ -1,0 +1,151 @@
+"""The tables of a suite as Markdown: best in bold, second best underlined."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from vggtgeo.benchmark import cells
+from vggtgeo.benchmark.cells import Cell
+from vggtgeo.benchmark.published import PublishedTable, published
+from vggtgeo.benchmark.statistics import select
+from vggtgeo.benchmark.store import Row
+from vggtgeo.benchmark.suite import Suite
+
+
+def page(suite: Suite, rows: Sequence[Row]) -> str:
+    """All of them."""
+    good = [row for row in rows if row["status"] == "ok"]
+    parts = [f"# {suite.title}", *([suite.about.strip()] if suite.about else []), notice(suite, rows)]
+    if good:
+        parts += ["## Accuracy", "ATE RMSE after SE(3) alignment, cm.", accuracy(suite, good, cells.SE3)]
+        parts += ["ATE RMSE after Sim(3) alignment, cm.", accuracy(suite, good, cells.SIM3)]
+        if cells.differences(suite, good):
+            parts += [f"## Against {suite.title_of(suite.base)}", _DIFFERENCES, differences(suite, good)]
+        parts += ["## Each sequence and setting", details(suite, good)]
+    if len(good) < len(rows):
+        parts += ["## Without a result", failures(rows)]
+    for name in suite.published:
+        parts += [published_table(published(name))]
+    parts += ["## Provenance", provenance(rows)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+_DIFFERENCES = (
+    "On the same sequence and seed: mean difference and its 95 % interval (Student), negative is less. Bold where the "
+    "interval leaves zero out."
+)
+
+
+def notice(suite: Suite, rows: Sequence[Row]) -> str:
+    """What kind of numbers these are."""
+    kinds = {bool(row.get("simulated")) for row in rows if row["status"] == "ok"}
+    kind = {
+        frozenset({True}): "Simulated: rendered worlds with exact truth. ",
+        frozenset({True, False}): "Sequences that are simulated are called so in `runs.csv`. ",
+    }.get(frozenset(kinds), "")
+    roles = "Perception is simulated, too: stubs of the five roles with stated error models. "
+    stubs = roles if any(row.get("perception") == "simulated" for row in rows) else ""
+    count = f"{len(rows)} runs" if len(rows) != 1 else "1 run"
+    seeds = f"Seeds from {suite.first_seed}; mean ± standard deviation over seeds."
+    return f"{kind}{stubs}Suite `{suite.name}`, {count}. {seeds} Protocol {cells.protocol_text(rows)}."
+
+
+def accuracy(suite: Suite, rows: Sequence[Row], column: cells.Column) -> str:
+    """A row a setting, a column a sequence."""
+    body = [[title, *map(_marked, line)] for title, line in cells.matrix(suite, rows, column)]
+    return table(["setting", *cells.matrix_heads(suite, rows, column)], body)
+
+
+def differences(suite: Suite, rows: Sequence[Row]) -> str:
+    """Each setting against the baseline."""
+    heads = ["setting", "sequence", "pairs", *(column.head for column in cells.COMPARED)]
+    lines = [
+        [one.setting, one.sequence, str(one.pairs), *(f"**{c.text}**" if c.place else c.text for c in one.cells)]
+        for one in cells.differences(suite, rows)
+    ]
+    return table(heads, lines)
+
+
+def details(suite: Suite, rows: Sequence[Row]) -> str:
+    """Every number of each sequence and setting; columns that no run has are left out."""
+    groups = [
+        (sequence, setting, own)
+        for sequence in cells.sequences_of(suite, rows)
+        for setting in cells.settings_of(suite, rows)
+        if (own := select(rows, sequence, setting))
+    ]
+    shown = [column for column in (*cells.DETAILS, *_references(rows)) if any(_has(own, column) for *_, own in groups)]
+    lines = [
+        [
+            *(sequence, suite.title_of(setting), str(len(own)), cells.tracked(own)),
+            *(cells.text_of(own, column) for column in shown),
+            cells.verdicts(own),
+        ]
+        for sequence, setting, own in groups
+    ]
+    return table(["sequence", "setting", "runs", "tracked", *(column.head for column in shown), "verdict"], lines)
+
+
+def failures(rows: Sequence[Row]) -> str:
+    """The runs that left no numbers, and why; those without data in one line."""
+    absent = sorted({str(row["sequence"]) for row in rows if row["status"] == "absent"})
+    broken = [row for row in rows if row["status"] not in ("ok", "absent")]
+    parts = []
+    if broken:
+        lines = [
+            [str(row[name]) for name in ("sequence", "setting", "seed", "status")] + [str(row.get("message", ""))]
+            for row in broken
+        ]
+        parts.append(table(["sequence", "setting", "seed", "status", "message"], lines))
+    if absent:
+        parts.append(f"Not there: {', '.join(absent)} (`vggtgeo data list` tells where to get them).")
+    return "\n\n".join(parts)
+
+
+def published_table(given: PublishedTable) -> str:
+    """Figures of others, apart from the suite's own."""
+    heads = ["system", *given.columns]
+    mark = lambda name: f"{name}*" if name in given.uncalibrated else name
+    lines = [
+        [mark(name), *("" if number is None else f"{number:g}" for number in numbers)]
+        for name, numbers in given.rows.items()
+    ]
+    note = " `*`: not given the intrinsics." if given.uncalibrated else ""
+    return (
+        f"## Published by others: {given.title}\n\nNot measured here; {given.unit}. Source: {given.source}. Protocol: "
+        f"{given.protocol}.{note}\n\n{table(heads, lines)}"
+    )
+
+
+def provenance(rows: Sequence[Row]) -> str:
+    """Versions and machines behind the rows."""
+    lines = []
+    for name in ("version", "commit", "source", "machine", "version_jax", "version_numpy", "version_python"):
+        found = [str(value) for value in dict.fromkeys(row.get(name) for row in rows) if value]
+        if found:
+            lines.append([name.replace("_", " "), ", ".join(found)])
+    return table(["", ""], lines)
+
+
+def table(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    row = lambda cells: "| " + " | ".join(text.replace("|", "\\|").replace("\n", " ") for text in cells) + " |"
+    return "\n".join([row(heads), "|" + "---|" * len(heads), *map(row, lines)])
+
+
+def _references(rows: Sequence[Row]) -> list[cells.Column]:
+    names = dict.fromkeys(name for row in rows for name in row if _is_reference(name))
+    return [cells.Column(f"{name[9:-2]} Sim(3) cm", name, 100.0) for name in names]
+
+
+def _is_reference(name: str) -> bool:
+    return name.startswith("ate_sim3_") and name.endswith("_m") and name != "ate_sim3_m"
+
+
+def _has(rows: Sequence[Row], column: cells.Column) -> bool:
+    return cells.summary_of(rows, column).count > 0
+
+
+def _marked(cell: Cell) -> str:
+    marks = {0: "{}", 1: "**{}**", 2: "<u>{}</u>"}
+    return marks[cell.place].format(cell.text) if cell.text else ""

@@ -1,0 +1,111 @@
+"""`report.html` of a suite: one self-contained file; what is shown is chosen here, how it looks in `page.html.j2`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.benchmark import cells, figures, markdown
+from vggtgeo.benchmark.published import published
+from vggtgeo.benchmark.statistics import select
+from vggtgeo.benchmark.store import Row
+from vggtgeo.benchmark.suite import Suite
+from vggtgeo.io.files import write_text
+from vggtgeo.report.figures import svg
+from vggtgeo.report.page import style, template
+
+
+def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> None:
+    """Writes the page, atomically. folder: of the runs, whose pages are linked where they are there."""
+    good = [row for row in rows if row["status"] == "ok"]
+    text = template("vggtgeo.benchmark", "page.html.j2").render(
+        style=style(),
+        title=suite.title,
+        about=suite.about.strip().replace("`", ""),
+        notice=markdown.notice(suite, rows).replace("`", ""),
+        facts=_facts(suite, rows),
+        tables=_accuracy_tables(suite, good),
+        base=suite.title_of(suite.base),
+        compared=[column.head for column in cells.COMPARED],
+        differences=cells.differences(suite, good),
+        ablations=svg(figures.ablation_figure(suite, good, 7.5)) if _has_error(good) else None,
+        sequences=[_sequence(suite, good, name, folder) for name in cells.sequences_of(suite, good)],
+        cost=svg(figures.cost_figure(suite, good, 7.5)) if any("frames" in row for row in good) else None,
+        runs=[_run(suite, row, folder) for row in rows],
+        broken=[row for row in rows if row["status"] not in ("ok", "absent")],
+        absent=sorted({row["sequence"] for row in rows if row["status"] == "absent"}),
+        published=[published(name) for name in suite.published],
+        provenance=_provenance(rows),
+    )
+    write_text(path, text)
+
+
+def _facts(suite: Suite, rows: Sequence[Row]) -> list[tuple[str, str]]:
+    good = [row for row in rows if row["status"] == "ok"]
+    levels = [row.get("verdict") for row in good]
+    seconds = sum(float(row.get("seconds_wall") or 0.0) for row in rows)
+    return [
+        (f"{len(good)} / {len(rows)}", "runs with a result"),
+        (str(len(cells.sequences_of(suite, good))), "sequences"),
+        (str(len(cells.settings_of(suite, good))), "settings"),
+        *((str(levels.count(level)), f"called {level}") for level in ("good", "degraded", "failed") if level in levels),
+        (f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s", "of runs"),
+    ]
+
+
+def _accuracy_tables(suite: Suite, rows: Sequence[Row]) -> list[dict[str, Any]]:
+    both = {column: cells.matrix(suite, rows, column) for column in (cells.SE3, cells.SIM3)}
+    return [
+        {"head": column.head, "columns": cells.matrix_heads(suite, rows, column), "rows": lines}
+        for column, lines in both.items()
+        if any(cell.text for _, line in lines for cell in line)
+    ]
+
+
+def _sequence(suite: Suite, rows: Sequence[Row], name: str, folder: Path) -> dict[str, Any]:
+    given = figures.paths(suite, rows, name, folder)
+    return {
+        "name": name,
+        "figure": svg(figures.paths_figure(given)) if given else None,
+        "rows": _details(suite, rows, name),
+    }
+
+
+def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> dict[str, Any]:
+    settings = cells.settings_of(suite, select(rows, sequence))
+    groups = [select(rows, sequence, setting) for setting in settings]
+    shown = [one for one in cells.DETAILS if any(cells.summary_of(own, one).count for own in groups)]
+    by_column = [cells.ranked(groups, column) for column in shown]
+    return {
+        "heads": [column.head for column in shown],
+        "lines": [
+            (suite.title_of(setting), cells.tracked(own), [line[row] for line in by_column], cells.verdicts(own))
+            for row, (setting, own) in enumerate(zip(settings, groups, strict=True))
+        ],
+    }
+
+
+def _run(suite: Suite, row: Row, folder: Path) -> dict[str, Any]:
+    place = Path("runs") / f"{row['sequence']}.{row['setting']}.{row['seed']}"
+    files = {"page": "report.html", "poses": "estimate.txt", "recording": "run.rrd", "log": "log.txt"}
+    there = {name: (place / file).as_posix() for name, file in files.items() if (folder / place / file).is_file()}
+    return {
+        **{name: row.get(name) for name in ("sequence", "seed", "status", "verdict", "message", "warnings", "reasons")},
+        "setting": suite.title_of(str(row["setting"])),
+        "links": there,
+    }
+
+
+def _provenance(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    names = sorted({name for row in rows for name in row if name.startswith("version_")})
+    found = []
+    for name in ("version", "commit", "source", "machine", *names):
+        values = [str(value) for value in dict.fromkeys(row.get(name) for row in rows) if value]
+        if values:
+            found.append((name.removeprefix("version_").replace("_", " "), ", ".join(values)))
+    return found
+
+
+def _has_error(rows: Sequence[Row]) -> bool:
+    return cells.summary_of(rows, figures.headline(rows)).count > 0

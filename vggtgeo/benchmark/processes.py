@@ -1,0 +1,144 @@
+"""A command in a process of its own, with limits of time and memory, whatever becomes of it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from vggtgeo.io.jax_environment import jax_environment
+
+_POLL = 0.02
+_MEMORY_POLL = 0.25
+"""Seconds between two looks; one at the memory of a process and its children takes half a millisecond."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """seconds: of one try. memory_gb: of the process and its children, resident. retries: of a process that somebody
+    else ended (SIGKILL, SIGTERM, SIGHUP): a worker of a cluster that is taken away, a machine short of memory.
+    """
+
+    seconds: float
+    memory_gb: float
+    retries: int = 2
+
+
+@dataclass(frozen=True)
+class Ending:
+    """status: "ended" (by itself: code says how), "timeout", "memory", or "killed" by somebody else's signal. code: the
+    exit status, minus the signal's number. seconds: of the last try. peak_gb: largest resident memory. tries: counted.
+    """
+
+    status: str
+    code: int
+    seconds: float
+    peak_gb: float
+    tries: int = 1
+
+    @property
+    def message(self) -> str:
+        """The ending in words."""
+        if self.status == "timeout":
+            return f"took longer than {self.seconds:.0f} s"
+        if self.status == "memory":
+            return f"took more than its share of memory: {self.peak_gb:.1f} GB"
+        if self.code < 0:
+            again = f", {self.tries} times" if self.tries > 1 else ""
+            return f"ended by {signal.Signals(-self.code).name}{again}"
+        return f"exit status {self.code}"
+
+
+_ELSEWHERE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
+
+
+def run_limited(
+    command: Sequence[str], log: Path, limits: Limits, cores: Sequence[int] = (), stop: threading.Event | None = None
+) -> Ending:
+    """Run `command` until it ends or a limit is reached; what it prints goes to `log`.
+
+    cores: the processors that it may use; by default all. stop: ends the process when it is set.
+    Raises KeyboardInterrupt after a stop.
+    """
+    tries = 1
+    while True:
+        ending = _once(command, log, limits, cores, stop)
+        killed = ending.status == "ended" and ending.code < 0 and signal.Signals(-ending.code) in _ELSEWHERE
+        if not killed:
+            return Ending(ending.status, ending.code, ending.seconds, ending.peak_gb, tries)
+        if tries > limits.retries:
+            return Ending("killed", ending.code, ending.seconds, ending.peak_gb, tries)
+        tries += 1
+
+
+def _once(
+    command: Sequence[str], log: Path, limits: Limits, cores: Sequence[int], stop: threading.Event | None
+) -> Ending:
+    began = looked = time.monotonic()
+    peak = 0.0
+    with _started(command, log, cores) as process:
+        while True:
+            pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+            now = time.monotonic()
+            if pid:
+                process.returncode = os.waitstatus_to_exitcode(status)
+                return Ending("ended", process.returncode, now - began, max(peak, usage.ru_maxrss / 2**20))
+            if now - began > limits.seconds:
+                return Ending("timeout", 0, now - began, peak)
+            if now - looked > _MEMORY_POLL:
+                looked, peak = now, max(peak, _resident_gb(process.pid))
+                if peak > limits.memory_gb:
+                    return Ending("memory", 0, now - began, peak)
+            if stop is not None and stop.is_set():
+                raise KeyboardInterrupt
+            time.sleep(_POLL)
+
+
+@contextmanager
+def _started(command: Sequence[str], log: Path, cores: Sequence[int]) -> Iterator[subprocess.Popen[bytes]]:
+    """The process in a session of its own; it and its children are gone afterwards."""
+    with log.open("ab") as output:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            env={**jax_environment(), **os.environ},
+        )
+    try:
+        if cores and hasattr(os, "sched_setaffinity"):
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(process.pid, cores)
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        if process.returncode is None:
+            process.wait()
+
+
+def _resident_gb(pid: int) -> float:
+    try:
+        process = psutil.Process(pid)
+        return sum(one.memory_info().rss for one in (process, *process.children(recursive=True))) / 2**30
+    except psutil.Error:
+        return 0.0
+
+
+def shares(workers: int) -> list[tuple[int, ...]]:
+    """The processors of each of `workers` processes: an even share each, where there are enough to share."""
+    there = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    each = len(there) // workers
+    if not each:
+        return [()] * workers
+    return [tuple(there[number * each : (number + 1) * each]) for number in range(workers)]

@@ -1,0 +1,33 @@
+"""How systems are compared in the literature, as presets: which frames are given, and which poses are judged.
+
+Whatever the protocol, errors are stated after SE(3) and after Sim(3), with the scale: a table after Sim(3) alone hides
+an error of scale, which for monocular systems is 2 to 10 times as large as what it shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """stride: take every n-th frame. poses: judge "all" frames or "keyframes". headline: the error that its tables
+    print. about: whose it is.
+    """
+
+    stride: int
+    poses: str
+    headline: str
+    about: str
+
+
+PROTOCOLS: dict[str, Protocol] = {
+    "every-frame": Protocol(1, "all", "ate_se3_m", "a pose for every frame, metric"),
+    "every-frame-sim3": Protocol(1, "all", "ate_sim3_m", "a pose for every frame, scale free"),
+    "mast3r-slam": Protocol(
+        2, "keyframes", "ate_sim3_m", "MASt3R-SLAM: every second frame, keyframes only, `evo_ape tum GT EST -as`"
+    ),
+    "droid-slam": Protocol(2, "all", "ate_sim3_m", "DROID-SLAM: every second frame, a pose for each of them"),
+    "dpvo": Protocol(1, "all", "ate_sim3_m", "DPVO: every frame; its tables print the median of the trials"),
+    "vggt-slam": Protocol(1, "keyframes", "ate_sim3_m", "VGGT-SLAM: keyframes by the flow of the image"),
+}

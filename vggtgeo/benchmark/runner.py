@@ -1,0 +1,183 @@
+"""A suite from its file to its tables: `vggtgeo.bench`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.benchmark import markdown
+from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
+from vggtgeo.benchmark.external import external_rows
+from vggtgeo.benchmark.figures import ablation_figure
+from vggtgeo.benchmark.inputs import data_folders
+from vggtgeo.benchmark.jobs import Job, jobs_of
+from vggtgeo.benchmark.page import write_page
+from vggtgeo.benchmark.processes import Limits
+from vggtgeo.benchmark.provenance import source_digest
+from vggtgeo.benchmark.scheduling import run_jobs
+from vggtgeo.benchmark.store import Row, Store
+from vggtgeo.benchmark.suite import Suite, limited, load_suite
+from vggtgeo.benchmark.table import as_csv, write_parquet
+from vggtgeo.figures.plot import plot
+from vggtgeo.figures.plots import NotebookFigure
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_text
+
+Progress = Callable[[int, int, Row], None]
+"""Called after each run with the number of those that are done, the number of all, and the row."""
+
+
+@dataclass(frozen=True)
+class BenchReport:
+    """The rows of a suite, as `vggtgeo.bench` returns them; SI units, angles in degrees.
+
+    Fields:
+        suite: what was to be run.
+        rows: a run each, in the order of the suite, then those of other systems; `status` says how it ended.
+        folder: of the runs.
+
+    """
+
+    suite: Suite
+    rows: tuple[Row, ...]
+    folder: Path
+
+    def markdown(self) -> str:
+        """The tables: means and standard deviations, differences from the baseline, what went wrong, provenance."""
+        return markdown.page(self.suite, self.rows)
+
+    def csv(self) -> str:
+        """Every run, one a line."""
+        return as_csv(self.rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The name of the suite and every row, as plain values."""
+        return {"suite": self.suite.name, "rows": [dict(row) for row in self.rows]}
+
+    def write(self, folder: Path) -> list[str]:
+        """`report.html`, `tables.md`, `runs.csv`, and `runs.parquet` where PyArrow is there; the names of the files."""
+        write_text(folder / "tables.md", self.markdown())
+        write_text(folder / "runs.csv", self.csv())
+        write_page(folder / "report.html", self.suite, self.rows, self.folder)
+        names = ["report.html", "tables.md", "runs.csv"]
+        try:
+            write_parquet(folder / "runs.parquet", self.rows)
+        except InputError:
+            return names
+        return [*names, "runs.parquet"]
+
+    def __repr__(self) -> str:
+        good = sum(row["status"] == "ok" for row in self.rows)
+        return f"BenchReport({self.suite.name}: {good} of {len(self.rows)} runs with a result, in {self.folder})"
+
+
+@plot.register(BenchReport)
+def _plot(value: BenchReport) -> NotebookFigure:
+    return ablation_figure(value.suite, value.rows)
+
+
+def bench(
+    suite: str | os.PathLike[str] | Suite,
+    output: str | os.PathLike[str],
+    *,
+    data: Iterable[str | os.PathLike[str]] | None = None,
+    sequences: Iterable[str] | None = None,
+    settings: Iterable[str] | None = None,
+    seeds: int | None = None,
+    first_seed: int | None = None,
+    frames: int | None = None,
+    workers: int = 1,
+    timeout_minutes: float | None = None,
+    memory_gb: float | None = None,
+    retry: bool = False,
+    progress: Progress | None = None,
+    cluster: Cluster | None = None,
+) -> BenchReport:
+    """Run a suite (sequences x settings x seeds) and write its tables and its page into the folder `output`.
+
+    Each run is a process of its own with limits of time and memory: a crash or a hang is a row, not the end. Each
+    finished run lies in `output`/runs; a second call does only what is missing, and what other settings, inputs or
+    another version of the code made.
+
+    Args:
+        suite: a TOML file, or the name of a suite that comes along: quick, simulated, paper, clips, tum, 7scenes, ...
+        output: folder.
+        data: folders that hold the recordings; by default those of `$VGGTGEO_DATA`, else `data`.
+        sequences: those of the suite to run.
+        settings: those of the suite to run.
+        seeds: how many, in place of the suite's own.
+        first_seed: the first of them.
+        frames: of each sequence at most.
+        workers: processes at once; the processors are shared out among them.
+        timeout_minutes: limit of one run, in place of the suite's.
+        memory_gb: limit of one run, in place of the suite's.
+        retry: run again what ended without a result.
+        progress: see `Progress`.
+        cluster: a Ray cluster to run on, in place of processes here.
+
+    Raises:
+        InputError: a suite, a name in it or a folder that is not there.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.bench("quick", "runs/quick", sequences=["ofice"])  # with "office": every setting on that sequence
+        Traceback (most recent call last):
+            ...
+        vggtgeo.io.errors.InputError: `sequences` holds ['ofice']; choose among office, corridor, redkitchen, icl-office
+
+    """
+    chosen = suite if isinstance(suite, Suite) else load_suite(Path(suite))
+    chosen = limited(chosen, _names(sequences), _names(settings), seeds, first_seed, frames)
+    folder = Path(output)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
+    if workers < 1:
+        raise InputError(f"`workers` is {workers}; it must be at least 1")
+    minutes, memory = timeout_minutes or chosen.timeout_minutes, memory_gb or chosen.memory_gb
+    jobs = jobs_of(chosen, data_folders(data))
+    store = Store(folder, chosen.name, source_digest())
+    rows = all_rows(jobs, store, Limits(60 * minutes, memory), workers, retry, progress, cluster)
+    base = Path(suite).parent if not isinstance(suite, Suite) else Path()
+    rows += external_rows(chosen, jobs, folder / "runs", base)
+    report = BenchReport(chosen, tuple(rows), folder)
+    report.write(folder)
+    return report
+
+
+def all_rows(
+    jobs: Sequence[Job],
+    store: Store,
+    limits: Limits,
+    workers: int = 1,
+    retry: bool = False,
+    progress: Progress | None = None,
+    cluster: Cluster | None = None,
+    **options: Any,
+) -> list[Row]:
+    """The rows of `jobs` in their order, from the store or by running them, in processes here or on a cluster."""
+    rows: dict[str, Row] = {}
+
+    def note(job: Job, row: Row) -> None:
+        rows[job.name] = row
+        if progress is not None:
+            progress(len(rows), len(jobs), row)
+
+    missing = []
+    for job in jobs:
+        row = store.load(job, retry) if job.present else store.absent(job)
+        if row is None:
+            missing.append(job)
+        else:
+            note(job, row)
+    if cluster is not None:
+        run_jobs_on_cluster(missing, store, limits, cluster, note, **options)
+    else:
+        run_jobs(missing, store, limits, min(workers, max(len(missing), 1)), note, **options)
+    return [rows[job.name] for job in jobs]
+
+
+def _names(names: Iterable[str] | None) -> tuple[str, ...] | None:
+    return None if names is None else tuple(names)

@@ -1,0 +1,140 @@
+"""Runs in turn or side by side, each in a process with limits."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.benchmark.inputs import walk_name
+from vggtgeo.benchmark.jobs import Job
+from vggtgeo.benchmark.processes import Ending, Limits, run_limited, shares
+from vggtgeo.benchmark.store import Row, Store
+from vggtgeo.benchmark.worker import LOG
+
+Command = Callable[[Path, Path], Sequence[str]]
+"""The command line of a run, given its folder and the scratch folder."""
+Finished = Callable[[Job, Row], None]
+_WAIT = 0.1
+_LAST = 2000  # characters of a log that are looked at for its last line
+
+
+def worker_command(folder: Path, scratch: Path) -> list[str]:
+    """The command line of a run."""
+    return [sys.executable, "-m", "vggtgeo.benchmark.worker", str(folder), str(scratch)]
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    store: Store,
+    limits: Limits,
+    workers: int = 1,
+    finished: Finished | None = None,
+    command: Command = worker_command,
+) -> None:
+    """Run `jobs`, `workers` at a time, and store their rows; a crash, a hang, too much memory is a row.
+
+    Walks that are rendered are kept in a folder of this process as long as a run waits for them. After Ctrl-C, or an
+    exception of `finished`, no process is left; what was finished is stored.
+    """
+    with tempfile.TemporaryDirectory(prefix="vggtgeo-bench-") as scratch:
+        queue = _Queue(list(jobs), Path(scratch))
+        stop = threading.Event()
+
+        def work(cores: Sequence[int]) -> None:
+            while (job := queue.take(stop)) is not None:
+                try:
+                    row = run_one(job, store, limits, cores, command, Path(scratch), stop)
+                finally:
+                    queue.give_back(job)
+                if finished is not None:
+                    with queue.changed:
+                        finished(job, row)
+
+        with ThreadPoolExecutor(workers) as pool:
+            futures = [pool.submit(work, cores) for cores in shares(workers)]
+            try:
+                while not all(future.done() for future in futures):
+                    time.sleep(_WAIT / 5)
+                    if any(future.done() and future.exception() for future in futures):
+                        break
+            finally:
+                if not all(future.done() and not future.exception() for future in futures):
+                    stop.set()
+            for future in futures:
+                future.result()
+
+
+def run_one(
+    job: Job,
+    store: Store,
+    limits: Limits,
+    cores: Sequence[int],
+    command: Command,
+    scratch: Path,
+    stop: threading.Event | None = None,
+) -> Row:
+    """One run and its row."""
+    place = store.begin(job)
+    began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    log = place / LOG
+    ending = run_limited(command(place, scratch), log, limits, cores, stop)
+    return store.complete(job, **described(ending, log.read_bytes()), started=began, cpus=len(cores))
+
+
+def described(ending: Ending, log: bytes) -> dict[str, Any]:
+    """The columns of a row that tell how its process ended; the status is that of a run that left no row itself."""
+    message = ending.message
+    if ending.status == "ended" and ending.code > 0:
+        lines = log[-_LAST:].decode(errors="replace").splitlines()
+        message = f"{message}: {next((line.strip() for line in reversed(lines) if line.strip()), '')}"
+    return {
+        "status": "crash" if ending.status in ("ended", "killed") else ending.status,
+        "message": message,
+        "seconds_wall": ending.seconds,
+        "peak_memory_gb": ending.peak_gb,
+        "tries": ending.tries,
+    }
+
+
+class _Queue:
+    """Jobs in order; of those that share a walk, one goes ahead and renders it, and the others wait for that."""
+
+    def __init__(self, jobs: list[Job], scratch: Path) -> None:
+        self._waiting = jobs
+        self._running: list[Job] = []
+        self._scratch = scratch
+        self.changed = threading.Condition(threading.RLock())
+
+    def take(self, stop: threading.Event) -> Job | None:
+        """The next job that can run now; None where no job is left, or after a stop."""
+        with self.changed:
+            while self._waiting and not stop.is_set():
+                for job in self._waiting:
+                    if self._can_run(job):
+                        self._waiting.remove(job)
+                        self._running.append(job)
+                        return job
+                self.changed.wait(_WAIT)
+            return None
+
+    def give_back(self, job: Job) -> None:
+        """The job has ended; its walk goes where nobody waits for it."""
+        with self.changed:
+            self._running.remove(job)
+            walk = self._walk(job)
+            if walk is not None and not any(self._walk(other) == walk for other in self._waiting + self._running):
+                walk.unlink(missing_ok=True)
+            self.changed.notify_all()
+
+    def _can_run(self, job: Job) -> bool:
+        walk = self._walk(job)
+        return walk is None or walk.is_file() or not any(self._walk(other) == walk for other in self._running)
+
+    def _walk(self, job: Job) -> Path | None:
+        return self._scratch / walk_name(job.spec["simulate"], job.seed) if job.spec["simulate"] else None

@@ -1,0 +1,73 @@
+"""Means, deviations, and differences run by run, with the intervals that few runs allow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import t as student
+
+from vggtgeo.benchmark.store import Row
+from vggtgeo.benchmark.table import number
+
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Of n numbers: mean, median, sample standard deviation (NaN for one), and the half width of the 95 % interval of
+    the mean by Student's law (NaN for one).
+    """
+
+    count: int
+    mean: float
+    median: float
+    deviation: float
+    half: float
+
+    @classmethod
+    def of(cls, values: Float[np.ndarray, " n"]) -> Self:
+        """The summary of those `values` that are numbers."""
+        known = values[np.isfinite(values)]
+        count = len(known)
+        if not count:
+            return cls(0, np.nan, np.nan, np.nan, np.nan)
+        deviation = float(np.std(known, ddof=1)) if count > 1 else np.nan
+        half = float(student.ppf(0.5 + LEVEL / 2, count - 1)) * deviation / np.sqrt(count) if count > 1 else np.nan
+        return cls(count, float(known.mean()), float(np.median(known)), deviation, float(half))
+
+    @property
+    def differs(self) -> bool:
+        """Whether zero lies outside of the interval."""
+        return bool(abs(self.mean) > self.half)
+
+
+def select(rows: Sequence[Row], sequence: str | None = None, setting: str | None = None) -> list[Row]:
+    """Rows of a sequence and a setting, by sequence and seed."""
+    chosen = [
+        row
+        for row in rows
+        if (sequence is None or row["sequence"] == sequence) and (setting is None or row["setting"] == setting)
+    ]
+    return sorted(chosen, key=lambda row: (str(row["sequence"]), int(row["seed"])))
+
+
+def values(rows: Sequence[Row], column: str) -> Float[np.ndarray, " n"]:
+    """A column, NaN where a run has no value."""
+    return np.array([number(row, column) for row in rows], float)
+
+
+def paired(
+    rows: Sequence[Row], setting: str, baseline: str, column: str, sequence: str | None = None
+) -> Float[np.ndarray, " n"]:
+    """Setting minus baseline on the same sequence and seed, where both have a number."""
+    other = {(row["sequence"], row["seed"]): number(row, column) for row in select(rows, sequence, baseline)}
+    differences = [
+        number(row, column) - other.get((row["sequence"], row["seed"]), np.nan)
+        for row in select(rows, sequence, setting)
+    ]
+    found = np.array(differences, float)
+    return found[np.isfinite(found)]

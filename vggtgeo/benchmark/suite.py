@@ -1,0 +1,329 @@
+"""A suite: which sequences are run with which settings, how often, and what they are compared with.
+
+A suite is a TOML file; the classes below are its tables, and their fields its keys. What a key may hold is checked when
+the file is read, so that a misspelt one ends before the first run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+from vggtgeo.benchmark.protocols import PROTOCOLS
+from vggtgeo.io.errors import InputError
+from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings_table import Tables, updated
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
+_Table = TypeVar("_Table", bound="CheckedTable")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckedTable:
+    """A table of the file."""
+
+    @classmethod
+    def read(cls, where: str, values: Any) -> Self:
+        """From plain values; InputError naming `where` for a key that is not there, or a value of a wrong type."""
+        known = {entry.name: entry for entry in dataclasses.fields(cls)}
+        if not isinstance(values, Mapping):
+            raise InputError(f"{where} is {values!r}; it must be a table")
+        for key in values:
+            if key not in known:
+                raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
+        plain = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        try:
+            return cls(**plain)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        except TypeError as error:
+            raise InputError(f"{where}: {str(error).partition('() ')[2] or error}") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceTable(CheckedTable):
+    """`[[sequence]]`: recorded (`path`) or rendered (`simulate`).
+
+    Keys:
+        name: short; letters, digits, `-`, `_`.
+        path: below one of the data folders.
+        kind: reader; found by looking.
+        simulate: `{scene = "office", frames = 80, rate = 6.0, size = [320, 240]}`; the walk follows from the seed.
+        protocol: see `vggtgeo/benchmark/protocols.py`; in place of the suite's.
+        start, end: frames.
+        rgb_only: without its depth.
+        key_points: of the simulated matcher, a frame.
+        references: other truths by name, files of the TUM format in the sequence's folder; compared after Sim(3).
+        threshold: of precision and recall, metres.
+        set: settings of the pipeline on this sequence.
+    """
+
+    name: str
+    path: str = ""
+    kind: str | None = None
+    simulate: Mapping[str, Any] = field(default_factory=dict)
+    protocol: str = ""
+    start: int = 0
+    end: int | None = None
+    rgb_only: bool = False
+    key_points: int = 800
+    references: Mapping[str, str] = field(default_factory=dict)
+    threshold: float = 0.05
+    set: Tables = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+        if bool(self.path) == bool(self.simulate):
+            raise InputError("a sequence has either a `path` or a table `simulate`")
+        _check_protocol(self.protocol)
+        if not (math.isfinite(self.threshold) and self.threshold > 0):
+            raise InputError(f"`threshold` is {self.threshold}; it must be positive metres")
+        updated(SlamSettings(), self.set)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingTable(CheckedTable):
+    """`[[setting]]`: one row of a table.
+
+    Keys:
+        name, title: short, and as people read it.
+        sequences: those it runs on; by default all.
+        seeds: how many, in place of the suite's.
+        rgb_only: without depth.
+        calibrated: false hides the intrinsics: they start from a guess.
+        perception: "classical", "light", "paper" (networks), or "simulated" (stubs of the five roles).
+        features: "sift" or "orb".
+        start_of_pose: of a new frame, "pnp", "constant-velocity", or, where the roles are simulated, "window".
+        depth_errors: factor on those of the simulated depth.
+        set: settings of the pipeline.
+    """
+
+    name: str
+    title: str = ""
+    sequences: tuple[str, ...] = ()
+    seeds: int | None = None
+    rgb_only: bool = False
+    calibrated: bool = True
+    perception: str = "classical"
+    features: str = "sift"
+    start_of_pose: str = "pnp"
+    depth_errors: float = 1.0
+    set: Tables = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+        _one_of("perception", self.perception, ("classical", "light", "paper", "simulated"))
+        _one_of("features", self.features, ("sift", "orb"))
+        _one_of("start_of_pose", self.start_of_pose, ("pnp", "constant-velocity", "window"))
+        if self.start_of_pose == "window" and self.perception != "simulated":
+            raise InputError("`start_of_pose` is 'window', which simulated roles have; networks start so by themselves")
+        if self.seeds is not None and self.seeds < 1:
+            raise InputError(f"`seeds` is {self.seeds}; it must be at least 1")
+        updated(SlamSettings(), self.set)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExternalTable(CheckedTable):
+    """`[[external]]`: trajectories of another system. files: TUM format; `{sequence}` and `{seed}` stand for both."""
+
+    name: str
+    files: str
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite(CheckedTable):
+    """The whole file.
+
+    Keys:
+        title, about: for the head of the report.
+        seeds, first_seed: runs of each setting on each sequence.
+        baseline: the setting that the others are compared with, run by run; by default the first.
+        protocol: see `vggtgeo/benchmark/protocols.py`.
+        timeout_minutes, memory_gb: limits of one run.
+        pages: whether each run leaves its page and its map.
+        published: names of the tables of other systems' figures that belong beside this suite.
+        set: settings of the pipeline, of all runs; a sequence's come on top, then a setting's.
+        sequence, setting, external: lists of tables.
+    """
+
+    name: str
+    title: str
+    about: str = ""
+    seeds: int = 1
+    first_seed: int = 0
+    baseline: str = ""
+    protocol: str = "every-frame"
+    timeout_minutes: float = 60.0
+    memory_gb: float = 16.0
+    pages: bool = True
+    published: tuple[str, ...] = ()
+    set: Tables = field(default_factory=dict)
+    sequence: tuple[SequenceTable, ...] = ()
+    setting: tuple[SettingTable, ...] = ()
+    external: tuple[ExternalTable, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_protocol(self.protocol)
+        for name in ("seeds", "timeout_minutes", "memory_gb"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
+        if self.first_seed < 0:
+            raise InputError(f"`first_seed` is {self.first_seed}; it must be at least 0")
+        for key in ("sequence", "setting"):
+            if not getattr(self, key):
+                raise InputError(f"there is no `[[{key}]]`; give at least one")
+        _check_different("sequence", [table.name for table in self.sequence])
+        _check_different("setting", [table.name for table in (*self.setting, *self.external)])
+        names = {table.name for table in self.sequence}
+        for table in self.setting:
+            if unknown := set(table.sequences) - names:
+                raise InputError(f"setting `{table.name}` names the sequences {sorted(unknown)}, which are not there")
+        if self.baseline and self.baseline not in {table.name for table in self.setting}:
+            raise InputError(f"`baseline` is {self.baseline!r}, which is no setting")
+        updated(SlamSettings(), self.set)
+
+    @property
+    def base(self) -> str:
+        """The name of the setting that others are compared with."""
+        return self.baseline or self.setting[0].name
+
+    def title_of(self, setting: str) -> str:
+        """The title of a setting or an external system; its name where it has none."""
+        return next((table.title for table in (*self.setting, *self.external) if table.name == setting), "") or setting
+
+
+def shipped() -> dict[str, str]:
+    """The suites that come with the package: their names, and the titles."""
+    folder = files("vggtgeo.benchmark") / "suites"
+    found = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return {name[:-5]: tomllib.loads((folder / name).read_text("utf-8"))["title"] for name in found}
+
+
+def load_suite(name: str | Path) -> Suite:
+    """The suite in a TOML file, or one that comes with the package, by its name.
+
+    Raises InputError where neither is there, or something in the file is wrong.
+    """
+    path = Path(name)
+    if path.suffix == ".toml" or path.is_file():
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(
+                f"`{path}` cannot be read: {error}; give a TOML file or one of {_shipped_text()}"
+            ) from None
+        return read_suite(text, path.stem, f"`{path}`")
+    if str(name) not in shipped():
+        raise InputError(f"`{name}` is no suite and no TOML file; suites that come along: {_shipped_text()}")
+    text = (files("vggtgeo.benchmark") / "suites" / f"{name}.toml").read_text("utf-8")
+    return read_suite(text, str(name), f"suite `{name}`")
+
+
+def read_suite(text: str, name: str, where: str) -> Suite:
+    """The suite in the TOML `text`."""
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{where} is no TOML: {error}") from None
+    kinds: tuple[tuple[str, type[CheckedTable]], ...] = (
+        ("sequence", SequenceTable),
+        ("setting", SettingTable),
+        ("external", ExternalTable),
+    )
+    for key, kind in kinds:
+        entries = values.get(key, [])
+        if not isinstance(entries, list):
+            raise InputError(f"{where}: `{key}` must be a list of tables, `[[{key}]]`")
+        values[key] = [kind.read(f"{where}, [[{key}]] {row + 1}", entry) for row, entry in enumerate(entries)]
+    return Suite.read(where, {"name": name, **values})
+
+
+def limited(
+    suite: Suite,
+    sequences: tuple[str, ...] | None = None,
+    settings: tuple[str, ...] | None = None,
+    seeds: int | None = None,
+    first_seed: int | None = None,
+    frames: int | None = None,
+) -> Suite:
+    """The part of a suite that is named; None keeps all. frames: the most of each sequence."""
+    changes: dict[str, Any] = {}
+    if sequences is not None:
+        changes["sequence"] = _chosen("sequences", sequences, suite.sequence)
+    if settings is not None:
+        changes["setting"] = _chosen("settings", settings, suite.setting)
+        if suite.base not in settings:
+            changes["baseline"] = ""
+    there = {table.name for table in changes.get("sequence", suite.sequence)}
+    kept = tuple(
+        dataclasses.replace(
+            table,
+            sequences=tuple(name for name in table.sequences if name in there),
+            seeds=table.seeds if seeds is None else seeds,
+        )
+        for table in changes.get("setting", suite.setting)
+        if not table.sequences or there & set(table.sequences)
+    )
+    if suite.base not in {table.name for table in kept}:
+        changes["baseline"] = ""
+    changes |= {"setting": kept, "seeds": seeds or suite.seeds}
+    if first_seed is not None:
+        changes["first_seed"] = first_seed
+    if frames is not None:
+        changes["sequence"] = tuple(_cut(table, frames) for table in changes.get("sequence", suite.sequence))
+    return dataclasses.replace(suite, **changes)
+
+
+def _cut(table: SequenceTable, frames: int) -> SequenceTable:
+    if frames < 1:
+        raise InputError(f"`frames` is {frames}; it must be at least 1")
+    if table.simulate:
+        return dataclasses.replace(
+            table, simulate={**table.simulate, "frames": min(frames, table.simulate.get("frames", frames))}
+        )
+    end = table.start + frames
+    return dataclasses.replace(table, end=end if table.end is None else min(end, table.end))
+
+
+def _chosen(what: str, wanted: tuple[str, ...], tables: tuple[Any, ...]) -> tuple[Any, ...]:
+    names = [table.name for table in tables]
+    unknown = [name for name in wanted if name not in names]
+    if unknown or not wanted:
+        raise InputError(f"`{what}` holds {unknown or 'nothing'}; choose among {', '.join(names)}")
+    return tuple(table for table in tables if table.name in wanted)
+
+
+def _check_name(name: str) -> None:
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise InputError(f"`name` is {name!r}; it must be of letters, digits, `-`, `_` and `+`")
+
+
+def _check_protocol(name: str) -> None:
+    if name and name not in PROTOCOLS:
+        raise InputError(f"`protocol` is {name!r}; it must be one of {', '.join(PROTOCOLS)}")
+
+
+def _check_different(what: str, names: list[str]) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{what} {', '.join(twice)}: each name may be there once")
+
+
+def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise InputError(f"`{key}` is {value!r}; it must be one of {', '.join(allowed)}")
+
+
+def _shipped_text() -> str:
+    return ", ".join(shipped())

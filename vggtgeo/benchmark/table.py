@@ -1,0 +1,66 @@
+"""The tidy table: a row a run, as CSV and Parquet."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.benchmark.store import Row
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_path
+
+FIRST = (
+    *("suite", "sequence", "setting", "seed", "status", "message", "simulated", "protocol", "verdict"),
+    *("frames", "tracked", "coverage", "keyframes", "matched", "metric", "path_m"),
+    *("ate_se3_m", "ate_sim3_m", "scale", "ate_yaw_m", "ate_unaligned_m", "rte_1s_m", "rre_1s_deg"),
+    *("rte_1m_m", "rre_1m_deg", "depth_rmse_m", "depth_abs_rel", "depth_below_1_25"),
+    *("f_score", "precision", "recall", "mean_distance_m", "completeness_m", "focal_error"),
+    *("frames_per_second", "seconds_wall", "peak_memory_gb"),
+)
+"""Columns that people look for; the others follow by name."""
+
+
+def columns(rows: Iterable[Row]) -> list[str]:
+    """The columns of a table, in order."""
+    there = {name for row in rows for name in row}
+    return [name for name in FIRST if name in there] + sorted(there - set(FIRST))
+
+
+def as_csv(rows: Sequence[Row]) -> str:
+    """The table as text; empty where there is no value."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns(rows), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def write_parquet(path: Path, rows: Sequence[Row]) -> None:
+    """The table as Parquet; InputError where PyArrow is not installed."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError("a Parquet table needs PyArrow: pip install 'vggtgeo[bench]'") from None
+    values = {name: [row.get(name) for row in rows] for name in columns(rows)}
+    table = pyarrow.table({name: pyarrow.array(_alike(column)) for name, column in values.items()})
+    with atomic_path(path) as temporary:
+        pyarrow.parquet.write_table(table, temporary)
+
+
+def number(row: Row, column: str) -> float:
+    """A value as a number; NaN where the run has none."""
+    value = row.get(column)
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else math.nan
+
+
+def _alike(column: list[Any]) -> list[Any]:
+    """The values of one type: numbers as float where any is."""
+    if any(isinstance(value, float) for value in column):
+        return [float(value) if isinstance(value, int | float) else None for value in column]
+    kinds = {type(value) for value in column if value is not None}
+    return column if len(kinds) < 2 else [None if value is None else str(value) for value in column]

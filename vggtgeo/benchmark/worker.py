@@ -1,0 +1,119 @@
+"""One run, in a process of its own: reads `job.json`, leaves `row.json`."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.benchmark.inputs import open_input
+from vggtgeo.benchmark.measure import measured
+from vggtgeo.benchmark.provenance import provenance
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_json
+from vggtgeo.io.warned import collected_warnings
+from vggtgeo.results import Result
+from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings_table import updated
+
+JOB, ROW, LOG = "job.json", "row.json", "log.txt"
+"""Files in the folder of a run."""
+
+
+def run_job(folder: Path, scratch: Path | None = None) -> None:
+    """The run that `folder`/job.json describes; its row is there as a whole or not at all.
+
+    scratch: see `open_input`. What the user gave wrong makes a row with the status "error"; a fault of the program
+    leaves by its exception.
+    """
+    job = json.loads((folder / JOB).read_text(encoding="utf-8"))
+    began = time.perf_counter()
+    try:
+        row = {"status": "ok", **_run(folder, job["spec"], job["seed"], scratch)}
+    except InputError as error:
+        row = {"status": "error", "message": str(error)}
+    cost = {"seconds_process": time.perf_counter() - began, "peak_memory_gb": _peak_gb()}
+    write_json(folder / ROW, {**identity(job), **row, **cost, **provenance()})
+
+
+def identity(job: Mapping[str, Any]) -> dict[str, Any]:
+    """The columns of a row that its job knows, whatever becomes of it."""
+    spec = job["spec"]
+    return {
+        "suite": job["suite"],
+        "sequence": job["sequence"],
+        "setting": job["setting"],
+        "seed": job["seed"],
+        "fingerprint": job["fingerprint"],
+        "protocol": spec["protocol"],
+        "perception": spec["perception"],
+        "depth_input": not spec["rgb_only"],
+        "settings": json.dumps({key: spec[key] for key in _SETTINGS}, sort_keys=True),
+        "input_hash": job["input_hash"],
+    }
+
+
+_SETTINGS = ("set", "features", "start_of_pose", "calibrated", "key_points", "depth_errors", "stride", "start", "end")
+
+
+def _peak_gb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None) -> dict[str, Any]:
+    with collected_warnings() as warned:
+        given = open_input(spec, seed, scratch)
+    simulated = given.oracle is not None
+    result = reconstruct(
+        given.sequence,
+        given.perception,
+        updated(SlamSettings(), spec["set"]),
+        start=spec["start"],
+        end=spec["end"],
+        stride=spec["stride"],
+        seed=seed,
+        title=f"{folder.name}{' (simulated)' if simulated else ''}",
+        facts={"simulated": True} if simulated else None,
+        warned=warned,
+    )
+    _save(folder, result, given.truth, spec)
+    return {**measured(result, given, spec), "simulated": simulated}
+
+
+def _save(folder: Path, result: Result, truth: Trajectory | None, spec: Mapping[str, Any]) -> None:
+    if spec["pages"]:
+        result.save(folder)
+    (result.trajectory if spec["poses"] == "all" else result.keyframes).save_tum(folder / "estimate.txt")
+    if truth is not None:
+        truth.save_tum(folder / "truth.txt")
+
+
+def end_with_parent(seconds: float = 1.0) -> None:
+    """End this process soon after the one that started it has ended: a run that nobody waits for must not go on."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(seconds)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def main(arguments: list[str]) -> None:
+    """`python -m vggtgeo.benchmark.worker FOLDER [SCRATCH]`."""
+    end_with_parent()
+    run_job(Path(arguments[0]), Path(arguments[1]) if len(arguments) > 1 else None)
+
+
+if __name__ == "__main__":
+    import sys
+
+    main(sys.argv[1:])

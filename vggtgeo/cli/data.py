@@ -1,0 +1,56 @@
+"""`vggtgeo data`: where to get recordings, and what is wrong with one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vggtgeo.cli.options import JsonOption
+
+data = typer.Typer(help="Where to get recordings, and what is wrong with one.", no_args_is_help=True)
+
+
+@data.command("list")
+def list_command(as_json: JsonOption = False) -> None:
+    """List what the readers know: where to get it, its size, licence and layout."""
+    from dataclasses import asdict
+
+    from vggtgeo.datasets.catalogue import catalogue
+
+    entries = catalogue()
+    if as_json:
+        typer.echo(json.dumps([asdict(entry) for entry in entries]))
+        return
+    for entry in entries:
+        typer.echo(f"{entry.name} (--kind {entry.kind.partition(',')[0]})")
+        suite = f"vggtgeo bench {entry.suite}" if entry.suite else ""
+        lines = ("get", entry.url), ("size", entry.size), ("licence", entry.licence), ("layout", entry.layout)
+        for head, text in (*lines, ("note", entry.note), ("suite", suite)):
+            if text:
+                typer.echo(f"  {head:8s}{text}")
+
+
+@data.command("check")
+def check_command(
+    path: Annotated[str, typer.Argument(metavar="PATH", help="Folder, video, bag or stream.")],
+    kind: Annotated[str | None, typer.Option(help="Reader; found by looking.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what is wrong with the recording at PATH, in sentences; exit code 2 where something is."""
+    from vggtgeo.cli.main import EXIT_INPUT
+    from vggtgeo.datasets.check import inspect
+
+    found = inspect(path if "://" in path or path.startswith("webcam") else Path(path), kind)
+    if as_json:
+        typer.echo(json.dumps({"facts": found.facts, "problems": found.problems}))
+    else:
+        for fact in found.facts:
+            typer.echo(fact)
+        for problem in found.problems:
+            typer.echo(f"- {problem}")
+        typer.echo(f"{len(found.problems)} doubtful" if found.problems else "nothing wrong found")
+    if found.problems:
+        raise typer.Exit(EXIT_INPUT)

@@ -1,0 +1,232 @@
+"""ROS 1 and ROS 2 bags, read without ROS by the package rosbags (`pip install 'vggtgeo[bags]'`).
+
+Topics are found by their types: the first with colour images (`sensor_msgs/Image` or `CompressedImage`), the first with
+depth (encoding 16UC1, millimetres, or 32FC1, metres), the camera's `CameraInfo`, and a path of poses for the truth
+(`PoseStamped`, `Odometry` or `TransformStamped`), whose name contains `truth`, `gt`, `vicon` or `mocap`.
+"""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.intrinsics import guess_with_warning
+from vggtgeo.datasets.pose_files import poses_of, trajectory_of
+from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+
+_DELAY = 0.02
+"""Seconds between an image and its depth."""
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_POSES = ("geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped")
+_TRUTH = ("truth", "gt", "vicon", "mocap")
+_DEPTH = {"16UC1": (np.uint16, 1e-3), "mono16": (np.uint16, 1e-3), "32FC1": (np.float32, 1.0)}
+_COLOUR = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+}
+
+
+def is_bag(path: Path) -> bool:
+    """Whether `path` is a ROS 1 bag (a file `.bag`) or a ROS 2 bag (a folder with `metadata.yaml`, `.db3`, `.mcap`)."""
+    return path.suffix in (".bag", ".db3", ".mcap") or (path / "metadata.yaml").is_file()
+
+
+@dataclass(frozen=True)
+class RosBag:
+    """A recording. Fields: path; name; camera; colour, depth, poses: topics, "" for none; times of the images."""
+
+    path: Path
+    name: str
+    camera: Camera
+    colour: str
+    depth: str
+    poses: str
+    times: tuple[float, ...]
+    has_depth: bool
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Looks through the topics; InputError where there are no colour images, or rosbags is not installed."""
+        with _reader(path) as reader:
+            topics = {name: str(info.msgtype) for name, info in reader.topics.items()}
+            colour, depth = _image_topics(reader, topics)
+            if not colour:
+                raise InputError(f"`{path}` has no topic with colour images; it has {', '.join(topics) or 'none'}")
+            poses = next((name for name, kind in topics.items() if kind in _POSES and _is_truth(name)), "")
+            first = next(_messages(reader, colour))[1]
+            height, width = _image(first).shape[:2]
+            camera = _camera(reader, topics, colour, width, height) or guess_with_warning(str(path), width, height)
+            times = tuple(time for time, _ in _messages(reader, colour))
+        return cls(path, path.name, camera, colour, depth, poses, times, bool(depth))
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """See `Sequence.frames`."""
+        check_selection(self.name, len(self), start, end, stride)
+        return self._read(range(len(self))[start:end:stride])
+
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of a topic that is called truth; they are those of what was tracked, markers on the camera, say."""
+        if not self.poses:
+            return None
+        with _reader(self.path) as reader:
+            rows = np.array([(time, *_pose(message)) for time, message in _messages(reader, self.poses)])
+        rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+        return trajectory_of(rows[:, 0], poses_of(rows[:, 1:4], rows[:, 4:]), self.path)
+
+    def _read(self, chosen: range) -> Iterator[Frame]:
+        with _reader(self.path) as reader:
+            depths = _messages(reader, self.depth) if self.has_depth else iter(())
+            waiting: list[tuple[float, Any]] = []
+            for index, (time, message) in enumerate(_messages(reader, self.colour)):
+                if index not in chosen:
+                    if index >= chosen.stop:
+                        return
+                    continue
+                try:
+                    image = _image(message)
+                except InputError as error:
+                    _warn(f"`{self.name}`, image {index}: {error}; the frame is skipped", LeftOutWarning)
+                    continue
+                depth = None
+                if self.has_depth:
+                    waiting = _around(time, waiting, depths)
+                    depth = self._depth(time, waiting, index)
+                yield Frame(index, time, image, depth, f"{self.name}, {index}")
+
+    def _depth(self, time: float, waiting: list[tuple[float, Any]], index: int) -> np.ndarray:
+        nothing = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
+        near = [entry for entry in waiting if abs(entry[0] - time) <= _DELAY]
+        if not near:
+            return nothing
+        depth = _metres(min(near, key=lambda entry: abs(entry[0] - time))[1])
+        if depth.shape != nothing.shape:
+            _warn(f"`{self.name}`, depth of image {index} is {depth.shape[1]} x {depth.shape[0]}; used without depth")
+            return nothing
+        return depth
+
+
+@contextmanager
+def _reader(path: Path) -> Iterator[Any]:
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise InputError("bags of ROS need the package rosbags: pip install 'vggtgeo[bags]'") from None
+    place = path.parent if path.suffix in (".db3", ".mcap") else path
+    try:
+        with AnyReader([place], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            yield reader
+    except InputError:
+        raise
+    except Exception as error:  # noqa: BLE001 - whatever a damaged file makes the package raise
+        raise InputError(f"`{path}` cannot be read as a bag of ROS: {error}") from None
+
+
+def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
+    """Time of each message's header, seconds, and the message; the recorder's time where the header has none."""
+    connections = [connection for connection in reader.connections if connection.topic == topic]
+    for connection, stamp, raw in reader.messages(connections=connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        header = message.header.stamp
+        time = header.sec + 1e-9 * header.nanosec
+        yield (time if time > 0 else 1e-9 * stamp), message
+
+
+def _image_topics(reader: Any, topics: dict[str, str]) -> tuple[str, str]:
+    colour = depth = ""
+    for name in [name for name, kind in topics.items() if kind in _IMAGES]:
+        message = next(_messages(reader, name), (0.0, None))[1]
+        if message is None:
+            continue
+        encoding = getattr(message, "encoding", "")
+        if encoding in _DEPTH:
+            depth = depth or name
+        elif encoding in _COLOUR or (not encoding and "depth" not in name.lower()):
+            colour = colour or name
+    return colour, depth
+
+
+def _is_truth(topic: str) -> bool:
+    return any(word in topic.lower() for word in _TRUTH)
+
+
+def _image(message: Any) -> np.ndarray:
+    """uint8 [H, W, 3], RGB."""
+    if not hasattr(message, "encoding"):  # compressed
+        image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
+        if image is None:
+            raise InputError("it cannot be decoded")
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+    if message.encoding not in _COLOUR:
+        raise InputError(f"its encoding is {message.encoding}; known are {', '.join(_COLOUR)}")
+    channels, change = _COLOUR[message.encoding]
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    image = np.ascontiguousarray(rows[:, : message.width * channels]).reshape(message.height, message.width, channels)
+    return image if change is None else np.asarray(cv2.cvtColor(image, change))
+
+
+def _metres(message: Any) -> np.ndarray:
+    kind, unit = _DEPTH[message.encoding]
+    order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    rows = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), order).reshape(message.height, -1)
+    depth = rows[:, : message.width].astype(np.float32) * np.float32(unit)
+    depth[~(depth > 0) | ~np.isfinite(depth)] = np.nan
+    return depth
+
+
+def _camera(reader: Any, topics: dict[str, str], colour: str, width: int, height: int) -> Camera | None:
+    """Of the `CameraInfo` whose name shares most with the images' topic, if its size is that of the images."""
+    infos = [name for name, kind in topics.items() if kind == "sensor_msgs/msg/CameraInfo"]
+    shared = lambda name: next((n for n, (a, b) in enumerate(zip(name, colour, strict=False)) if a != b), len(name))
+    for name in sorted(infos, key=shared, reverse=True):
+        message = next(_messages(reader, name), (0.0, None))[1]
+        if message is None or (message.width, message.height) != (width, height):
+            continue
+        matrix = np.reshape(message.K if hasattr(message, "K") else message.k, (3, 3))
+        values = np.asarray(message.D if hasattr(message, "D") else message.d, float)
+        distortion = check_distortion(values if len(values) in (4, 5, 8) and values.any() else ())
+        return Camera(
+            check_intrinsics((matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])), width, height, distortion
+        )
+    return None
+
+
+def _pose(message: Any) -> tuple[float, ...]:
+    value = getattr(message, "pose", None) or message.transform
+    value = getattr(value, "pose", value)  # Odometry has a pose with covariance
+    place = getattr(value, "position", None) or value.translation
+    turn = getattr(value, "orientation", None) or value.rotation
+    return place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
+
+
+def _around(
+    time: float, waiting: list[tuple[float, Any]], later: Iterator[tuple[float, Any]]
+) -> list[tuple[float, Any]]:
+    """The depth messages near `time`, read on as far as needed."""
+    kept = [entry for entry in waiting if entry[0] >= time - _DELAY]
+    while not kept or kept[-1][0] <= time + _DELAY:
+        entry = next(later, None)
+        if entry is None:
+            break
+        if entry[0] >= time - _DELAY:
+            kept.append(entry)
+    return kept
+
+
+def _warn(message: str, category: type[InputWarning] = InputWarning) -> None:
+    warnings.warn(message, category, stacklevel=3)

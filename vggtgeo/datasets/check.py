@@ -1,0 +1,157 @@
+"""What is wrong with a recording, in sentences, before an hour is spent on it."""
+
+import itertools
+import os
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame, Sequence
+from vggtgeo.datasets.opening import open_sequence
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+
+SAMPLES = 20
+"""Frames that are decoded."""
+_NEAR, _FAR = 0.1, 30.0
+"""Metres: a room's median depth lies in between; millimetres taken for fifths of them do not."""
+_LEAST_DEPTH = 0.2
+"""Share of pixels; depth cameras give 0.5 to 0.9 indoors."""
+_DARK = 8.0
+_GAP = 5.0
+"""Times the median step between two frames."""
+_FAST = 5.0
+"""Metres a second: more than a hand or a small drone does between two poses of the truth."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """facts: what was found, in words. problems: what is wrong or doubtful, a sentence each; empty for nothing."""
+
+    facts: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection:
+    """Opens a recording and looks at a sample of its frames, times, depth and truth; what it finds is no exception."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        try:
+            sequence = open_sequence(path, kind)
+            frames = _sample(sequence)
+            truth = sequence.ground_truth()
+        except InputError as error:
+            return Inspection((), (*_texts(caught), str(error)))
+    problems = [*_texts(caught), *_of_images(frames), *_of_times(frames, len(sequence)), *_of_depth(sequence, frames)]
+    problems += _of_truth(truth, frames)
+    if not sequence.camera.known and not any("intrinsics" in text for text in problems):
+        problems.append("the intrinsics are a guess; give --intrinsics, or put them into calibration.txt")
+    return Inspection(_facts(sequence, frames, truth), tuple(dict.fromkeys(problems)))
+
+
+def _sample(sequence: Sequence) -> list[Frame]:
+    count = len(sequence)
+    return list(sequence.frames(0, None if count else SAMPLES, max(count // SAMPLES, 1)))
+
+
+def _texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:
+    return [str(one.message) for one in caught if issubclass(one.category, InputWarning)]
+
+
+def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) -> tuple[str, ...]:
+    camera = sequence.camera
+    focal = f"f = {camera.intrinsics[0]:.1f}, {camera.intrinsics[1]:.1f}"
+    coefficients = ", ".join(f"{value:g}" for value in camera.distortion)
+    lens = f"distorted by {coefficients}" if any(camera.distortion) else "no distortion"
+    facts = [
+        f"reader: {type(sequence).__name__}",
+        f"{len(sequence)} frames of {camera.width} x {camera.height}",
+        f"camera: {focal}, centre {camera.intrinsics[2]:.1f}, {camera.intrinsics[3]:.1f}, {lens}",
+    ]
+    if len(frames) > 1 and frames[-1].index > frames[0].index:
+        seconds = frames[-1].timestamp - frames[0].timestamp
+        rate = (frames[-1].index - frames[0].index) / seconds if seconds > 0 else np.nan
+        facts.append(f"{rate:.1f} frames a second")
+    depths = [frame.depth[np.isfinite(frame.depth)] for frame in frames if frame.depth is not None]
+    known = np.concatenate(depths) if depths else np.zeros(0)
+    if len(known):
+        low, middle, high = np.quantile(known, (0.02, 0.5, 0.98))
+        facts.append(f"depth {low:.2f} to {high:.2f} m, half of it below {middle:.2f} m")
+    else:
+        facts.append("no depth: the scale stays free")
+    if truth is not None:
+        facts.append(f"truth: {len(truth)} poses, path {truth.length:.2f} m")
+    else:
+        facts.append("no truth")
+    return tuple(facts)
+
+
+def _of_images(frames: list[Frame]) -> list[str]:
+    if not frames:
+        return ["no frame can be read"]
+    problems = []
+    dark = sum(float(frame.image.mean()) < _DARK for frame in frames)
+    if dark:
+        problems.append(f"{dark} of {len(frames)} images looked at are black")
+    same = sum(np.array_equal(a.image, b.image) for a, b in itertools.pairwise(frames))
+    if same:
+        problems.append(f"{same} of {len(frames)} images looked at are the same as the one before: a frozen camera?")
+    return problems
+
+
+def _of_times(frames: list[Frame], count: int) -> list[str]:
+    times = np.array([frame.timestamp for frame in frames])
+    steps = np.diff(times)
+    if not len(steps):
+        return []
+    if (steps <= 0).any():
+        return ["times do not increase from frame to frame"]
+    steps = steps / np.diff([frame.index for frame in frames])
+    middle = float(np.median(steps))
+    problems = []
+    if steps.max() > _GAP * middle:
+        row = int(steps.argmax())
+        where = f"between frames {frames[row].index} and {frames[row + 1].index}"
+        problems.append(f"{where} the step is {steps.max() / middle:.0f} times the usual one: frames are missing")
+    if middle > 1.0 and count > 2:
+        problems.append(f"frames are {middle:.1f} s apart: too few to be tracked, or times in another unit")
+    return problems
+
+
+def _of_depth(sequence: Sequence, frames: list[Frame]) -> list[str]:
+    if not sequence.has_depth:
+        return []
+    depths = [frame.depth for frame in frames if frame.depth is not None and np.isfinite(frame.depth).any()]
+    if not depths:
+        return ["none of the depth images looked at has a valid pixel"]
+    problems = []
+    share = float(np.mean([np.isfinite(depth).mean() for depth in depths]))
+    if share < _LEAST_DEPTH:
+        problems.append(f"only {100 * share:.0f} % of the pixels have depth")
+    middle = float(np.median(np.concatenate([depth[np.isfinite(depth)][::7] for depth in depths])))
+    if not _NEAR <= middle <= _FAR:
+        problems.append(f"the median depth is {middle:.3g} m: is the unit of the depth files another one?")
+    same = sum(np.array_equal(a, b, equal_nan=True) for a, b in itertools.pairwise(depths))
+    if same:
+        problems.append(f"{same} of {len(depths)} depth images looked at are the same as the one before: frozen depth?")
+    return problems
+
+
+def _of_truth(truth: Trajectory | None, frames: list[Frame]) -> list[str]:
+    if truth is None or not frames or len(truth) < 2:
+        return []
+    times = np.array([frame.timestamp for frame in frames])
+    within = (times >= truth.timestamps[0] - 0.05) & (times <= truth.timestamps[-1] + 0.05)
+    if not within.any():
+        return ["no frame lies within the times of the truth: the clocks differ"]
+    problems = []
+    if within.mean() < 0.9:
+        problems.append(f"{100 * (1 - within.mean()):.0f} % of the frames looked at lie outside the times of the truth")
+    speed = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1) / np.diff(truth.timestamps)
+    if speed.max() > _FAST:
+        row = int(speed.argmax())
+        when = f"{truth.timestamps[row]:.2f} s"
+        problems.append(f"the truth moves at {speed.max():.0f} m/s at {when}: a jump, or another unit")
+    return problems

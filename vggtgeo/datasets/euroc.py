@@ -1,0 +1,87 @@
+"""EuRoC MAV in the ASL layout: `mav0/cam0/data.csv`, `mav0/cam0/data/NANOSECONDS.png`, `sensor.yaml`, the truth beside.
+
+The left camera alone is read; its distortion is removed like any other. Source: M. Burri et al., "The EuRoC micro
+aerial vehicle datasets", IJRR 2016.
+"""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of, yaml_numbers
+from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+
+_TRUTH = ("state_groundtruth_estimate0", "leica0", "vicon0")
+
+
+@dataclass(frozen=True)
+class Euroc(FolderSequence):
+    """One flight, left camera. Truth: `state_groundtruth_estimate0`, poses of the body, moved to the camera."""
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder`, or `mav0` in it, has `cam0/data.csv`."""
+        return _base(folder) is not None
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Reads the list of the left camera's images; the IMU's file is left out with an InputWarning."""
+        base = _base(folder)
+        if base is None:
+            raise InputError(f"`{folder}` has no `mav0/cam0/data.csv`; expected a sequence of EuRoC")
+        if (base / "imu0" / "data.csv").is_file():
+            warnings.warn(
+                f"`{folder}`: the IMU is not used; images alone leave the scale free", InputWarning, stacklevel=3
+            )
+        camera_folder = base / "cam0"
+        files = tuple(
+            FrameFile(index, time, camera_folder / "data" / name)
+            for index, (time, name) in enumerate(sorted(_images(camera_folder / "data.csv")))
+        )
+        if not files:
+            raise InputError(f"`{camera_folder}/data.csv` lists no image; expected lines `nanoseconds,file`")
+        width, height = common_size(str(folder), files)
+        sensor = camera_folder / "sensor.yaml"
+        intrinsics = check_intrinsics(yaml_numbers(sensor, "intrinsics"))
+        distortion = check_distortion(yaml_numbers(sensor, "distortion_coefficients"))
+        return cls(base, folder.resolve().name, Camera(intrinsics, width, height, distortion), files)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses of the left camera, at their own times."""
+        file = self.folder / _TRUTH[0] / "data.csv"
+        if not file.is_file():
+            return None
+        rows = _numbers(file)
+        if rows.shape[1] < 8:
+            raise InputError(f"`{file}` has {rows.shape[1]} columns; expected a time, a position and a quaternion")
+        body = poses_of(rows[:, 1:4], rows[:, [5, 6, 7, 4]])  # w first in the file
+        extrinsics = np.reshape(yaml_numbers(self.folder / "cam0" / "sensor.yaml", "data"), (4, 4))
+        return trajectory_of(rows[:, 0] * 1e-9, body @ extrinsics, file)
+
+
+def _base(folder: Path) -> Path | None:
+    return next((base for base in (folder / "mav0", folder) if (base / "cam0" / "data.csv").is_file()), None)
+
+
+def _images(file: Path) -> list[tuple[float, str]]:
+    entries = []
+    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        text = line.split("#", 1)[0].strip()
+        if not text:
+            continue
+        time, _, name = text.partition(",")
+        if not time.strip().isdigit():
+            raise InputError(f"`{file}`, line {number}: found {text[:60]!r}; expected `nanoseconds,file`")
+        entries.append((int(time) * 1e-9, name.strip() or f"{time.strip()}.png"))
+    return entries
+
+
+def _numbers(file: Path) -> np.ndarray:
+    lines = [line for line in file.read_text(encoding="utf-8", errors="replace").splitlines() if line[:1].isdigit()]
+    return read_matrices(file, lines[0].count(",") + 1) if lines else np.zeros((0, 17))

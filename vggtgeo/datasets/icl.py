@@ -1,0 +1,75 @@
+"""ICL-NUIM in its TUM-compatible form: `associations.txt`, `rgb/N.png`, `depth/N.png`, `*.gt.freiburg`.
+
+Its camera has a negative fy: the picture's y axis points up. The images are read as they are, with fy positive, which
+mirrors the world; so the truth is mirrored, too, and errors are what they were. Source: A. Handa et al., "A benchmark
+for RGB-D visual odometry, 3D reconstruction and SLAM", ICRA 2014.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
+from vggtgeo.datasets.images import FRAMES_PER_SECOND
+from vggtgeo.datasets.intrinsics import guess_with_warning
+from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+
+_CAMERA = (481.20, 480.00, 319.50, 239.50)
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_LIST = "associations.txt"
+
+
+@dataclass(frozen=True)
+class IclNuim(FolderSequence):
+    """One sequence. Times are numbers of frames / 30 s. Truth: `*.gt.freiburg` or `groundtruth.txt`, mirrored in y."""
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has `associations.txt`, and no `rgb.txt` as TUM RGB-D has."""
+        return (folder / _LIST).is_file() and not (folder / "rgb.txt").is_file()
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Reads the list of pairs."""
+        files = tuple(
+            FrameFile(index, number / FRAMES_PER_SECOND, folder / image, folder / depth)
+            for index, (number, depth, image) in enumerate(sorted(_pairs(folder / _LIST)))
+        )
+        width, height = common_size(str(folder), files)
+        camera = Camera(_CAMERA, width, height)
+        if (width, height) != (640, 480):
+            camera = guess_with_warning(str(folder), width, height)
+        has_depth = depth_is_usable(str(folder), files, FIVE_THOUSANDTHS, width, height)
+        return cls(folder, folder.resolve().name, camera, files, FIVE_THOUSANDTHS, has_depth)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses of the mirrored world."""
+        there = [*sorted(self.folder.glob("*.gt.freiburg")), self.folder / "groundtruth.txt"]
+        file = next((file for file in there if file.is_file()), None)
+        if file is None:
+            return None
+        rows = read_matrices(file, 8)
+        poses = poses_of(rows[:, 1:4], rows[:, 4:])
+        return trajectory_of(rows[:, 0] / FRAMES_PER_SECOND, _MIRROR @ poses @ _MIRROR, file)
+
+
+def _pairs(file: Path) -> list[tuple[float, str, str]]:
+    pairs = []
+    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        words = line.split("#", 1)[0].split()
+        if not words:
+            continue
+        try:
+            time, depth, _, image = float(words[0]), words[1], float(words[2]), words[3]
+        except (IndexError, ValueError):
+            raise InputError(f"`{file}`, line {number}: found {line!r}; expected `N depth/N.png N rgb/N.png`") from None
+        pairs.append((time, depth, image) if "depth" in depth else (time, image, depth))
+    if not pairs:
+        raise InputError(f"`{file}` lists nothing; expected lines `N depth/N.png N rgb/N.png`")
+    return pairs

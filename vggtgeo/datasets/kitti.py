@@ -1,0 +1,101 @@
+"""KITTI, left camera: odometry (`image_0` or `image_2`, `times.txt`), raw (`image_02/data`, `timestamps.txt`).
+
+Source: A. Geiger et al., "Are we ready for autonomous driving?", CVPR 2012.
+"""
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
+from vggtgeo.datasets.images import natural_key
+from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.pose_files import read_matrices, trajectory_of
+from vggtgeo.geometry.camera import Camera, check_intrinsics
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+
+RATE = 10.0
+_FOLDERS = ("image_2", "image_0", "image_02/data", "image_00/data")
+_LINES = {"image_2": ("P2",), "image_0": ("P0",), "image_02": ("P_rect_02", "P2"), "image_00": ("P_rect_00", "P0")}
+
+
+@dataclass(frozen=True)
+class Kitti(FolderSequence):
+    """One drive. Truth: `poses.txt` in the folder, or `poses/NN.txt` beside the sequences; those of the left grey
+    camera, moved to the colour camera where that is read.
+    """
+
+    baseline: float = 0.0
+    """Metres along x from the left grey camera, which the truth belongs to, to this one."""
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has one of the folders of images."""
+        return any((folder / name).is_dir() for name in _FOLDERS)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Lists the images."""
+        place = next((folder / name for name in _FOLDERS if (folder / name).is_dir()), None)
+        found = [] if place is None else [path for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+        if place is None or not found:
+            raise InputError(f"`{folder}` has no images in {', '.join(_FOLDERS)}; expected a drive of KITTI")
+        images = sorted(found, key=lambda path: natural_key(path.name))
+        times = _times(folder, place, len(images))
+        files = tuple(FrameFile(index, times[index], image) for index, image in enumerate(images))
+        width, height = common_size(str(folder), files)
+        camera, baseline = _camera(folder, place.relative_to(folder).parts[0], width, height)
+        return cls(folder, folder.resolve().name, camera, files, baseline=baseline)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses of the camera that is read."""
+        name = f"{self.folder.resolve().name}.txt"
+        places = (self.folder / "poses.txt", self.folder.resolve().parent.parent / "poses" / name)
+        file = next((file for file in places if file.is_file()), None)
+        if file is None:
+            return None
+        rows = read_matrices(file, 12)
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, :3] = rows.reshape(-1, 3, 4)
+        poses[:, :3, 3] += self.baseline * poses[:, :3, 0]
+        return trajectory_of([one.timestamp for one in self.files], poses[: len(self.files)], file)
+
+
+def _times(folder: Path, place: Path, count: int) -> list[float]:
+    seconds = folder / "times.txt"
+    if seconds.is_file():
+        times = read_matrices(seconds, 1)[:, 0].tolist()
+    elif (stamps := place.parent / "timestamps.txt").is_file():
+        lines = [line.strip() for line in stamps.read_text(encoding="utf-8").splitlines() if line.strip()]
+        moments = [datetime.fromisoformat(line[:26]) for line in lines]
+        times = [(moment - moments[0]).total_seconds() for moment in moments]
+    else:
+        return [index / RATE for index in range(count)]
+    if len(times) < count:
+        raise InputError(f"`{folder}` has {count} images and {len(times)} times")
+    return times
+
+
+def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, float]:
+    """The rectified camera, and its distance from the left grey one: the fourth number of `P` is `-fx b`."""
+    for file in (
+        folder / "calib.txt",
+        folder / "calib_cam_to_cam.txt",
+        folder.resolve().parent / "calib_cam_to_cam.txt",
+    ):
+        lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+        for line in lines:
+            key, _, rest = line.partition(":")
+            if key.strip() in _LINES[name]:
+                values = [float(word) for word in rest.split()]
+                if len(values) != 12:
+                    raise InputError(f"`{file}`: `{key}` has {len(values)} numbers; expected 12")
+                intrinsics = check_intrinsics((values[0], values[5], values[2], values[6]))
+                return Camera(intrinsics, width, height), -values[3] / values[0]
+    own = camera_from_folder(folder, width, height)
+    return own or guess_with_warning(str(folder), width, height), 0.0

@@ -1,0 +1,99 @@
+"""A camera that is running: a webcam (`webcam:0`) or a stream by its address (`rtsp://...`, `http://...`)."""
+
+import re
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+
+_WEBCAM = re.compile(r"webcam(?::(\d+))?")
+_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://.+", re.IGNORECASE)
+
+
+def is_live(text: str) -> bool:
+    """Whether `text` names a webcam or a stream, no file."""
+    return _WEBCAM.fullmatch(text) is not None or _ADDRESS.fullmatch(text) is not None
+
+
+@dataclass(frozen=True)
+class LiveCamera:
+    """Frames as they come, without depth and truth, until the stream ends or the run is interrupted. Its length is 0:
+    not known. Time is that of arrival.
+    """
+
+    source: str
+    camera: Camera
+    has_depth: bool = False
+
+    @classmethod
+    def open(cls, source: str) -> Self:
+        """Takes one frame for the size of the images; InputError where no camera answers."""
+        capture = _capture(source)
+        try:
+            there, image = capture.read()
+        finally:
+            capture.release()
+        if not there:
+            raise InputError(f"`{source}` gives no frame: is the camera there, and free?")
+        height, width = image.shape[:2]
+        camera = Camera.guess(width, height)
+        warnings.warn(
+            f"`{source}`: no intrinsics found; starting from a guess, f = {camera.intrinsics[0]:.0f} pixels: give "
+            "--intrinsics fx,fy,cx,cy",
+            InputWarning,
+            stacklevel=3,
+        )
+        return cls(source, camera)
+
+    @property
+    def name(self) -> str:
+        """The source, without a password in it."""
+        return re.sub(r"//[^/@]*@", "//", self.source)
+
+    def __len__(self) -> int:
+        return 0
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """The frames start, start + stride, ... below end, as they come. What arrives while nobody asks may be lost."""
+        if stride < 1 or start < 0 or (end is not None and end <= start):
+            raise InputError(f"`start` is {start}, `end` {end}, `stride` {stride}; they must select a frame")
+        return self._read(start, end, stride)
+
+    def ground_truth(self) -> Trajectory | None:
+        """None."""
+        return None
+
+    def _read(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
+        capture = _capture(self.source)
+        began = last = time.monotonic()
+        index = 0
+        try:
+            while (end is None or index < end) and capture.grab():
+                now = max(time.monotonic(), last + 1e-6)
+                if index >= start and (index - start) % stride == 0:
+                    there, image = capture.retrieve()
+                    if there:
+                        yield Frame(
+                            index, now - began, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), None, f"{self.name}, {index}"
+                        )
+                last = now
+                index += 1
+        finally:
+            capture.release()
+
+
+def _capture(source: str) -> cv2.VideoCapture:
+    webcam = _WEBCAM.fullmatch(source)
+    capture = cv2.VideoCapture(int(webcam.group(1) or 0) if webcam else source)
+    if not capture.isOpened():
+        capture.release()
+        raise InputError(f"`{source}` cannot be opened: is the camera there, and its address right?")
+    return capture

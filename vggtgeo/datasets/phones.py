@@ -1,0 +1,193 @@
+"""Recordings of phones with LiDAR: Stray Scanner (and alike) and ARKitScenes.
+
+| | Stray Scanner | ARKitScenes |
+|---|---|---|
+| images | `rgb.mp4` | `lowres_wide/*_TIME.png` |
+| depth, mm | `depth/NNNNNN.png`, `confidence/NNNNNN.png` 0 to 2 | `lowres_depth/*_TIME.png` |
+| camera | `camera_matrix.csv` | `lowres_wide_intrinsics/*.pincam` |
+| poses | `odometry.csv` | `lowres_wide.traj` |
+
+The depth has 256 x 192 pixels of the same field of view; it is enlarged to the images without interpolation. Poses are
+those of ARKit, which are no independent truth: differences from them are not errors.
+"""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.image_files import MILLIMETRES, read_depth
+from vggtgeo.datasets.images import natural_key
+from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_matrix, trajectory_of
+from vggtgeo.datasets.video import VideoFile
+from vggtgeo.geometry.camera import Camera, check_intrinsics
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+
+LARGEST = 960
+"""Pixels of the longer side: the depth has 256, and 1920 pixels of image cost four times as much."""
+_LEAST_CONFIDENCE = 1
+"""Of 0 (low), 1 and 2."""
+_MOST_DELAY = 0.02
+
+
+@dataclass(frozen=True)
+class StrayScanner:
+    """A folder of Stray Scanner. Truth: ARKit's own odometry."""
+
+    folder: Path
+    name: str
+    camera: Camera
+    video: VideoFile = field(repr=False)
+    times: tuple[float, ...] = field(repr=False)
+    has_depth: bool = True
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has `rgb.mp4` and `odometry.csv`."""
+        return (folder / "rgb.mp4").is_file() and (folder / "odometry.csv").is_file()
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Opens the video; images are reduced to at most 960 pixels, by a whole number."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)  # the video alone has no intrinsics; the folder has
+            video = VideoFile.open(folder / "rgb.mp4")
+        width, height = video.camera.width, video.camera.height
+        reduction = -(-max(width, height) // LARGEST)
+        matrix = read_matrix(folder / "camera_matrix.csv", (3, 3))
+        # pixel (0, 0) is the centre of the corner pixel, not the corner
+        centre = (matrix[:2, 2] + 0.5) / reduction - 0.5
+        intrinsics = check_intrinsics((matrix[0, 0] / reduction, matrix[1, 1] / reduction, *centre))
+        camera = Camera(intrinsics, width // reduction, height // reduction)
+        times = tuple(_odometry(folder)[:, 0].tolist())
+        has_depth = any((folder / "depth").glob("*.png"))
+        return cls(folder, folder.resolve().name, camera, video, times, has_depth)
+
+    def __len__(self) -> int:
+        return min(len(self.video), len(self.times))
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """See `Sequence.frames`."""
+        check_selection(self.name, len(self), start, end, stride)
+        end = len(self) if end is None else min(end, len(self))
+        return (self._frame(frame) for frame in self.video.frames(start, end, stride))
+
+    def ground_truth(self) -> Trajectory | None:
+        """ARKit's poses, camera -> world, which the app writes with the axes of OpenCV."""
+        rows = _odometry(self.folder)
+        return trajectory_of(rows[:, 0], poses_of(rows[:, 2:5], rows[:, 5:9]), self.folder / "odometry.csv")
+
+    def _frame(self, frame: Frame) -> Frame:
+        size = (self.camera.width, self.camera.height)
+        image = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+        depth = self._depth(frame.index) if self.has_depth else None
+        return Frame(frame.index, self.times[frame.index], np.asarray(image, np.uint8), depth, frame.name)
+
+    def _depth(self, index: int) -> np.ndarray:
+        shape = (self.camera.height, self.camera.width)
+        file = self.folder / "depth" / f"{index:06d}.png"
+        try:
+            depth = read_depth(file, MILLIMETRES)
+        except InputError as error:
+            warnings.warn(f"{error}; the frame is used without depth", InputWarning, stacklevel=3)
+            return np.full(shape, np.nan, np.float32)
+        trust = cv2.imread(str(self.folder / "confidence" / file.name), cv2.IMREAD_UNCHANGED)
+        if trust is not None and trust.shape == depth.shape:
+            depth[trust < _LEAST_CONFIDENCE] = np.nan
+        return enlarged(depth, (self.camera.width, self.camera.height))
+
+
+@dataclass(frozen=True)
+class ArkitScenes(FolderSequence):
+    """A folder of ARKitScenes, low-resolution images. Truth: ARKit's own poses."""
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has `lowres_wide`."""
+        return (folder / "lowres_wide").is_dir()
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Lists the images and pairs each with the depth nearest in time."""
+        images = _timed(folder / "lowres_wide")
+        if not images:
+            raise InputError(f"`{folder}/lowres_wide` has no images named `..._SECONDS.png`")
+        depths = _timed(folder / "lowres_depth") if (folder / "lowres_depth").is_dir() else []
+        files = tuple(
+            FrameFile(index, time, image, _nearest(time, depths)) for index, (time, image) in enumerate(images)
+        )
+        width, height = common_size(str(folder), files)
+        has_depth = any(file.depth is not None for file in files)
+        return cls(folder, folder.resolve().name, _pincam(folder, width, height), files, MILLIMETRES, has_depth)
+
+    def load_depth(self, path: Path) -> np.ndarray:
+        """The depth, enlarged to the images where it is smaller."""
+        return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height))
+
+    def ground_truth(self) -> Trajectory | None:
+        """ARKit's poses: the file holds world -> camera, an axis with the angle as its length, and a translation."""
+        file = self.folder / "lowres_wide.traj"
+        if not file.is_file():
+            return None
+        rows = read_matrices(file, 7)
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, :3, :3] = Rotation.from_rotvec(rows[:, 1:4]).as_matrix()
+        poses[:, :3, 3] = rows[:, 4:]
+        return trajectory_of(rows[:, 0], np.linalg.inv(poses), file)
+
+
+def enlarged(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Depth of another number of pixels in the same view, float32 [height, width]: each pixel takes the nearest."""
+    if depth.shape == size[::-1]:
+        return depth
+    return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+
+
+def _odometry(folder: Path) -> np.ndarray:
+    """Rows: time, frame, x, y, z, qx, qy, qz, qw."""
+    file = folder / "odometry.csv"
+    text = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    header = text[0].split(",") if text else []
+    rows = read_matrices(file, len(header), skip="t") if header else np.zeros((0, 9))
+    if rows.shape[1] < 9 or not len(rows):
+        raise InputError(f"`{file}`: expected lines `timestamp, frame, x, y, z, qx, qy, qz, qw` after a head")
+    return rows
+
+
+def _timed(folder: Path) -> list[tuple[float, Path]]:
+    found = []
+    for path in sorted(folder.glob("*.png"), key=lambda path: natural_key(path.name)):
+        try:
+            found.append((float(path.stem.rsplit("_", 1)[-1]), path))
+        except ValueError:
+            continue
+    return sorted(found)
+
+
+def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
+    if not depths:
+        return None
+    other, path = min(depths, key=lambda entry: abs(entry[0] - time))
+    return path if abs(other - time) <= _MOST_DELAY else None
+
+
+def _pincam(folder: Path, width: int, height: int) -> Camera:
+    """The middle of the intrinsics of all frames: autofocus changes them by a few tenths of a per cent."""
+    files = sorted((folder / "lowres_wide_intrinsics").glob("*.pincam"))
+    if not files:
+        raise InputError(f"`{folder}/lowres_wide_intrinsics` has no `.pincam` file: width height fx fy cx cy")
+    rows = np.concatenate([read_matrices(file, 6)[:1] for file in files])
+    if (rows[:, :2] != (width, height)).any():
+        raise InputError(
+            f"`{files[0]}` is for {rows[0, 0]:g} x {rows[0, 1]:g} pixels; the images are {width} x {height}"
+        )
+    fx, fy, cx, cy = np.median(rows[:, 2:], axis=0)
+    return Camera(check_intrinsics((fx, fy, cx, cy)), width, height)

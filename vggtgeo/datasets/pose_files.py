@@ -1,0 +1,97 @@
+"""Poses and cameras as the benchmarks write them: matrices, rows of CSV, fields of YAML."""
+
+import json
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+
+
+def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
+    """Lines of `columns` numbers, blanks or commas in between; InputError with the line of one that is not so."""
+    rows = []
+    for number, line in enumerate(_text(file).splitlines(), start=1):
+        words = line.split(skip, 1)[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if len(row) != columns:
+            raise InputError(f"`{file}`, line {number}: found {line.strip()[:60]!r}; expected {columns} numbers")
+        rows.append(row)
+    return np.array(rows, np.float64).reshape(-1, columns)
+
+
+def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
+    """One matrix; InputError where the file holds another count of numbers."""
+    try:
+        return np.array(_text(file).replace(",", " ").split(), np.float64).reshape(shape)
+    except ValueError:
+        raise InputError(f"`{file}`: expected a matrix of {shape[0]} x {shape[1]} numbers") from None
+
+
+def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path) -> Trajectory | None:
+    """Camera -> world at `times`; poses with NaN or infinity (tracking was lost) are left out with an InputWarning.
+
+    None where no pose is left.
+    """
+    poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
+    times = np.asarray(times, np.float64)[: len(poses)]
+    known = np.isfinite(poses).all(axis=(1, 2))
+    if not known.all():
+        warnings.warn(
+            f"`{where}`: {int((~known).sum())} of {len(poses)} poses have a NaN or an infinity; left out of the truth",
+            InputWarning,
+            stacklevel=3,
+        )
+    return Trajectory(times[known], _orthonormal(poses[known])) if known.any() else None
+
+
+def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
+    """Matrices of positions [n, 3] and quaternions [n, 4], x y z w."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    poses[:, :3, 3] = positions
+    return poses
+
+
+def yaml_numbers(file: Path, key: str) -> list[float]:
+    """The list of numbers after `key:` in a YAML file as the benchmarks write them: `key: [1, 2, 3]`."""
+    found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", _text(file), re.MULTILINE)
+    if found is None:
+        raise InputError(f"`{file}` has no list `{key}: [...]`")
+    try:
+        return [float(word) for word in found.group(1).replace(",", " ").split()]
+    except ValueError:
+        raise InputError(f"`{file}`: `{key}` is {found.group(1)!r}; expected numbers") from None
+
+
+def read_json(file: Path) -> Any:
+    """The content of a JSON file; InputError where it is none."""
+    try:
+        return json.loads(_text(file))
+    except json.JSONDecodeError as error:
+        raise InputError(f"`{file}` is no JSON: {error}") from None
+
+
+def _orthonormal(poses: np.ndarray) -> np.ndarray:
+    """The nearest rotations: files with few digits, or with a scale of 1 +- 1e-3, are no exact ones."""
+    u, _, vt = np.linalg.svd(poses[:, :3, :3])
+    return np.concatenate([np.concatenate([u @ vt, poses[:, :3, 3:]], axis=2), poses[:, 3:]], axis=1)
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None

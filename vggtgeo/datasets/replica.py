@@ -1,0 +1,71 @@
+"""Replica as rendered for NICE-SLAM: `results/frameXXXXXX.jpg`, `results/depthXXXXXX.png`, `traj.txt`.
+
+The camera is in `cam_params.json` beside the rooms; the depth is in 1 / 6553.5 m there. Source: Z. Zhu et al.,
+"NICE-SLAM", CVPR 2022; J. Straub et al., "The Replica Dataset", 2019.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.image_files import DepthFormat
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
+from vggtgeo.datasets.intrinsics import camera_from_folder
+from vggtgeo.datasets.pose_files import read_json, read_matrices, trajectory_of
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+
+_PUBLISHED = (600.0, 600.0, 599.5, 339.5)
+_UNITS = 6553.5
+
+
+@dataclass(frozen=True)
+class Replica(FolderSequence):
+    """One room. Truth: `traj.txt`, a matrix camera -> world a line. The files have no times: 30 frames a second."""
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has `traj.txt` and `results/frame...`."""
+        return (folder / "traj.txt").is_file() and any((folder / "results").glob("frame*"))
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Lists the frames."""
+        images = sorted((folder / "results").glob("frame*"), key=lambda path: natural_key(path.name))
+        if not images:
+            raise InputError(f"`{folder}` has no `results/frameXXXXXX.jpg`; expected a room of Replica")
+        files = tuple(
+            FrameFile(index, index / FRAMES_PER_SECOND, image, _depth(image)) for index, image in enumerate(images)
+        )
+        width, height = common_size(str(folder), files)
+        camera, units = _camera(folder, width, height)
+        coding = DepthFormat(units)
+        has_depth = depth_is_usable(str(folder), files, coding, width, height)
+        return cls(folder, folder.resolve().name, camera, files, coding, has_depth)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses."""
+        file = self.folder / "traj.txt"
+        poses = read_matrices(file, 16)
+        return trajectory_of([one.timestamp for one in self.files], poses[: len(self.files)], file)
+
+
+def _depth(image: Path) -> Path | None:
+    path = image.with_name(image.stem.replace("frame", "depth") + ".png")
+    return path if path.is_file() else None
+
+
+def _camera(folder: Path, width: int, height: int) -> tuple[Camera, float]:
+    for file in (folder / "cam_params.json", folder.resolve().parent / "cam_params.json"):
+        if file.is_file():
+            values = read_json(file)
+            try:
+                camera = values["camera"]
+                intrinsics = tuple(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
+                return Camera(intrinsics, width, height), float(camera["scale"])  # type: ignore[arg-type]
+            except (KeyError, TypeError, ValueError) as error:
+                raise InputError(f"`{file}`: expected `camera` with fx, fy, cx, cy and scale ({error!r})") from None
+    own = camera_from_folder(folder, width, height)
+    return own or Camera(_PUBLISHED, width, height), _UNITS

@@ -1,0 +1,109 @@
+"""Tanks and Temples: the images of a scene, `SCENE_COLMAP_SfM.log`, `SCENE_trans.txt`, `SCENE.ply`, `SCENE.json`.
+
+Source: A. Knapitsch et al., "Tanks and Temples", ACM TOG 36(4), 2017.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
+from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.pose_files import read_json, read_matrix, trajectory_of
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+
+_LOG = "_COLMAP_SfM.log"
+_LINES = 5
+"""Of a pose in the log: its numbers, and four rows of a matrix camera -> world."""
+
+
+@dataclass(frozen=True)
+class TanksAndTemples(FolderSequence):
+    """One scene. Truth: COLMAP's poses, in the scanner's metres where `SCENE_trans.txt` is there; 30 a second."""
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has a `*_COLMAP_SfM.log`."""
+        return any(folder.glob(f"*{_LOG}"))
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Lists the images, in the folder itself, in `images`, or in a folder of the scene's name."""
+        places = [folder, folder / "images", folder / folder.resolve().name]
+        images = next((found for place in places if place.is_dir() and (found := _images(place))), [])
+        if not images:
+            raise InputError(f"`{folder}` has no images; expected a scene of Tanks and Temples")
+        files = tuple(FrameFile(index, index / FRAMES_PER_SECOND, image) for index, image in enumerate(images))
+        width, height = common_size(str(folder), files)
+        camera = camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
+        return cls(folder, folder.resolve().name, camera, files)
+
+    def ground_truth(self) -> Trajectory | None:
+        """COLMAP's poses of the images, a similarity applied where the scanner's frame is known."""
+        file = next(iter(sorted(self.folder.glob(f"*{_LOG}"))), None)
+        if file is None:
+            return None
+        numbers, poses = _read_log(file)
+        alignment = self.folder / file.name.replace(_LOG, "_trans.txt")
+        if alignment.is_file():
+            poses = moved(poses, read_matrix(alignment, (4, 4)))
+        return trajectory_of(np.array(numbers) / FRAMES_PER_SECOND, poses, file)
+
+
+def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """Camera -> world after a similarity `[s R, t]` of the world; rotations stay rotations."""
+    scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
+    result = poses.copy()
+    result[:, :3, :3] = similarity[:3, :3] / scale @ poses[:, :3, :3]
+    result[:, :3, 3] = poses[:, :3, 3] @ similarity[:3, :3].T + similarity[:3, 3]
+    return result
+
+
+def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which points lie in the volume of a scene's `SCENE.json`: a polygon across an axis, between two bounds on it."""
+    crop = read_json(file)
+    try:
+        axis = "XYZ".index(crop["orthogonal_axis"].upper())
+        low, high = float(crop["axis_min"]), float(crop["axis_max"])
+        polygon = np.array(crop["bounding_polygon"], np.float64)
+    except (KeyError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"`{file}`: expected orthogonal_axis, axis_min, axis_max, bounding_polygon ({error!r})"
+        ) from None
+    across = [number for number in range(3) if number != axis]
+    between = (points[:, axis] >= low) & (points[:, axis] <= high)
+    return between & _in_polygon(points[:, across], polygon[:, across])
+
+
+def _in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Even-odd rule: a ray along the first axis crosses the boundary an odd number of times."""
+    inside = np.zeros(len(points), bool)
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        spans = (ay > points[:, 1]) != (by > points[:, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = ax + (points[:, 1] - ay) / (by - ay) * (bx - ax)
+        inside ^= spans & (points[:, 0] < crossing)
+    return inside
+
+
+def _images(folder: Path) -> list[Path]:
+    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    return sorted(found, key=lambda path: (natural_key(path.name), path.name))
+
+
+def _read_log(file: Path) -> tuple[list[int], np.ndarray]:
+    lines = [line.split() for line in file.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    try:
+        if len(lines) % _LINES:
+            raise ValueError
+        numbers = [int(lines[row][0]) for row in range(0, len(lines), _LINES)]
+        rows = [[float(word) for word in line] for number, line in enumerate(lines) if number % _LINES]
+        return numbers, np.array(rows).reshape(-1, 4, 4)
+    except (ValueError, IndexError):
+        raise InputError(f"`{file}`: expected, a pose, a line of numbers and four rows of a 4 x 4 matrix") from None

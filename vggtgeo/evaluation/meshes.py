@@ -1,0 +1,53 @@
+"""Points on the surface of a triangle mesh, so that meshes are compared as clouds are."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vggtgeo.evaluation.clouds import CloudError, cloud_error
+from vggtgeo.io.errors import InputError
+
+Mesh = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]
+"""Vertices, metres, and the rows of the three corners of each face."""
+
+
+def surface_points(mesh: Mesh, spacing: float, seed: int = 0) -> Float[np.ndarray, "k 3"]:
+    """Points on the faces of `mesh`, even by area, about one to a square of `spacing` metres; the same for a `seed`.
+
+    A face is drawn by its area, then a point in it: with u, v uniform in [0, 1] and s = sqrt(u), the point
+    `(1 - s) a + s (1 - v) b + s v c` is uniform in the triangle (R. Osada et al., ACM TOG 21(4), 2002). InputError for
+    wrong shapes, a corner that is no vertex, a mesh without area, or a spacing that is not positive.
+    """
+    vertices, faces = _checked(mesh)
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise InputError(f"`spacing` is {spacing}; it must be positive metres")
+    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    total = float(areas.sum())
+    if not total > 0:
+        raise InputError("`mesh` has no face with an area")
+    rng = np.random.default_rng(seed)
+    face = rng.choice(len(faces), max(round(total / spacing**2), 1), p=areas / total)
+    s, v = np.sqrt(rng.random((len(face), 1))), rng.random((len(face), 1))
+    return np.asarray((1 - s) * a[face] + s * (1 - v) * b[face] + s * v * c[face])
+
+
+def mesh_error(estimate: Mesh, truth: Mesh, threshold: float = 0.05, seed: int = 0) -> CloudError:
+    """`cloud_error` of points on both surfaces, a fifth of the threshold apart.
+
+    A distance to the nearest point on a surface is then at most a few per cent of the threshold too long.
+    """
+    spacing = threshold / 5
+    return cloud_error(surface_points(estimate, spacing, seed), surface_points(truth, spacing, seed + 1), threshold)
+
+
+def _checked(mesh: Mesh) -> Mesh:
+    vertices, faces = mesh
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+        raise InputError(
+            f"`mesh` has vertices {vertices.shape} and faces {faces.shape}; both must be [n, 3], not empty"
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"`mesh` has a face with corner {faces.max()}, and {len(vertices)} vertices")
+    if not np.isfinite(vertices).all():
+        raise InputError("`mesh` has a vertex with a NaN or an infinity")
+    return mesh

@@ -1,0 +1,30 @@
+"""JAX's global settings for a program of this package, as environment variables."""
+
+import os
+from pathlib import Path
+
+SHORTEST_CACHED_COMPILATION = 0.5
+"""Seconds: what compiles faster is not kept."""
+
+
+def jax_environment() -> dict[str, str]:
+    """64-bit numbers, compiled code kept between runs, and memory of a GPU taken as needed, not three quarters at once:
+    the networks of onnxruntime share it. A setting of the user's own environment is to win.
+    """
+    found = {"JAX_ENABLE_X64": "1", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    folder = cache_folder()
+    if folder is not None:
+        found["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        found["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(SHORTEST_CACHED_COMPILATION)
+    return found
+
+
+def cache_folder() -> Path | None:
+    """`$XDG_CACHE_HOME/vggtgeo/jax` (`~/.cache/...` without that variable), or None where it cannot be written."""
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(base) / "vggtgeo" / "jax"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):
+        return None
+    return folder if os.access(folder, os.W_OK) else None

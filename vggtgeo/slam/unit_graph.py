@@ -1,0 +1,55 @@
+"""The unit of each keyframe of a map without metric depth: scale drifts along the way, and loops measure by how much.
+
+Scale is a homomorphism of the similarities, so the scale part of a Sim(3) pose graph is a linear graph of its own over
+the logarithms of the units. It is solved first, and the pose graph over SE(3) after it (`straightening.py`); what this
+leaves out is what the lengths of motions would say about scale, which on the way around a loop is little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import spsolve
+
+DRIFT = 0.01
+"""Standard deviation of the change of scale from one keyframe to the next."""
+RATIO = 0.03
+"""Standard deviation of the logarithm of a measured ratio."""
+WIDTHS = (1024.0, 256.0, 64.0, 16.0, 4.0, 2.5, 2.5, 2.5)
+"""Widths of the Cauchy kernel on ratios, one reweighting each, in standard deviations: graduated, as from a large drift
+true ratios look as false as the false ones do."""
+
+
+@dataclass(frozen=True)
+class UnitRatio:
+    """Lengths of keyframe `second` must be multiplied by `ratio` to have the unit of keyframe `first`."""
+
+    first: int
+    second: int
+    ratio: float
+
+
+def solve_units(keyframes: int, motions: Sequence[tuple[int, int]], ratios: Sequence[UnitRatio]) -> np.ndarray:
+    """By what the lengths of each keyframe must be multiplied, float64 [n]; by 1 those of the first."""
+    if not ratios:
+        return np.ones(keyframes)
+    first, second = np.array([*motions, *((r.first, r.second) for r in ratios)], int).T
+    measured = np.concatenate([np.zeros(len(motions)), np.log([r.ratio for r in ratios])])
+    sigma = np.repeat([DRIFT, RATIO], [len(motions), len(ratios)])
+    rows = np.repeat(np.arange(len(first)), 2)
+    shape = (len(first), keyframes)
+    logs, weight = np.zeros(keyframes), np.ones(len(first))
+    for width in WIDTHS:
+        values = np.tile([-1.0, 1.0], len(first)) * np.repeat(np.sqrt(weight) / sigma, 2)
+        design = coo_array((values, (rows, np.stack([first, second], 1).ravel())), shape).tocsc()
+        target = np.sqrt(weight) * measured / sigma
+        # The weak hold of every logarithm at 0 decides for keyframes that nothing ties to the first.
+        normal = design.T @ design + coo_array((np.full(keyframes, 1e-6), (np.arange(keyframes),) * 2)).tocsc()
+        logs = np.asarray(spsolve(normal, design.T @ target))
+        logs -= logs[0]
+        residual = (logs[second] - logs[first] - measured) / sigma
+        weight[len(motions) :] = 1.0 / (1.0 + (residual[len(motions) :] / width) ** 2)
+    return np.exp(logs)
