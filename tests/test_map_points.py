@@ -14,9 +14,9 @@ from vggtgeo.models.classical import SiftMatcher, search_near, search_tree
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation import simulate
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import tangent
 from vggtgeo.slam.fusion import with_systematic
-from vggtgeo.slam.description import Description
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.map_points import Refined, refine_by_map
 from vggtgeo.slam.settings import Roles, SlamSettings

@@ -32,7 +32,7 @@ LEAST_POINTS = 300
 
 @dataclass(frozen=True, eq=False)
 class SurfaceRows:
-    """Cells in a row: points and unit normals float64 [3, m], camera frame, standard deviations of the depth [m]."""
+    """Cells in a row: points and unit normals float32 [3, m], camera frame, standard deviations of the depth [m]."""
 
     points: np.ndarray
     normals: np.ndarray
