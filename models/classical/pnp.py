@@ -28,7 +28,7 @@ class PnpGeometry:
     least: int = 12
     confidence: float = 0.999
     max_iterations: int = 1000
-    sure: float = 0.7
+    sure: float = 0.9
     two_view: TwoViewStart = field(default_factory=TwoViewStart)
 
     def __post_init__(self) -> None:
