@@ -29,8 +29,8 @@ LEAST_SHARE = 0.7
 LEAST_INLIERS = 60
 FLOW_SIGMA = 4.0
 """Standard deviation of a match, pixels: a tenth of that is the flow's own, the rest the depth of the keyframe at its
-points, whose errors are the same in all frames that follow. Measured on icl-office (ATE, exact truth): 0.13 cm with 4, 8
-and 1000 px, 0.22 with descriptors; points at jumps of depth among them, 0.34."""
+points, whose errors are the same in all frames that follow. ATE of icl-office (exact truth): 0.13 cm with 4, 8 and 1000
+px, 0.22 with descriptors; with points at jumps of depth among the others, and 2 px, 0.34."""
 
 
 @dataclass(frozen=True, eq=False)
