@@ -18,6 +18,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
+from vggtgeo.models.classical import can_search
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
@@ -122,9 +123,10 @@ def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, 
     The images of those outside the window are compressed.
     """
     slam = make_room(slam, settings, tied_to)
-    matched = map_in_threads(
-        lambda number: match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics), slam.window
-    )
+    match = lambda number: match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics)
+    # A network takes all cores, or the GPU, for one pair.
+    alone = not can_search(keyframe.features)
+    matched = [match(number) for number in slam.window] if alone else map_in_threads(match, slam.window)
     pairs = tuple(pair for pair in matched if pair is not None)
     inside = (*slam.window, keyframe.number)
     kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in slam.keyframes)
