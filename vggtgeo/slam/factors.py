@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -137,7 +138,7 @@ def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, in
     return RelativePose(**relative_pose_rows(placed, room), kernel=Cauchy(jnp.asarray(TIE_WIDTH)))
 
 
-def relative_pose_rows(own: Sequence[MeasuredRelativePose], room: int | None = None) -> dict[str, Array]:
+def relative_pose_rows(own: Sequence[MeasuredRelativePose], room: int | None = None) -> dict[str, Any]:
     """Fields of a `RelativePose` term, padded to `room` observations; the motions name rows of the problem."""
     room = len(own) if room is None else room
     poses = np.tile(np.eye(4), (room, 1, 1))

@@ -51,7 +51,9 @@ def with_one_gauge(problem: Problem, state: State, keyframes: int, metric: bool)
     label = _labels(problem, keyframes, known)
     fixed = np.array(problem.fixed_pose)
     sized = _sized(problem, keyframes, known, label)
-    pieces, free, loose = [], [], []
+    pieces: list[tuple[int, ...]] = []
+    free: list[tuple[int, ...]] = []
+    loose: list[tuple[int, ...]] = []
     for piece in (np.nonzero(label == number)[0] for number in range(label.max(initial=-1) + 1)):
         held = piece[fixed[piece]]
         rows = tuple(int(row) for row in piece)
@@ -111,7 +113,7 @@ def _labels(problem: Problem, keyframes: int, known: _PriorKnowledge) -> np.ndar
             break
         label = merged
     _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse]
+    return np.asarray(np.argsort(np.argsort(first))[inverse])
 
 
 def _permuted(tied: np.ndarray, label: np.ndarray) -> np.ndarray:

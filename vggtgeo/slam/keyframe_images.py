@@ -8,7 +8,7 @@ colours serve a coarse alignment and the map), depth and its deviation as PNG, w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ class CompressedImage:
 
     data: bytes
     shape: tuple[int, ...]
-    dtype: np.dtype
+    dtype: np.dtype[Any]
 
     @classmethod
     def of(cls, image: np.ndarray) -> Self:

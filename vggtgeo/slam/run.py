@@ -128,7 +128,7 @@ def frame_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
 
     """
     times, poses = frame_poses(slam)
-    own = set(pieces_by_size(slam)[piece]) if slam.keyframes else set()
+    own: set[int] = set(pieces_by_size(slam)[piece]) if slam.keyframes else set()
     chosen = np.array([record.tracked and record.reference in own for record in slam.frames], bool)
     return Trajectory(times[chosen], rigid.invert(poses[chosen]))
 

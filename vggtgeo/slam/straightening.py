@@ -20,7 +20,7 @@ from vggtgeo.slam.pose_graph import BELIEF, PoseGraph, distance, solve_pose_grap
 from vggtgeo.slam.start import NOMINAL_DEPTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.unit_graph import UnitRatio, solve_units
-from vggtgeo.slam.units import longer, scaled_factor, scaled_keyframe, scaled_record
+from vggtgeo.slam.units import longer, scaled_factor, scaled_keyframe, scaled_motion, scaled_record
 
 MENDABLE = 20.0
 """Pixels of the median match beyond which the map is straightened before it is adjusted. An adjustment alone brings
@@ -90,7 +90,8 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     between = lambda first, second: rigid.orthonormal(poses[second] @ rigid.invert(poses[first]))
     loose = np.diag(1.0 / np.repeat(UNTRACKED, 3) ** 2)
-    motions, matched = [], {pair.key for pair in slam.pairs if len(pair.points)}
+    motions: list[MeasuredRelativePose] = []
+    matched = {pair.key for pair in slam.pairs if len(pair.points)}
     for number in range(1, len(slam.keyframes)):
         tie = tree.get(number)
         if tie is None and (number - 1, number) not in matched:
@@ -114,7 +115,7 @@ def _graph(
     slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[MeasuredRelativePose], units: np.ndarray
 ) -> PoseGraph:
     """The graph in the unit of the first keyframe, one keyframe held of each piece that the loops leave."""
-    inside = lambda measured: scaled_factor(measured, float(units[measured.first]))
+    inside = lambda measured: scaled_motion(measured, float(units[measured.first]))
     scaled_motions, scaled_loops = tuple(map(inside, motions)), tuple(map(inside, loops))
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])

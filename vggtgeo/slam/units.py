@@ -65,7 +65,10 @@ def scaled_record(record: FramePose, ratio: float) -> FramePose:
 
 def scaled_factor(factor: Factor, ratio: float) -> Factor:
     """What is known of such keyframes; a baseline stays what it is."""
-    if not isinstance(factor, MeasuredRelativePose):
-        return factor
+    return scaled_motion(factor, ratio) if isinstance(factor, MeasuredRelativePose) else factor
+
+
+def scaled_motion(motion: MeasuredRelativePose, ratio: float) -> MeasuredRelativePose:
+    """A measured motion whose translation is `ratio` times as long, and its information."""
     by = np.repeat([1.0 / ratio, 1.0], 3)
-    return replace(factor, pose=longer(factor.pose, ratio), information=factor.information * np.outer(by, by))
+    return replace(motion, pose=longer(motion.pose, ratio), information=motion.information * np.outer(by, by))
