@@ -4,7 +4,8 @@ the full adjustment, whose matches pull only within a few pixels.
 Tracked motions are a tree: nothing but loops contradicts them, so they have no robust kernel. What they are off by more
 than they state is estimated from the loops: the median over loops of the squared Mahalanobis distance between what a
 loop measured and what the motions on the way add up to, over the median of chi-square (a variance component, robust
-against up to half of the loops being false). Loops have a Cauchy kernel, widened at first
+against up to half of the loops being false). So drift is spread over the way; a single motion that is wrong (a slip) is
+spread, too, and not left where it happened. Loops have a Cauchy kernel, widened at first
 (`vggtgeo/bundle/graduation.py`): from metres of drift true loops look as false as the false ones do.
 """
 
