@@ -103,9 +103,14 @@ def simulated(*words: str) -> Any:
     return lambda made: ["simulate", "room", "-o", made / "new", *words]
 
 
-def benched(*words: str) -> Any:
-    """`vggtgeo bench` into a new folder."""
-    return lambda made: ["bench", "paper", "-o", made / "new", *words]
+def benched(suite: str) -> Any:
+    """`vggtgeo bench` into a new folder; `{}` is where the suite's file lies."""
+    return lambda made: ["bench", suite.format(made), "-o", made / "new"]
+
+
+def suite(content: str) -> Any:
+    """Makes a suite."""
+    return lambda folder: bad.file("suite.toml", content)(folder).parent
 
 
 def locked(folder: Path) -> None:
@@ -207,8 +212,9 @@ OTHERS = rows(
         ("`view` of a folder that is not there", nothing, {"argv": line("view", "no/such/run")}),
         ("`view` of a folder that is no run's", nothing, {"argv": lambda made: ["view", made]}),
         ("`view --rerun text.txt`", nothing, {"argv": lambda made: ["view", made, "--rerun", "text.txt"]}),
-        ("`bench` of a plan that is none", nothing, {"argv": benched("--plan", "huge")}),
-        ("`bench` of a scene that is none", nothing, {"argv": benched("--scenes", "moon")}),
+        ("`bench` of a suite that is none", nothing, {"argv": benched("no-such-suite")}),
+        ("`bench` of a suite that is no TOML", suite("sequences: 2"), {"argv": benched("{}/suite.toml")}),
+        ("`bench` of a suite without sequences", suite("name = 'mine'"), {"argv": benched("{}/suite.toml")}),
     ],
 )
 TRAJECTORIES = rows(

@@ -9,9 +9,10 @@ from vggtgeo.models.classical import SiftMatcher
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.mapping.cloud import map_points
+from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.dense import map_points
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -50,4 +51,10 @@ def recorded_run() -> RecordedRun:
     for slam in run_frames(iter(frames), sequence.camera, ROLES, SETTINGS, Clock()):
         recorder.on_frame(slam, frames[slam.frames[-1].frame])
         states.append(slam)
-    return RecordedRun(sequence, frames, states, recorder, map_points(slam.keyframes, slam.intrinsics))
+    return RecordedRun(
+        sequence,
+        frames,
+        states,
+        recorder,
+        map_points(slam.keyframes, slam.intrinsics, dense_depths(slam.keyframes, slam.intrinsics)),
+    )

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import bad_files as bad
 import cv2
 import numpy as np
 import pytest
@@ -17,8 +18,10 @@ from vggtgeo.datasets import (
     open_sequence,
     parse_intrinsics,
     with_intrinsics,
+    with_rate,
     without_depth,
 )
+from vggtgeo.datasets.image_files import read_image_file
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -296,3 +299,34 @@ def test_real_clips(shared_data: Path, clip: str, count: int, poses: int, kind: 
         assert frame.depth is not None
         assert 0.3 < np.nanmedian(frame.depth) < 8.0
         assert np.abs(truth.timestamps - frame.timestamp).min() < 1e-5
+
+
+def test_a_given_rate_makes_the_times(tmp_path: Path) -> None:
+    # Proves that a rate sets the times of images and videos, and is refused where frames have times. Oracle: index /
+    # rate.
+    images = with_rate(open_sequence(tiny.images(tmp_path / "images")), 4.0)
+    assert [frame.timestamp for frame in images.frames()] == [0.0, 0.25, 0.5]
+    tiny.write_calibration(tmp_path, tiny.INTRINSICS)
+    video = with_rate(open_sequence(_video(tmp_path / "clip.avi", [0, 80, 160])), 5.0)
+    assert [frame.timestamp for frame in video.frames()] == [0.0, 0.2, 0.4]
+    with pytest.raises(InputError, match="has times of its own"):
+        with_rate(open_sequence(tiny.tum(tmp_path / "tum")), 5.0)
+    with pytest.raises(InputError, match="must be a positive number"):
+        with_rate(images, -1.0)
+
+
+def test_images_are_used_as_they_are_stored(tmp_path: Path) -> None:
+    # Proves that an EXIF orientation turns no image, and that 12-bit values in a 16-bit file are not black. Oracle: the
+    # pixels that were written.
+    (tmp_path / "turned.jpg").write_bytes(bad.turned_jpeg())
+    (tmp_path / "plain.jpg").write_bytes(bad.encoded(".jpg"))
+    turned, plain = (read_image_file(tmp_path / f"{name}.jpg") for name in ("turned", "plain"))
+    assert (turned.orientation, plain.orientation) == (6, 1)
+    np.testing.assert_array_equal(turned.image, plain.image)
+    picture = bad.picture(1)
+    picture[0, 0] = 255
+    (tmp_path / "twelve.png").write_bytes(bad.encoded(".png", picture[..., ::-1].astype(np.uint16) << 4))
+    twelve = read_image_file(tmp_path / "twelve.png")
+    assert twelve.bits == 12
+    np.testing.assert_array_equal(twelve.image, picture)
+    assert read_image_file(tmp_path / "twelve.png", 16).image.max() == 15  # beside images that use all 16 bits

@@ -129,7 +129,8 @@ def test_a_depth_twice_as_uncertain_knows_a_quarter(keyframes: list[Keyframe]) -
     truth = keyframes[1].pose @ rigid.invert(keyframes[0].pose)
     found = []
     for factor in (1.0, 2.0):
-        views = [replace(each, depth_sigma=np.full(SIZE, 0.01 * factor, np.float16)) for each in keyframes]
+        sigma = np.full(SIZE, 0.01 * factor, np.float16)
+        views = [replace(each, images=replace(each.images, depth_sigma=sigma)) for each in keyframes]
         found.append(align(0, 1, [Surface.of(each, INTRINSICS) for each in views], truth, EFFECTIVE))
     np.testing.assert_allclose(found[0].hessian, 4 * found[1].hessian, rtol=2e-2)
 
@@ -167,7 +168,8 @@ def unit(rng: np.random.Generator) -> np.ndarray:
 def test_one_wall_leaves_free_what_it_does_not_tell(keyframes: list[Keyframe]) -> None:
     # Proves that a plane constrains three directions of six and invents no information. Oracle: sliding along it and
     # turning about its normal change no residual.
-    flat = [replace(each, depth=np.full(SIZE, 2.0, np.float16), pose=np.eye(4)) for each in keyframes]
+    wall = np.full(SIZE, 2.0, np.float16)
+    flat = [replace(each, images=replace(each.images, depth=wall), pose=np.eye(4)) for each in keyframes]
     surfaces = [Surface.of(each, INTRINSICS) for each in flat]
     term = align_pairs(flat, [(0, 1)], surfaces, EFFECTIVE)
     values = np.linalg.svd(np.asarray(term.root[0]))[1]

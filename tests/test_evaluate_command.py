@@ -83,3 +83,16 @@ def test_what_the_user_gave_wrong_is_an_input_error(tmp_path: Path) -> None:
         result = CliRunner().invoke(app, [str(estimate), str(truth)])
         assert isinstance(result.exception, InputError)
         assert message in str(result.exception)
+
+
+def test_a_run_of_free_scale_has_no_errors_in_metres(tmp_path: Path) -> None:
+    # Proves that SE(3) errors are left out where the run says that its scale is free, and that a metric run is
+    # labelled. Oracle: the summaries.
+    files = _files(tmp_path)
+    for scale in ("free (no metric depth): lengths have no unit", "metric"):
+        (tmp_path / "summary.json").write_text(json.dumps({"scale": scale}))
+        result = CliRunner().invoke(app, [str(tmp_path), str(files[1])])
+        assert result.exit_code == 0, result.output
+        assert f"scale of the estimate: {scale}" in result.output
+        assert ("ATE, SE(3)" in result.output) == (scale == "metric")
+        assert "ATE, Sim(3)" in result.output

@@ -142,6 +142,9 @@ def test_a_wrong_checkpoint_names_what_differs() -> None:
     load_strictly(module, weights_of({"model": {"module.a": np.zeros((2, 3)), "b": np.ones(4), "c": np.ones(1)}}),
                   Path("x.pt"), "a network")  # fmt: skip
     assert set(loaded) == {"a", "b", "c"}
+    extra = {"a": np.zeros((2, 3)), "b": np.ones(4), "c": np.ones(1), "d": np.ones(1)}
+    load_strictly(module, extra, Path("x.pt"), "a network", allow_extra=True)
+    assert set(loaded) == {"a", "b", "c"}
 
 
 def test_difference_is_relative_to_the_largest_value() -> None:

@@ -18,10 +18,11 @@ STAIR = (
     ("geometry",),
     ("bundle", "datasets", "evaluation"),
     ("simulation", "slam"),
+    ("mapping",),
     ("figures",),
     ("report",),
     ("results",),
-    ("benchmark", "learning", "viewing"),
+    ("benchmark", "export", "learning", "viewing"),
     ("cli",),
 )
 """Packages of `vggtgeo`, the lowest first: each imports of those below it; those of one step nothing of each other."""

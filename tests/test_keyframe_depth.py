@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from vggtgeo.models.roles import Features, LineFeatures, Segments
 
+from vggtgeo.mapping.keyframe_depth import fused_depths, optimised_depth
 from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_depth import fused_depths, optimised_depth
 from vggtgeo.slam.keyframe_images import KeyframeImages
 
 SIZE = (120, 160)

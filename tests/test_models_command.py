@@ -41,7 +41,8 @@ def test_every_network_is_listed_with_its_terms(tmp_path: Path) -> None:
     for row in found["networks"]:
         assert f"{row['paper']}\n    {row['licence']}: {row['allows']}\n    {row['get']}" in text
     assert "vggtgeo models fetch moge2\n" in text
-    assert "letr  present" in text
+    assert "letr  present, random weights: its answers mean nothing" in text
+    assert [row["name"] for row in found["networks"] if row["random"]] == ["letr"]
 
 
 def test_the_registry_is_sound() -> None:

@@ -26,7 +26,7 @@ from vggtgeo.models.onnx.letr import LetrDetector
 from vggtgeo.models.onnx.moge2 import MogeDepth
 from vggtgeo.models.onnx.session import NetworkValueError, open_session
 from vggtgeo.models.onnx.vggt import decode_cameras
-from vggtgeo.models.roles import DepthEstimate, Segments
+from vggtgeo.models.roles import DepthEstimate, Features, Segments
 
 import vggtgeo as vg
 from vggtgeo.slam.trust.input import check_refusals
@@ -40,7 +40,7 @@ IMAGE = np.random.default_rng(0).integers(0, 255, (*SIZE, 3)).astype(np.uint8)
 def moge(path: Path, scale: float, mask: float = 1.0, size: tuple[int, int] = SIZE) -> Path:
     """A file of MoGe-2 that answers a wall at 2 m times `scale`, valid with probability `mask`."""
     y, x = np.mgrid[: size[0], : size[1]] - np.array(size)[:, None, None] / 2
-    points = np.stack([x / 30, y / 30, np.full(size, 2.0)], axis=-1)[None]
+    points = np.stack([x / 15, y / 15, np.full(size, 2.0)], axis=-1)[None]
     outputs = {"points": points, "mask": np.full((1, *size), mask), "metric_scale": np.full(1, scale)}
     return tiny.constant(path, "moge2", {"image": (1, 3, *size)}, outputs, "test")
 
@@ -88,7 +88,8 @@ def test_values_that_are_not_finite_cost_the_answer_only() -> None:
     assert not np.isfinite(depth.estimate(IMAGE).depth).any()
     assert len(lines.detect(IMAGE)) == 0
     assert (confidence.confidence(IMAGE) == AVERAGE).all()
-    assert len(points.match(None, None)) == 0
+    nothing = Features(np.zeros((0, 2)), np.zeros(0))
+    assert len(points.match(nothing, nothing)) == 0
     guess = window.window([IMAGE, IMAGE])
     assert not guess.found.any()
     assert not np.isfinite(guess.depth).any()
@@ -153,7 +154,8 @@ def test_depth_of_another_scene_is_told(kind: str) -> None:
         "5 % off": lambda depth: depth * rng.normal(1.0, 0.05, depth.shape),
         "random": lambda depth: rng.uniform(0.5, 5.0, depth.shape),
     }[kind]
-    keyframes = tuple(replace(member, depth=change(member.depth).astype(np.float16)) for member in slam.keyframes)
+    images = [replace(k.images, depth=change(k.depth).astype(np.float16)) for k in slam.keyframes]
+    keyframes = tuple(replace(k, images=own) for k, own in zip(slam.keyframes, images, strict=True))
     found = list(check_surfaces(keyframes, np.asarray(slam.intrinsics)))
     assert [finding.level for finding in found] == (["degraded"] if kind == "random" else [])
     verdict = judge(replace(slam, keyframes=keyframes))
@@ -167,6 +169,7 @@ def test_a_run_tells_what_was_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     """
     monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
     monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
+    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
     size = (120, 160)
     tiny.dinov3(tmp_path / "dinov3-small.onnx", (112, 160))
     tiny.mlsd(tmp_path / "mlsd.onnx")

@@ -12,7 +12,7 @@ from vggtgeo.models.onnx.dinov3 import DinoFeatures
 from vggtgeo.models.onnx.letr import LetrDetector, decode_lines
 from vggtgeo.models.onnx.line_matcher import DenseLineMatcher, segment_similarity
 from vggtgeo.models.onnx.mlsd import MlsdDetector, decode_maps
-from vggtgeo.models.onnx.segments import directed, tidy
+from vggtgeo.models.onnx.segments import cut_off, directed, tidy
 from vggtgeo.models.onnx.session import open_session
 from vggtgeo.models.roles import LineDetector, LineMatcher, RelativeView, Segments
 
@@ -104,12 +104,32 @@ def test_directions_are_those_of_lsd(seed: int) -> None:
 
 
 def test_segments_are_clipped_filtered_and_ordered() -> None:
-    # Proves `tidy`. Oracle: four segments whose fate is plain.
+    # Proves `tidy`: cut off at the border, the short one and the one outside dropped, the best first. Oracle: four
+    # segments whose fate is plain.
     ends = np.array([[[-5.0, 10], [100, 10]], [[0, 0], [5, 0]], [[0, 50], [319, 50]], [[400, 20], [400, 90]]])
     found = tidy(_blocks(0), ends, np.array([0.7, 1.0, 0.8, 0.9]), 20.0, 10)
-    expected = np.array([[[319.0, 20], [319, 90]], [[0, 50], [319, 50]], [[0, 10], [100, 10]]])
+    expected = np.array([[[0.0, 50], [319, 50]], [[0, 10], [100, 10]]])
     np.testing.assert_allclose(np.sort(found.endpoints, axis=1), np.sort(expected, axis=1))
-    np.testing.assert_array_equal(found.scores, [0.9, 0.8, 0.7])
+    np.testing.assert_array_equal(found.scores, [0.8, 0.7])
+
+
+def test_a_segment_is_cut_off_along_itself() -> None:
+    # Proves that the part of a segment inside the image lies on the segment, however it meets the border, and that its
+    # ends are on the border or its own. Oracle: the line through the ends given; a dense sampling of the segment.
+    rng = np.random.default_rng(0)
+    ends = rng.uniform(-300, 600, (400, 2, 2))
+    ends[:40, 1, 0] = ends[:40, 0, 0]  # upright
+    found = cut_off(ends, (320, 240))
+    way = ends[:, 1] - ends[:, 0]
+    normal = np.stack([-way[:, 1], way[:, 0]], axis=1) / np.linalg.norm(way, axis=1, keepdims=True)
+    off = np.abs(((found - ends[:, :1]) * normal[:, None]).sum(-1))
+    length = np.linalg.norm(found[:, 1] - found[:, 0], axis=1)
+    assert off.max() < 1e-9
+    steps = np.linspace(0, 1, 20001)
+    for segment, kept in zip(ends, length, strict=True):
+        points = segment[0] + steps[:, None] * (segment[1] - segment[0])
+        inside = ((points >= 0) & (points <= [319, 239])).all(axis=1)
+        assert kept == pytest.approx(inside.mean() * np.linalg.norm(segment[1] - segment[0]), abs=0.2)
 
 
 def test_nothing_found_is_an_answer(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 import tiny_networks as tiny
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
+from vggtgeo.models.onnx.graph_bytes import external_files
 from vggtgeo.models.onnx.session import NetworkRunError, choose_provider, digest_of, open_session, read_signature
 
 MAKERS = {
@@ -200,12 +201,24 @@ def test_the_digest_covers_the_external_data(tmp_path: Path) -> None:
     assert digest_of(path) != before
 
 
+def test_the_digest_follows_the_names_in_the_graph(tmp_path: Path) -> None:
+    # Proves that a graph that was given another name still counts its weights, which have kept theirs. Oracle: one bit
+    # of them changed; and the bytes of the graph, which do not change.
+    path = tiny.vggt(tmp_path / "vggt.onnx", external=True).rename(tmp_path / "renamed.onnx")
+    before, data = digest_of(path), tmp_path / "vggt.onnx.data"
+    assert external_files(path) == [data]
+    raw = bytearray(data.read_bytes())
+    raw[0] ^= 1
+    data.write_bytes(raw)
+    assert digest_of(path) != before
+
+
 def test_cuda_is_refused_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves the choice of the provider. Oracle: the list that onnxruntime would give.
     available = "vggtgeo.models.onnx.session.onnxruntime.get_available_providers"
     monkeypatch.setattr(available, lambda: ["CPUExecutionProvider"])
     assert choose_provider("auto") == "cpu"
-    with pytest.raises(NetworkFileError, match=r"pip install vggtgeo\[gpu\]"):
+    with pytest.raises(NetworkFileError, match=r"pip install -e \.\[gpu\]"):
         choose_provider("cuda")
     monkeypatch.setattr(available, lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     assert choose_provider("auto") == "cuda"

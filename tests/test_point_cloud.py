@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 
@@ -58,3 +59,24 @@ def test_what_is_no_cloud_is_named(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"{name}` cannot be read as a PLY"):
             PointCloud.load_ply(tmp_path / name)
     assert os.listdir(tmp_path) == ["text.ply"]
+
+
+def test_cells_are_told_apart_by_one_number() -> None:
+    # Proves that equal cells have equal numbers, different ones different, in the order of the rows, and the error of a
+    # grid too large to number. Oracle: `np.unique` of rows.
+    cells = np.random.default_rng(0).integers(-5, 6, (500, 3))
+    rows, inverse = np.unique(cells, axis=0, return_inverse=True)
+    numbers, again = np.unique(cell_numbers(cells), return_inverse=True)
+    assert len(numbers) == len(rows)
+    np.testing.assert_array_equal(again, inverse.reshape(-1))
+    assert len(cell_numbers(np.zeros((0, 3), int))) == 0
+    with pytest.raises(InputError, match="make the cells larger"):
+        cell_numbers(np.array([[0, 0, 0], [2**30, 2**30, 2**30]]))
+
+
+def test_normals_come_back_from_the_file(tmp_path: Path) -> None:
+    # Proves that normals are written and read, and that other shapes are refused. Oracle: the cloud written.
+    normals = np.tile(np.float32([0, 0, 1]), (3, 1))
+    cloud = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), np.ones(3, np.float32), normals)
+    cloud.save_ply(tmp_path / "map.ply")
+    np.testing.assert_array_equal(PointCloud.load_ply(tmp_path / "map.ply").normals, normals)

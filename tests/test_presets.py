@@ -206,7 +206,7 @@ def test_missing_and_wrong_files_end_the_run_before_any_frame(
         (folder / f"{name}.onnx").rename(tmp_path / f"{name}.onnx")
     result = _run(tmp_path, "--preset", "paper", "--models", folder)
     assert result.exit_code == 2
-    assert "`preset` 'paper' needs vggt.onnx, moge2.onnx in" in result.output
+    assert "what was chosen needs vggt.onnx, moge2.onnx in" in result.output
     for name in ("vggt", "moge2"):
         (tmp_path / f"{name}.onnx").rename(folder / f"{name}.onnx")
     result = _run(tmp_path, "--preset", "paper", "--models", folder)
@@ -299,3 +299,20 @@ def test_real_exports_keep_their_contracts_and_run(tmp_path: Path) -> None:
     summary = _whole_run(tmp_path, folder, (640, 480))
     assert summary["frames"] == 10
     assert all(network["calls"] > 0 for network in summary["networks"].values()), summary["networks"]
+
+
+def test_roles_are_mixed_by_name(files: Path) -> None:
+    # Proves that a role is played by whom its name says, on top of a preset too, that no other network is opened, and
+    # the error of a name that is not there. Oracle: the classes, and the networks opened.
+    classical = Roles()
+    found = perception("classical", classical, files, mixed={"lines": "mlsd", "depth": "moge2-small"})
+    assert set(found.networks) == {"mlsd", "moge2-small"}
+    assert type(found.roles.lines.source).__name__ == "MlsdDetector"
+    assert type(found.roles.depth.source).__name__ == "MogeDepth"
+    assert found.roles.points is classical.points
+    less = perception("light", classical, files, mixed={"depth": "classical", "lines": "letr"})
+    assert set(less.networks) == {"dinov3-small", "letr"}
+    assert less.roles.depth is classical.depth
+    assert less.roles.line_matches.source.features is less.roles.confidence.source
+    with pytest.raises(InputError, match="`lines` is 'moge2'; what can be mixed is points: classical, mast3r;"):
+        perception("classical", classical, files, mixed={"lines": "moge2"})

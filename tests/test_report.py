@@ -19,6 +19,7 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.report import write_page
 from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
@@ -59,8 +60,13 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     settings, seconds = {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}
     summary = summarise(slam, verdict, settings=settings, seconds=seconds, report=report, **facts)
     given = {"title": "a <room>", "truth": truth, "cloud": run.cloud, "records": run.recorder.records}
+    given["depth_maps"] = dense_depths(slam.keyframes, slam.intrinsics, "auto" if _deep(slam) else "none")
     write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
     return (folder / "report.html").read_text()
+
+
+def _deep(slam: Slam) -> bool:
+    return any(np.isfinite(keyframe.depth).any() for keyframe in slam.keyframes)
 
 
 @pytest.fixture(scope="module")

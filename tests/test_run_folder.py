@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tiny_sequences as tiny
@@ -21,7 +22,9 @@ from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import end_on_signals, interruption
 from vggtgeo.io.locks import LockedError, locked
 from vggtgeo.results import Result
+from vggtgeo.results.files import write_depth
 from vggtgeo.results.run_folder import RESERVE, check_finished, taken
+from vggtgeo.slam.keyframe import Keyframe
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of another kind")
 FRAMES = 6
@@ -104,7 +107,7 @@ def test_a_new_run_replaces_the_old_one_as_a_whole(frames: Path, tmp_path: Path)
 
 STAGES = (
     "vggtgeo.results.reconstruction.finish",
-    "vggtgeo.results.reconstruction.map_points",
+    "vggtgeo.results.reconstruction.dense_map",
     "vggtgeo.results.reconstruction.judge",
     "vggtgeo.results.result.write_settings",
     "vggtgeo.results.result.write_json",
@@ -329,3 +332,25 @@ def test_a_lock_says_who_holds_it(tmp_path: Path) -> None:
     ):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None:
+    """Counts are 1/5000 m, what is too far for 16 bits is none, the folder says its unit, and without depth there is no
+    folder but a warning; oracle: the depth that was given.
+    """
+    keyframe = object.__new__(Keyframe)  # of which two fields count
+    object.__setattr__(keyframe, "frame", 7)
+    object.__setattr__(keyframe, "depth_confidence", np.full((2, 2), 255, np.uint8))
+    depth = np.array([[1.0, np.nan], [13.2, 0.5]])
+    write_depth(tmp_path, [keyframe, keyframe], [depth, None], metric=False)
+    assert sorted(path.name for path in (tmp_path / "depth").iterdir()) == [
+        "000007.confidence.png",
+        "000007.depth.png",
+        "README.txt",
+    ]
+    found = cv2.imread(str(tmp_path / "depth/000007.depth.png"), cv2.IMREAD_UNCHANGED)
+    assert found.tolist() == [[5000, 0], [0, 2500]]
+    assert "which is no metre" in (tmp_path / "depth/README.txt").read_text()
+    with pytest.warns(InputWarning, match="there is none to save"):
+        write_depth(tmp_path / "none", [keyframe], [None])
+    assert not (tmp_path / "none").exists()

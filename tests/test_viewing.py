@@ -26,8 +26,8 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.results.files import write_depth, write_settings, write_trajectories
-from vggtgeo.slam.keyframe_depth import fused_depths
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.target import check_target, has_screen
 
@@ -120,7 +120,7 @@ def test_ellipsoids_have_the_axes_of_the_covariance() -> None:
 def test_a_run_folder_becomes_a_recording(run: RecordedRun, tmp_path: Path) -> None:
     """`vggtgeo view` writes a file with path, map, depth and confidence; oracle: rerun's own reader."""
     write_trajectories(tmp_path, run.slam)
-    depths = fused_depths(run.slam.keyframes, run.slam.intrinsics)
+    depths = dense_depths(run.slam.keyframes, run.slam.intrinsics)
     run.cloud.save_ply(tmp_path / "map.ply")
     write_depth(tmp_path, run.slam.keyframes, depths)
     result = CliRunner().invoke(make_app(), ["view", str(tmp_path), "--rerun", str(tmp_path / "out" / "v.rrd")])

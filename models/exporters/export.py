@@ -2,8 +2,8 @@
 
 In this order, each step an oracle of the next: the changed module gives what the published code gave (both in
 PyTorch); the file passes onnx's full checker; onnxruntime loads it; and gives what PyTorch gave for the same random
-input. The file appears under its name only after that, with `FILE.onnx.data` (its weights) and `FILE.onnx.parity.npz`
-(that input, and what PyTorch gave) beside it.
+input. The file appears under its name only after that, with `FILE.onnx.data` (large weights) and
+`FILE.onnx.parity.npz` (that input, and what PyTorch gave) beside it.
 
 Difference = max |a - b| / max |b|, the largest over the outputs.
 """
@@ -36,6 +36,8 @@ from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, METADATA_
 OPSET = 20
 TOLERANCE = 1e-3
 """Largest difference of a file in float32."""
+EMBEDDED = 64e6
+"""Bytes of weights up to which they are in the ONNX file itself."""
 HALF_TOLERANCE = 3e-2
 """Largest difference of a file in half precision: some three digits, through tens of blocks."""
 
@@ -169,7 +171,8 @@ def _save(graph: Graph, names: tuple[str, ...], path: Path, properties: Mapping[
         )
     _strip(program.model)
     program.model.metadata_props.update(properties)
-    program.save(str(path), external_data=True)
+    weights = sum(value.const_value.nbytes for value in program.model.graph.initializers.values())
+    program.save(str(path), external_data=weights > EMBEDDED)
     return sum(int(np.prod(value.shape.numpy())) for value in program.model.graph.initializers.values())
 
 

@@ -15,7 +15,7 @@ def load(name: str) -> Any:
     except ModuleNotFoundError as error:
         raise ExportError(
             f"exporting needs the package `{error.name}`, which is not installed; "
-            "install the extra: pip install 'vggtgeo[export]'"
+            "install the extra `export`: `pip install -e .[export]` in a clone, `pip install vggtgeo[export]` elsewhere"
         ) from None
 
 

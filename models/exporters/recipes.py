@@ -57,6 +57,7 @@ class Recipe:
         tokens: int | None = None,
         variant: str | None = None,
         half: bool = False,
+        allow_extra: bool = False,
     ) -> Request:
         """The request with defaults filled in; `ExportError` for what this network cannot be."""
         height, width = height or self.size[0], width or self.size[1]
@@ -76,6 +77,7 @@ class Recipe:
             views=self._only_where("--views", views, self.views) or 1,
             tokens=self._only_where("--tokens", tokens, self.tokens),
             half=half,
+            allow_extra=allow_extra,
         )
 
     def _check_size(self, height: int, width: int) -> None:

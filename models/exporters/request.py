@@ -21,6 +21,7 @@ class Request:
     source: the checkout. checkpoint: the file of weights, or None for random ones drawn with `seed`.
     height, width: pixels of the input image. views: images a window (VGGT). tokens: patches inside MoGe-2.
     variant: the size of the network, one of the recipe's. half: attention and perceptrons in float16.
+    allow_extra: whether the checkpoint may hold weights that the network has no place for.
     """
 
     source: Path
@@ -31,6 +32,7 @@ class Request:
     views: int = 1
     tokens: int = 0
     half: bool = False
+    allow_extra: bool = False
     seed: int = 0
 
     def random_images(self, low: float, high: float, count: int = 1) -> np.ndarray:

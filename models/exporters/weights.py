@@ -13,7 +13,7 @@ from typing import Any
 from vggtgeo.models.exporters.packages import load
 from vggtgeo.models.exporters.request import ExportError, Request
 
-_NAMED = 4
+_NAMED = 12
 """How many missing or superfluous weights an error names."""
 _STATES = ("model", "state_dict", "teacher")
 """Keys under which published checkpoints keep the weights."""
@@ -48,10 +48,11 @@ def weights_of(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name.removeprefix("module."): value for name, value in inner.items()}
 
 
-def load_strictly(module: Any, weights: Mapping[str, Any], path: Path, fits: str) -> None:
+def load_strictly(module: Any, weights: Mapping[str, Any], path: Path, fits: str, allow_extra: bool = False) -> None:
     """Give `module` all its weights; `ExportError` unless names and shapes agree exactly.
 
-    fits: what the module is, for the message.
+    fits: what the module is, for the message. allow_extra: leave out weights that the module has no place for, as the
+    published code of some networks does.
     """
     own = module.state_dict()
     wrong = [
@@ -63,7 +64,7 @@ def load_strictly(module: Any, weights: Mapping[str, Any], path: Path, fits: str
         f"{len(names)} {kind}: {', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''}"
         for kind, names in (
             ("missing", [name for name in own if name not in weights]),
-            ("superfluous", [name for name in weights if name not in own]),
+            ("superfluous", [name for name in weights if name not in own and not allow_extra]),
             ("of another shape", wrong),
         )
         if names
@@ -71,9 +72,9 @@ def load_strictly(module: Any, weights: Mapping[str, Any], path: Path, fits: str
     if problems:
         raise ExportError(
             f"`--checkpoint` {path} does not hold the weights of {fits}: {'; '.join(problems)}; "
-            "give the checkpoint of this network and `--variant`"
+            "give the checkpoint of this network and `--variant`, or allow superfluous ones by `--allow-extra-weights`"
         )
-    module.load_state_dict(dict(weights), strict=True)
+    module.load_state_dict({name: weights[name] for name in own}, strict=True)
 
 
 def fill(module: Any, request: Request, fits: str) -> None:
@@ -81,7 +82,8 @@ def fill(module: Any, request: Request, fits: str) -> None:
     if request.checkpoint is None:
         liven(module)
     else:
-        load_strictly(module, weights_of(read_checkpoint(request.checkpoint)), request.checkpoint, fits)
+        weights = weights_of(read_checkpoint(request.checkpoint))
+        load_strictly(module, weights, request.checkpoint, fits, request.allow_extra)
     module.eval().requires_grad_(False)
 
 

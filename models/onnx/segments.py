@@ -8,17 +8,36 @@ from vggtgeo.models.roles import Segments
 
 
 def tidy(image: np.ndarray, endpoints: np.ndarray, scores: np.ndarray, shortest: float, count: int) -> Segments:
-    """Segments clipped to `image` (uint8 [H, W, 3]), directed by their brighter side, best first.
+    """Segments cut off at the border of `image` (uint8 [H, W, 3]), directed by their brighter side, best first.
 
-    endpoints: float [L, 2, 2], pixels. scores: float [L]. Those shorter than `shortest` pixels are dropped, and all
-    but the best `count`.
+    endpoints: float [L, 2, 2], pixels. scores: float [L]. Those of which less than `shortest` pixels are inside are
+    dropped, and all but the best `count`.
     """
     height, width = image.shape[:2]
-    ends = np.clip(np.asarray(endpoints, np.float64).reshape(-1, 2, 2), 0.0, [width - 1.0, height - 1.0])
+    ends = cut_off(np.asarray(endpoints, np.float64).reshape(-1, 2, 2), (width, height))
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     order = np.argsort(-scores, kind="stable")
     order = order[length[order] >= shortest][:count]
     return Segments(directed(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), ends[order]), scores[order].astype(np.float64))
+
+
+def cut_off(endpoints: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """The parts of segments float64 [L, 2, 2] inside an image of `size` (width, height), along the segments themselves.
+
+    Clipping x and y apart would turn a segment. Both ends are one point where nothing of a segment is inside (Liang and
+    Barsky, "A new concept and method for line clipping", ACM TOG 3(1), 1984).
+    """
+    start, way = endpoints[:, 0], endpoints[:, 1] - endpoints[:, 0]
+    low, high = np.zeros(2), np.array(size, np.float64) - 1.0
+    along = np.where(way == 0, 1.0, way)
+    bounds = np.stack([(low - start) / along, (high - start) / along])
+    outside = (start < low) | (start > high)
+    never = np.where(outside, np.inf, -np.inf)  # parallel to a side: beyond it wholly, or never cut by it
+    enter = np.where(way == 0, never, bounds.min(axis=0)).max(axis=1).clip(min=0.0)
+    leave = np.where(way == 0, -never, bounds.max(axis=0)).min(axis=1).clip(max=1.0)
+    empty = enter >= leave
+    enter, leave = np.where(empty, 0.0, enter), np.where(empty, 0.0, leave)
+    return np.stack([start + enter[:, None] * way, start + leave[:, None] * way], axis=1)
 
 
 def directed(gray: np.ndarray, endpoints: np.ndarray, samples: int = 16, reach: float = 3.0) -> np.ndarray:

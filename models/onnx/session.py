@@ -23,6 +23,7 @@ from vggtgeo.models.onnx.file_checks import (
     check_looks_like_onnx,
     check_signature,
 )
+from vggtgeo.models.onnx.graph_bytes import external_files
 
 Provider = Literal["auto", "cuda", "cpu"]
 _log = logging.getLogger(__name__)
@@ -207,13 +208,14 @@ def choose_provider(provider: Provider) -> str:
     has_cuda = _PROVIDERS["cuda"] in onnxruntime.get_available_providers()
     if provider == "cuda" and not has_cuda:
         raise NetworkFileError(
-            "`provider` is cuda, but this onnxruntime runs on the CPU only; install the extra: pip install vggtgeo[gpu]"
+            "`provider` is cuda, but this onnxruntime runs on the CPU only; install the extra `gpu`: "
+            "`pip install -e .[gpu]` in a clone, `pip install vggtgeo[gpu]` elsewhere"
         )
     return provider if provider != "auto" else "cuda" if has_cuda else "cpu"
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of an ONNX file and of the files of external data that share its name, hexadecimal."""
+    """SHA-256 of an ONNX file and of the files of external data that its graph names, hexadecimal."""
     total = hashlib.sha256()
     for part in _parts(path):
         with part.open("rb") as file:
@@ -223,7 +225,7 @@ def digest_of(path: Path) -> str:
 
 def _parts(path: Path) -> list[Path]:
     """The file and its external data."""
-    return [path, *sorted(path.parent.glob(f"{path.name}[._]data*"))]
+    return [path, *external_files(path)]
 
 
 def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int | None) -> onnxruntime.InferenceSession:

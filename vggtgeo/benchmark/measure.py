@@ -116,9 +116,9 @@ def depth_errors(result: Result, given: Input, alignment: Similarity | None) -> 
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, _DEPTH_MAPS).round().astype(int))
     found, prior = [], []
     for number in chosen:
-        keyframe, fused = keyframes[number], result.record.depths[number]
+        keyframe, fused = keyframes[number], result.record.dense.depth_maps[number]
         truth = given.oracle.depth(keyframe.frame)
-        for depth, kept in ((fused, found), (keyframe.depth, prior)):
+        for depth, kept in ((fused.depth if fused else None, found), (keyframe.depth, prior)):
             if depth is not None and np.isfinite(depth).any():
                 kept.append(depth_error((scale * depth).astype(np.float64), truth))
     weights = np.array([one.count for one in found], float)

@@ -71,6 +71,15 @@ COMMANDS = (
         ),
     ),
     CommandEntry(
+        "export",
+        "vggtgeo.cli.export",
+        "Write the run in DIR for another program.",
+        (
+            "vggtgeo export runs/desk --to colmap  # pictures, cameras, tracks: what Gaussian splatting wants",
+            "vggtgeo export runs/desk --to glb -o desk  # the mesh, for any 3D viewer",
+        ),
+    ),
+    CommandEntry(
         "solve",
         "vggtgeo.cli.solve",
         "Solve the bundle-adjustment problem in PROBLEM.",

@@ -50,7 +50,9 @@ def list_networks(folder: Folder = None, as_json: JsonOption = False) -> None:
         typer.echo(json.dumps({"folder": str(place), "networks": rows}, ensure_ascii=False))
         return
     for row in rows:
-        typer.echo(f"{row['name']}  {'present' if row['present'] else 'absent'}  {row['megabytes']} MB  {row['role']}")
+        there = "present" if row["present"] else "absent"
+        there += ", random weights: its answers mean nothing" if row["random"] else ""
+        typer.echo(f"{row['name']}  {there}  {row['megabytes']} MB  {row['role']}")
         typer.echo(f"    {row['paper']}")
         typer.echo(f"    {row['licence']}: {row['allows']}")
         typer.echo(f"    {row['get']}")
@@ -111,11 +113,14 @@ def verify(
 
 
 def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
+    from vggtgeo.models.onnx.graph_bytes import has_random_weights
+
     made = f"{network.export_command}  # {network.publication.code}; weights: {network.weights}"
     return {
         "name": network.name,
         "role": network.role,
         "present": (place / network.file).is_file(),
+        "random": (place / network.file).is_file() and has_random_weights(place / network.file),
         "file": str(place / network.file),
         "megabytes": network.megabytes,
         "paper": network.publication.paper,

@@ -1,6 +1,9 @@
 """`vggtgeo models export`: a published network as the ONNX file that the pipeline reads."""
 
+import contextlib
 import json
+import signal
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +12,20 @@ import typer
 
 from vggtgeo.cli.options import JsonOption, QuietOption
 from vggtgeo.io.errors import InputError
+
+
+@contextlib.contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """SIGTERM ends the program by an exception, as Ctrl-C does, so that temporary folders are removed."""
+
+    def leave(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def export(
@@ -28,6 +45,13 @@ def export(
     views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None,
     tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None,
     variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None,
+    allow_extra_weights: Annotated[
+        bool,
+        typer.Option(
+            "--allow-extra-weights/--no-allow-extra-weights",
+            help="Leave out weights of the checkpoint that the network has no place for.",
+        ),
+    ] = False,
     half: Annotated[bool, typer.Option("--half/--no-half", help="Attention and perceptrons in float16.")] = False,
     tolerance: Annotated[
         float | None,
@@ -49,10 +73,11 @@ def export(
         raise InputError(f"one of `--checkpoint` FILE and `--random-weights` is needed; {found}")
     try:
         recipe = recipe_of(name)
-        request = recipe.request(source, checkpoint, height, width, views, tokens, variant, half)
+        request = recipe.request(source, checkpoint, height, width, views, tokens, variant, half, allow_extra_weights)
         from vggtgeo.models.exporters.export import export as write
 
-        report = write(recipe, request, output, say, tolerance)
+        with _ended_in_order():
+            report = write(recipe, request, output, say, tolerance)
     except ExportError as error:
         raise InputError(str(error)) from error
     if as_json:

@@ -6,6 +6,7 @@ What is heavy is imported when a run begins, so that `vggtgeo run --help` answer
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,6 +48,10 @@ def run(
     cache: options.CacheOption = None,
     provider: options.ProviderOption = "auto",
     memory_limit_gb: options.MemoryOption = None,
+    points: options.PointsOption = None,
+    line_detector: options.LineDetectorOption = None,
+    depth: options.DepthOption = None,
+    dense: options.DenseOption = "auto",
     save_depth: options.SaveDepthOption = False,
     assignments: AssignmentsOption = None,
     rerun: RerunOption = None,
@@ -76,15 +81,17 @@ def run(
     with collected_warnings() as warned:
         sequence = open_input(path, kind, intrinsics, rgb_only, fps)
     classical = classical_roles(sequence.has_depth, init, features)
-    perceived = make_perception(preset, classical, models, cache, provider, memory_limit_gb)
+    mixed = {"points": points, "lines": line_detector, "depth": depth}
+    perceived = make_perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
     flags = settings.values() if settings else {}
     run_and_write(
         sequence,
         perceived,
         slam_settings,
-        Output(output, flags, rerun, save_depth, quiet, as_json, source=path),
+        Output(output, flags, rerun, save_depth, quiet, as_json, source=Path(path)),
         (start, end, stride),
         seed=seed,
+        dense=dense,
         warned=warned,
     )
 
@@ -131,11 +138,13 @@ def make_perception(
     cache: Path | None,
     provider: options.Provider,
     memory_limit_gb: float | None,
+    mixed: Mapping[str, str | None],
 ) -> Perception:
-    """The roles of a preset; warns of networks whose weights are random."""
+    """The roles of a preset, some played by others; warns of networks whose weights are random."""
     from vggtgeo.slam.presets import perception
 
-    perceived = perception(preset, classical, models, cache, provider, memory_limit_gb)
+    chosen = {role: name for role, name in mixed.items() if name is not None}
+    perceived = perception(preset, classical, models, cache, provider, memory_limit_gb, chosen)
     if perceived.random:
         warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
     return perceived

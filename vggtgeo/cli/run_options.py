@@ -53,11 +53,29 @@ PresetOption = Annotated[
     Literal["classical", "light", "paper"],
     typer.Option(help="Who perceives: classical code, or networks (see `vggtgeo models list`)."),
 ]
+PointsOption = Annotated[
+    Literal["classical", "mast3r"] | None, typer.Option(help="Who matches points, in place of the preset's choice.")
+]
+LineDetectorOption = Annotated[
+    Literal["classical", "mlsd", "letr"] | None,
+    typer.Option(help="Who finds line segments, in place of the preset's choice."),
+]
+DepthOption = Annotated[
+    Literal["classical", "moge2-small", "moge2"] | None,
+    typer.Option(help="Whose depth is used, in place of the preset's choice; classical is the sensor's."),
+]
 ModelsOption = Annotated[Path | None, typer.Option("--models", help="Folder of the networks' files.")]
 CacheOption = Annotated[Path | None, typer.Option("--cache", help="Folder to keep what the networks answer.")]
 ProviderOption = Annotated[Provider, typer.Option(help="Where networks run.")]
 MemoryOption = Annotated[
     float | None, typer.Option(help="Most GPU memory of each network, GB; has no effect on the CPU.")
+]
+DenseOption = Annotated[
+    Literal["auto", "mvs", "sensor", "network", "none"],
+    typer.Option(
+        help="Whose depth the map is made of: mvs, the pictures (also in holes of measured depth); sensor or network, "
+        "what was measured; none, points alone; auto, what was measured, else the pictures."
+    ),
 ]
 SaveDepthOption = Annotated[
     bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")

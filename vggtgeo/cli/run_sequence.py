@@ -58,6 +58,7 @@ def run_and_write(
     selection: tuple[int, int | None, int] = (0, None, 1),
     *,
     seed: int = 0,
+    dense: str = "auto",
     title: str | None = None,
     facts: Mapping[str, Any] | None = None,
     warned: Iterable[Warning | str] = (),
@@ -86,15 +87,17 @@ def run_and_write(
                 end=end,
                 stride=stride,
                 seed=seed,
+                dense=dense,
                 title=title,
                 callbacks=(bar, _EarlyFiles(folder.stage, {**output.flags, **changed(settings)}), *callbacks),
                 facts=facts,
                 warned=warned,
             )
-        result.save_into(folder, depth=output.save_depth, settings=output.flags)
+            bar.on_stage("writing")
+            summary = result.save_into(folder, depth=output.save_depth, settings=output.flags)
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: everything was done and is written", err=True)
-    print_result(console, result, output.folder)
+    print_result(console, result, summary, output.folder)
     if output.as_json:
         typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
     if output.rerun == "serve":

@@ -86,8 +86,8 @@ def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
     """The file's bytes, and the image in them."""
     try:
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"`{path}` cannot be read: {error.strerror or error}") from None
+    except (OSError, ValueError) as error:  # a name from a list may be none that a file system takes
+        raise InputError(f"`{path}` cannot be read: {getattr(error, 'strerror', None) or error}") from None
     wrong = defect(content)
     if wrong:
         raise InputError(f"`{path}` {wrong}")

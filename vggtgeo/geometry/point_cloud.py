@@ -10,19 +10,23 @@ from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 
-# What the parser raises for files that are none, or that declare more than they hold.
-_UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyHeaderParseError, PlyParseError)
+UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyHeaderParseError, PlyParseError)
+"""What the parser raises for files that are none, or that declare more than they hold."""
+
+_NORMAL = ("nx", "ny", "nz")
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
     """Fields: points float [n, 3], world, metres; colours uint8 [n, 3], RGB; confidence float32 [n] in [0,
-    1], or None. InputError for other shapes or a NaN among the points.
+    1], or None; normals float32 [n, 3] of unit length, 0 where not known, or None. InputError for other shapes or a NaN
+    among the points.
     """
 
     points: Float[np.ndarray, "n 3"]
     colours: UInt8[np.ndarray, "n 3"]
     confidence: Float[np.ndarray, " n"] | None = None
+    normals: Float[np.ndarray, "n 3"] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.points)
@@ -33,6 +37,8 @@ class PointCloud:
             )
         if self.confidence is not None and self.confidence.shape != (count,):
             raise InputError(f"`confidence` has shape {self.confidence.shape}; it must be [{count}]")
+        if self.normals is not None and self.normals.shape != (count, 3):
+            raise InputError(f"`normals` has shape {self.normals.shape}; it must be [{count}, 3]")
         if not np.isfinite(self.points).all():
             raise InputError("`points` has a NaN or an infinity; leave such points out")
 
@@ -43,12 +49,15 @@ class PointCloud:
         return len(self.points)
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
-        """Writes binary little-endian PLY, atomically: float32 x y z, uint8 RGB, float32 confidence."""
+        """Writes binary little-endian PLY, atomically: float32 x y z, uint8 RGB, float32 confidence, nx ny nz."""
         fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
         columns = [*self.points.T, *self.colours.T]
         if self.confidence is not None:
             fields.append(("confidence", "<f4"))
             columns.append(self.confidence)
+        if self.normals is not None:
+            fields += [(name, "<f4") for name in _NORMAL]
+            columns += [*self.normals.T]
         vertices = np.empty(len(self), dtype=fields)
         for (name, _), column in zip(fields, columns, strict=True):
             vertices[name] = column
@@ -57,8 +66,8 @@ class PointCloud:
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> "PointCloud":
-        """Reads the points, colours (black where there are none) and confidence of a PLY file; InputError for any file
-        that holds no such points.
+        """Reads the points, colours (black where there are none), confidence and normals of a PLY file; InputError for
+        any file that holds no such points.
         """
         try:
             vertices = PlyData.read(os.fspath(path))["vertex"].data
@@ -67,6 +76,8 @@ class PointCloud:
             colours = np.zeros((len(points), 3), np.uint8)
             if {"red", "green", "blue"} <= set(names):
                 colours = np.column_stack([vertices[name] for name in ("red", "green", "blue")]).astype(np.uint8)
-            return cls(points, colours, np.array(vertices["confidence"]) if "confidence" in names else None)
-        except _UNREADABLE as error:
+            confidence = np.array(vertices["confidence"]) if "confidence" in names else None
+            normals = np.column_stack([vertices[name] for name in _NORMAL]) if set(_NORMAL) <= set(names) else None
+            return cls(points, colours, confidence, normals)
+        except UNREADABLE as error:
             raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY point cloud: {error}") from None

@@ -84,7 +84,9 @@ def _hub_client() -> tuple[Any, Any, type[Exception]]:
         import huggingface_hub
         from huggingface_hub.file_download import http_get
     except ImportError:
-        raise InputError("fetching needs the package huggingface-hub; install it: pip install vggtgeo[fetch]") from None
+        raise InputError(
+            "fetching needs the package huggingface-hub, which is not installed: `pip install huggingface-hub`"
+        ) from None
     # The client lets the errors of its HTTP library through, and which library that is depends on its version.
     library = type(huggingface_hub.get_session()).__module__.split(".")[0]
     return huggingface_hub, http_get, sys.modules[library].HTTPError

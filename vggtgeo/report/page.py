@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jinja2
 import numpy as np
@@ -15,14 +15,15 @@ from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
+from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.keyframe_depth import optimised_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.window_recorder import WindowRecord
 
+_Value = TypeVar("_Value")
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""
 VERDICT_LINES = {
@@ -68,6 +69,7 @@ def write_page(
     title: str,
     truth: Trajectory | None,
     cloud: PointCloud,
+    depth_maps: Sequence[DepthMap | None],
     records: Sequence[WindowRecord],
     summary: Mapping[str, Any],
     verdict: Verdict,
@@ -81,6 +83,7 @@ def write_page(
         title: of the page.
         truth: camera -> world, drawn beside the estimate where it is known.
         cloud: the map.
+        depth_maps: dense depth of each keyframe.
         records: one an adjustment of the window, in order.
         summary: what `summary.json` holds.
         verdict: how far the result can be trusted; the first thing on the page.
@@ -88,7 +91,8 @@ def write_page(
 
     """
     trajectory = frame_trajectory(slam)
-    low, high = _depth_range(slam)
+    chosen = _spread(list(zip(slam.keyframes, depth_maps, strict=True)), SAMPLES)
+    low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
     text = template("vggtgeo.report", "page.html.j2").render(
         style=style(),
         title=title,
@@ -105,7 +109,7 @@ def write_page(
         residuals=figures.residuals_svg(records) if records else None,
         map_above=_map_picture(map_view.from_above, cloud, trajectory),
         map_inside=_map_picture(map_view.walk_in, cloud, trajectory),
-        samples=[_sample(keyframe, low, high) for keyframe in _spread(slam.keyframes, SAMPLES)],
+        samples=[_sample(keyframe, depth_map, low, high) for keyframe, depth_map in chosen],
         depth_range=(low, high) if np.isfinite(low) else None,
         stages=_stages(summary["seconds_by_stage"]),
         total=summary["seconds_by_stage"].get("all"),
@@ -186,26 +190,27 @@ def _stages(seconds: Mapping[str, float]) -> list[Stage]:
     return [Stage(name, value, value / longest) for name, value in sorted(shown.items(), key=lambda item: -item[1])]
 
 
-def _spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
-    rows = np.unique(np.linspace(0, len(keyframes) - 1, min(count, len(keyframes))).round().astype(int))
-    return [keyframes[row] for row in rows]
+def _spread(values: Sequence[_Value], count: int) -> list[_Value]:
+    rows = np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int))
+    return [values[row] for row in rows]
 
 
-def _depth_range(slam: Slam) -> tuple[float, float]:
+def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
     """The 2nd and 98th percentile of the depth in the samples, metres; NaN where there is none."""
-    depths = [keyframe.depth[::8, ::8].astype(np.float32) for keyframe in _spread(slam.keyframes, SAMPLES)]
-    known = np.concatenate([depth[np.isfinite(depth)] for depth in depths])
+    depths = [depth_map.depth[::8, ::8] for depth_map in depth_maps]
+    known = np.concatenate([np.zeros(0, np.float32), *(depth[np.isfinite(depth)] for depth in depths)])
     if not len(known):
         return float("nan"), float("nan")
     return float(np.quantile(known, 0.02)), float(np.quantile(known, 0.98))
 
 
-def _sample(keyframe: Keyframe, low: float, high: float) -> Sample:
+def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: float) -> Sample:
     image = figures.picture(keyframe.image, _SAMPLE_WIDTH)
     depth = confidence = None
-    if np.isfinite(keyframe.depth).any():
-        depth = figures.picture(figures.depth_colours(optimised_depth(keyframe), low, high), _SAMPLE_WIDTH)
-        confidence = figures.picture(figures.confidence_colours(keyframe.depth_confidence), _SAMPLE_WIDTH)
+    if depth_map is not None and np.isfinite(low):
+        depth = figures.picture(figures.depth_colours(depth_map.depth, low, high), _SAMPLE_WIDTH)
+        shades = np.rint(255 * depth_map.confidence).astype(np.uint8)
+        confidence = figures.picture(figures.confidence_colours(shades), _SAMPLE_WIDTH)
     return Sample(f"frame {keyframe.frame}, {keyframe.timestamp:.2f} s", image, depth, confidence)
 
 

@@ -13,6 +13,7 @@ import tomli_w
 
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.io.files import atomic_open, write_text
+from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -35,7 +36,11 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
     """`trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world.
 
     Of a map in pieces they hold the one of most frames, `trajectory-2.txt` and `keyframes-2.txt` the next, and so on.
+    Those of pieces that have been joined since they were last written are taken away.
     """
+    for name in ("trajectory", "keyframes"):
+        for old in folder.glob(f"{name}-[0-9]*.txt"):
+            old.unlink()
     for piece in range(max(len(pieces_by_size(slam)), 1)):
         frame_trajectory(slam, piece).save_tum(folder / piece_file("trajectory", piece))
         keyframe_trajectory(slam, piece).save_tum(folder / piece_file("keyframes", piece))
@@ -47,29 +52,27 @@ def piece_file(name: str, piece: int) -> str:
 
 
 def write_depth(
-    folder: Path, keyframes: Sequence[Keyframe], depths: Sequence[np.ndarray | None], metric: bool = True
+    folder: Path, keyframes: Sequence[Keyframe], depth_maps: Sequence[DepthMap | None], metric: bool = True
 ) -> None:
-    """The keyframes' `fused_depths` as `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none), beside each
+    """The keyframes' dense depth as `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = none), beside each
     `depth/NNNNNN.confidence.png` (8 bit), and `depth/README.txt`, which says so.
 
     A keyframe without any depth has no files; where none has any there is no folder, and a warning.
     """
-    written = [(keyframe, depth) for keyframe, depth in zip(keyframes, depths, strict=True) if _any(depth)]
+    pairs = zip(keyframes, depth_maps, strict=True)
+    written = [(keyframe, depth_map) for keyframe, depth_map in pairs if depth_map is not None and not depth_map.empty]
     if not written:
         warnings.warn("no keyframe has dense depth: there is none to save", InputWarning, stacklevel=3)
         return
     write_text(folder / "depth" / "README.txt", DEPTH_NOTE + (METRES if metric else NO_METRES))
-    for keyframe, depth in written:
-        counts = np.rint(np.nan_to_num(depth) * DEPTH_UNIT)
+    for keyframe, depth_map in written:
+        counts = np.rint(np.nan_to_num(depth_map.depth) * DEPTH_UNIT)
         counts = np.where(counts <= MOST_COUNTS, counts, 0).astype(np.uint16)  # farther than 13.1 m: none, not 13.1 m
-        for name, image in (("depth", counts), ("confidence", keyframe.depth_confidence)):
+        confidence = np.rint(255 * depth_map.confidence).astype(np.uint8)
+        for name, image in (("depth", counts), ("confidence", confidence)):
             # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
             with atomic_open(folder / "depth" / f"{keyframe.frame:06d}.{name}.png", "wb") as file:
                 file.write(cv2.imencode(".png", image)[1].tobytes())
-
-
-def _any(depth: np.ndarray | None) -> bool:
-    return depth is not None and bool((np.nan_to_num(depth) > 0).any())
 
 
 def write_settings(path: Path, values: Mapping[str, Any]) -> None:

@@ -22,14 +22,13 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.warned import collected_warnings
+from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.connected import main_piece
-from vggtgeo.slam.dense import map_points
-from vggtgeo.slam.keyframe_depth import fused_depths
+from vggtgeo.slam.compile_ahead import CompileAhead
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import default_roles, finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -55,6 +54,7 @@ def reconstruct(
     end: int | None = None,
     stride: int = 1,
     seed: int = 0,
+    dense: str = "auto",
     title: str | None = None,
     callbacks: Iterable[Callback] = (),
     facts: Mapping[str, Any] | None = None,
@@ -76,6 +76,7 @@ def reconstruct(
         end: frame to stop before.
         stride: take every n-th frame.
         seed: of OpenCV's random choices, a global setting of that package.
+        dense: whose depth the map is made of: auto, mvs, sensor, network or none (`vggtgeo/mapping/dense.py`).
         title: of the report; by default the name of the sequence.
         callbacks: called with every frame.
         facts: what the summary shall say besides.
@@ -98,8 +99,9 @@ def reconstruct(
         source = _opened(frames, camera)
         source.check(start, end, stride)
         perception = _perception(roles, source.has_depth)
+        check_dense(dense, perception.roles.metric)
         windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
-        hooks = _Callbacks((windows, evidence, *callbacks), clock)
+        hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
         tracked = _track(source, (start, end, stride), perception.roles, settings, hooks, stop)
@@ -113,7 +115,7 @@ def reconstruct(
         }
         notices = (*warned, *collected)
         ending = _Ending(
-            slam, source.truth, report, notices, perception.refusals, title or source.name, known, clock, began
+            slam, source.truth, report, notices, perception.refusals, title or source.name, known, clock, began, dense
         )
         return _concluded(ending, settings, hooks, windows.records, evidence)
 
@@ -131,6 +133,7 @@ class _Ending:
     facts: Mapping[str, Any]
     clock: Clock
     began: float
+    dense: str
 
 
 def _concluded(
@@ -138,11 +141,11 @@ def _concluded(
 ) -> Result:
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
+    hooks.each("on_stage", "dense map")
     with clock.measure("dense map"):
-        depths = tuple(fused_depths(slam.keyframes, slam.intrinsics))
-        keyframes, own_depths = main_piece(slam, depths)
-        cloud = map_points(keyframes, slam.intrinsics, own_depths)
-    hooks.each("on_finish", slam, cloud)
+        built = dense_map(slam, run.dense)
+    hooks.each("on_finish", slam, built.cloud)
+    hooks.each("on_stage", "verdict")
     with clock.measure("verdict"):
         left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
         verdict = judge(slam, evidence.frames, left_out)
@@ -152,13 +155,12 @@ def _concluded(
         settings=changed(settings),
         seconds={**clock.seconds, "all": time.perf_counter() - run.began},
         report=run.report,
-        map_points=len(cloud),
+        map_points=len(built.cloud),
+        dense=run.dense,
         **run.facts,
     )
     notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
-    return Result.assemble(
-        RunRecord(slam, depths, tuple(windows), run.truth, notices, run.title), cloud, verdict, summary
-    )
+    return Result.assemble(RunRecord(slam, built, tuple(windows), run.truth, notices, run.title), verdict, summary)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +232,7 @@ class _Callbacks:
 
     def warm_up(self, settings: SlamSettings, roles: Roles) -> None:
         """Compile what every window needs, and what the callbacks make of windows."""
+        self.each("on_stage", "compiling")
         compiled = warm_up(settings, roles.metric)
         for member in self.members:
             member.on_warm_up(*compiled)
@@ -289,6 +292,7 @@ def _adjust(
     hooks.each("on_adjust", tracked.slam)
     if tracked.interrupted:
         return tracked.slam, True
+    hooks.each("on_stage", "last adjustment")
     try:
         with stop.at_once():
             return finish(tracked.slam, roles, settings, hooks.clock), False

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import json
 import os
+import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
 from vggtgeo.figures.result_figure import result_figure
+from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
+from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
 from vggtgeo.results.files import write_depth, write_settings, write_trajectories
 from vggtgeo.results.run_folder import RunFolder, check_finished, taken
-from vggtgeo.results.summary import compare, summarise
-from vggtgeo.slam.connected import main_piece
-from vggtgeo.slam.dense import map_points
-from vggtgeo.slam.keyframe_depth import fused_depths
+from vggtgeo.results.scene import write_scene
+from vggtgeo.results.summary import compare, summarise, with_writing
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import Evidence
@@ -38,13 +37,13 @@ from vggtgeo.slam.window_recorder import WindowRecord
 class RunRecord:
     """What a result is made of, as long as it is in memory; the page and the depth images are drawn from it.
 
-    slam: the last state. depths: the keyframes' dense depth after adjustment, metres, NaN or None where there is none.
+    slam: the last state. dense: the dense map after adjustment.
     windows: one an adjustment of the window. truth: camera -> world, where it is known. warnings: about the input, and
     about the weights of networks. title: of the run.
     """
 
     slam: Slam
-    depths: tuple[np.ndarray | None, ...]
+    dense: DenseMap
     windows: tuple[WindowRecord, ...] = ()
     truth: Trajectory | None = None
     warnings: tuple[str, ...] = ()
@@ -64,6 +63,7 @@ class Result:
         verdict: how far all this can be trusted, by segment of time.
         summary: counts, times and settings, as `summary.json` has them.
         record: what it was made of; None for a result that was read from a folder.
+        saved_mesh: the surface that was read from a folder, if there was one.
 
     Example:
         >>> import vggtgeo as vg
@@ -81,26 +81,32 @@ class Result:
     verdict: Verdict
     summary: Mapping[str, Any] = field(default_factory=dict)
     record: RunRecord | None = None
+    saved_mesh: Mesh | None = None
+
+    @property
+    def mesh(self) -> Mesh | None:
+        """The map's surface, world frame; None where there is no dense depth. It is made when first asked for."""
+        return self.saved_mesh if self.record is None else self.record.dense.mesh
 
     @classmethod
-    def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None) -> Self:
+    def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
         """The result of a state: the last one that `vggtgeo.run` gave, or what `vggtgeo.finish` made of it.
 
         evidence: what an `EvidenceRecorder` noted of all frames; without it the verdict rests on the run's own record.
-        truth: camera -> world, where it is known.
+        truth: camera -> world, where it is known. dense: whose depth the map is made of, as of `vggtgeo.reconstruct`.
         """
-        verdict, depths = judge(slam, evidence), tuple(fused_depths(slam.keyframes, slam.intrinsics))
-        keyframes, own_depths = main_piece(slam, depths)
-        cloud = map_points(keyframes, slam.intrinsics, own_depths)
-        summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=len(cloud))
-        return cls.assemble(RunRecord(slam, depths, truth=truth), cloud, verdict, summary)
+        verdict, built = judge(slam, evidence), dense_map(slam, dense)
+        count = len(built.cloud)
+        summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=count)
+        return cls.assemble(RunRecord(slam, built, truth=truth), verdict, summary)
 
     @classmethod
-    def assemble(cls, record: RunRecord, cloud: PointCloud, verdict: Verdict, summary: Mapping[str, Any]) -> Self:
+    def assemble(cls, record: RunRecord, verdict: Verdict, summary: Mapping[str, Any]) -> Self:
         """The result of parts that are there already."""
         slam = record.slam
         fx, fy, cx, cy = (float(value) for value in slam.intrinsics)
         poses = frame_trajectory(slam), keyframe_trajectory(slam)
+        cloud = record.dense.cloud
         return cls(*poses, cloud, (fx, fy, cx, cy), verdict.metric, verdict, summary, record)
 
     @classmethod
@@ -126,6 +132,7 @@ class Result:
             metric,
             verdict,
             summary,
+            saved_mesh=Mesh.load_ply(place / "mesh.ply") if (place / "mesh.ply").is_file() else None,
         )
 
     def save(
@@ -134,9 +141,10 @@ class Result:
         *,
         depth: bool = False,
         settings: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `trajectory.png`, `report.html`,
-        `summary.json` and `settings.toml`; `vggtgeo.read` reads it. They are written beside and take their places
+    ) -> dict[str, Any]:
+        """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (where there is dense
+        depth), `images/`, `scene.npz`, `trajectory.png`, `report.html`, `summary.json` and `settings.toml`;
+        `vggtgeo.read` reads it. They are written beside and take their places
         together; what an earlier run left there is replaced as a whole.
 
         A result that was read from a folder has neither images nor windows, so it is saved without page and depth.
@@ -146,19 +154,25 @@ class Result:
             depth: write each keyframe's dense depth and confidence as well.
             settings: flags of the command line that tell how the run was made, beside the pipeline's own settings.
 
+        Returns:
+            What `summary.json` holds: the summary, and of a run how long it took with all its files.
+
         Raises:
             InputError: `depth` is asked of a result that was read from a folder, or the folder cannot be written, is
                 in use by a run, or holds a sequence of images.
 
         """
         with taken(folder) as place:
-            self.save_into(place, depth=depth, settings=settings)
+            return self.save_into(place, depth=depth, settings=settings)
 
-    def save_into(self, run: RunFolder, *, depth: bool = False, settings: Mapping[str, Any] | None = None) -> None:
+    def save_into(
+        self, run: RunFolder, *, depth: bool = False, settings: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """The same, into a folder that is taken already."""
         place = run.stage
         if depth and self.record is None:
             raise InputError("`depth` needs a result that is still in memory; this one was read from a folder")
+        began = time.perf_counter()
         run.release_reserve()
         used = {**(settings or {}), **self.summary.get("settings", {})}
         flags = {name.replace("_", "-"): value for name, value in used.items()}
@@ -170,11 +184,18 @@ class Result:
             self.trajectory.save_tum(place / "trajectory.txt")
             self.keyframes.save_tum(place / "keyframes.txt")
         self.cloud.save_ply(place / "map.ply")
-        write_json(place / "summary.json", plain)
+        if self.mesh is not None:
+            self.mesh.save_ply(place / "mesh.ply")
         self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
+        if self.record is not None:
+            write_scene(place, self.record.slam)
         if depth and self.record is not None:
-            write_depth(place, self.record.slam.keyframes, self.record.depths, self.record.slam.metric)
+            write_depth(place, self.record.slam.keyframes, self.record.dense.depth_maps, self.record.slam.metric)
+        if self.record is not None:
+            plain = with_writing(plain, time.perf_counter() - began)
+        write_json(place / "summary.json", plain)
         run.publish()
+        return plain
 
     def _draw(self, place: Path, name: str, summary: Mapping[str, Any]) -> None:
         record = self.record
@@ -194,6 +215,7 @@ class Result:
                 title=record.title,
                 truth=record.truth,
                 cloud=self.cloud,
+                depth_maps=record.dense.depth_maps,
                 records=record.windows,
                 summary=summary,
                 verdict=self.verdict,

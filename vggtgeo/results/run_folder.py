@@ -36,6 +36,9 @@ NAMES = (
     "keyframes.txt",
     "keyframes-[0-9]*.txt",
     "map.ply",
+    "mesh.ply",
+    "scene.npz",
+    "images",
     "trajectory.png",
     "report.html",
     "depth",
@@ -43,9 +46,9 @@ NAMES = (
     "view.rrd",
 )
 """All that a run may leave, as patterns, in the order in which what is old is taken away."""
-RESERVE = 32 * 2**20
-"""Bytes that must be free before the first frame, and are held until the results are written: a map of 300,000 points,
-page and trajectories of 10,000 frames take less than 20 MB."""
+RESERVE = 96 * 2**20
+"""Bytes that must be free before the first frame, and are held until the results are written: a map of 500,000 points
+(14 MB), a mesh of a million faces (30 MB), 200 pictures (20 MB), page and trajectories of 10,000 frames (10 MB)."""
 
 _LOCK = ".lock"
 _NOTE = "README.txt"

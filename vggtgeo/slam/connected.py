@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.slam.factors import MeasuredRotation
-from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-
-Depth = np.ndarray | None
 
 
 def piece_of(slam: Slam) -> np.ndarray:
@@ -38,10 +33,3 @@ def pieces_by_size(slam: Slam) -> tuple[tuple[int, ...], ...]:
     hanging = np.bincount(label[[r.reference for r in slam.frames if r.tracked]], minlength=label.max(initial=-1) + 1)
     order = np.argsort(-hanging, kind="stable")
     return tuple(tuple(int(number) for number in np.nonzero(label == piece)[0]) for piece in order)
-
-
-def main_piece(slam: Slam, depths: Sequence[Depth]) -> tuple[tuple[Keyframe, ...], tuple[Depth, ...]]:
-    """Keyframes of the piece that most frames hang on, and those of `depths`, one a keyframe: what one map can show."""
-    own = pieces_by_size(slam)[:1]
-    numbers = own[0] if own else ()
-    return tuple(slam.keyframes[number] for number in numbers), tuple(depths[number] for number in numbers)

@@ -64,14 +64,12 @@ def drawn_to(found: Motion, prior: Motion) -> Motion:
     return Motion(rigid.exponential(step) @ found.motion, found.information)
 
 
-def lines_wanted(found: Motion | None, prior: Motion | None) -> bool:
+def wanting(found: Motion) -> bool:
     """Whether, in some direction, a motion is known worse than to within what no number of samples removes.
 
-    Elsewhere lines change nothing that could be measured, and finding them costs as much as the alignment. Without any
-    motion to start from, measured or expected, they are of no use.
+    Elsewhere neither lines nor the points of other keyframes change anything for the better (docs/lines.md), and
+    finding lines costs as much as the alignment.
     """
-    if found is None:
-        return prior is not None
     floor = _floor(found.motion)
     return bool(np.linalg.eigvalsh(found.information * np.outer(floor, floor))[0] < 1.0)
 

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -45,11 +45,48 @@ from vggtgeo.models.roles import PointMatcher
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.slam.settings import Roles
 
-NEEDED = {
-    "classical": (),
-    "light": ("dinov3-small", "moge2-small", "mlsd"),
-    "paper": ("vggt", "dinov3", "moge2", "letr", "mast3r_encoder", "mast3r_decoder"),
+PRESETS: dict[str, dict[str, str]] = {
+    "classical": {},
+    "light": {
+        "line_matches": "dinov3-small",
+        "confidence": "dinov3-small",
+        "depth": "moge2-small",
+        "lines": "mlsd",
+    },
+    "paper": {
+        "geometry": "vggt",
+        "line_matches": "dinov3",
+        "confidence": "dinov3",
+        "depth": "moge2",
+        "lines": "letr",
+        "points": "mast3r",
+    },
 }
+"""The networks of each preset, by role."""
+CHOICES: dict[str, tuple[str, ...]] = {
+    "points": ("classical", "mast3r"),
+    "lines": ("classical", "mlsd", "letr"),
+    "depth": ("classical", "moge2-small", "moge2"),
+}
+"""Who may play a role apart from its preset, beside the roles that the caller has (`classical`)."""
+_FILES = {"mast3r": ("mast3r_encoder", "mast3r_decoder")}
+"""The registry's names of what is more than one file."""
+_BOUNDED: dict[str, Callable[[Any], Any]] = {
+    "points": BoundedPoints,
+    "lines": BoundedLines,
+    "line_matches": BoundedLineMatcher,
+    "depth": BoundedDepth,
+    "confidence": BoundedConfidence,
+}
+"""What checks the answers of a network in each role."""
+
+
+def _files(roles: Mapping[str, str]) -> tuple[str, ...]:
+    """The registry's names of the networks of some roles, each once."""
+    return tuple(dict.fromkeys(file for name in roles.values() for file in _FILES.get(name, (name,))))
+
+
+NEEDED = {preset: _files(roles) for preset, roles in PRESETS.items()}
 """The networks of each preset, by their names in the registry."""
 _FEATURES: dict[str, Callable[[], PointMatcher]] = {"sift": SiftMatcher, "orb": OrbMatcher}
 
@@ -116,6 +153,7 @@ def perception(
     cache: Path | None = None,
     provider: Provider = "auto",
     memory_limit_gb: float | None = None,
+    mixed: Mapping[str, str] | None = None,
 ) -> Perception:
     """The role objects of a preset, for `vggtgeo.reconstruct`; every file is opened, checked and warmed up here.
 
@@ -126,6 +164,7 @@ def perception(
         cache: folder for what the networks answer; by default nothing is kept beyond the run.
         provider: where networks run: auto, cuda or cpu.
         memory_limit_gb: most GPU memory of each network.
+        mixed: who plays a role in place of the preset's choice, by role, as `CHOICES` lists: `{"lines": "mlsd"}`.
 
     Raises:
         InputError: an unknown preset, a missing file, or a wrong one.
@@ -137,14 +176,13 @@ def perception(
 
     """
     classical = classical or Roles()
-    if preset not in NEEDED:
-        raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(NEEDED)}")
-    if not NEEDED[preset]:
+    parts = _parts(preset, mixed or {})
+    if not parts:
         return Perception(classical, {})
-    place = networks_folder(folder)
-    _check_present(preset, place)
+    needed, place = _files(parts), networks_folder(folder)
+    _check_present(needed, place)
     with as_input_errors():
-        for name in NEEDED[preset]:
+        for name in needed:
             check_looks_like_onnx(place / NETWORKS[name].file)  # before gigabytes of others are read
         networks = {
             name: open_session(
@@ -153,55 +191,63 @@ def perception(
                 provider=provider,
                 memory_limit_gb=memory_limit_gb,
             )
-            for name in NEEDED[preset]
+            for name in needed
         }
-        build = _paper if preset == "paper" else _light
-        roles, refusals = build(classical, networks, cache)
+        players, refusals = _players(parts, classical, networks, cache)
         for session in networks.values():
             session.warm_up()
-    return Perception(roles, networks, refusals)
+    return Perception(replace(classical, **players), networks, refusals)
 
 
-Built = tuple[Roles, dict[str, Refusals]]
+def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
+    """The network of each role that one plays."""
+    if preset not in PRESETS:
+        raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(PRESETS)}")
+    for role, name in mixed.items():
+        if name not in CHOICES.get(role, ()):
+            known = "; ".join(f"{role}: {', '.join(names)}" for role, names in CHOICES.items())
+            raise InputError(f"`{role}` is {name!r}; what can be mixed is {known}")
+    parts = {**PRESETS[preset], **mixed}
+    return {role: name for role, name in parts.items() if name != "classical"}
 
 
-def _light(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Built:
-    features = DinoFeatures(networks["dinov3-small"], _cache(cache))
-    lines = BoundedLines(MlsdDetector(networks["mlsd"], _cache(cache)))
-    depth = BoundedDepth(MogeDepth(networks["moge2-small"], _cache(cache)))
-    confidence = BoundedConfidence(features)
-    roles = replace(classical, lines=lines, line_matches=DenseLineMatcher(features), depth=depth, confidence=confidence)
-    return roles, {"depth": depth.refusals, "lines": lines.refusals, "confidence": confidence.refusals}
-
-
-def _paper(classical: Roles, networks: Mapping[str, Session], cache: Path | None) -> Built:
-    features = DinoFeatures(networks["dinov3"], _cache(cache))
-    model = _check_views(VggtWindow(networks["vggt"], _cache(cache)))
-    window = BoundedWindow(model)
-    points = BoundedPoints(Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache)))
-    lines = BoundedLines(LetrDetector(networks["letr"], _cache(cache)))
-    depth = BoundedDepth(MogeDepth(networks["moge2"], _cache(cache)))
-    confidence, pairs = BoundedConfidence(features), BoundedLineMatcher(DenseLineMatcher(features))
-    bounded: dict[str, Any] = {
-        "points": points,
-        "lines": lines,
-        "line_matches": pairs,
-        "depth": depth,
-        "confidence": confidence,
+def _players(
+    parts: Mapping[str, str], classical: Roles, networks: Mapping[str, Session], cache: Path | None
+) -> tuple[dict[str, Any], dict[str, Refusals]]:
+    """The role objects of the networks, and what each refuses. One network in two roles answers both from one call."""
+    features = {
+        name: DinoFeatures(networks[name], _cache(cache)) for name in parts.values() if name.startswith("dinov3")
     }
-    roles = Roles(**bounded, geometry=WindowLocator(window, classical.geometry, views=model.views))
-    return roles, {role: part.refusals for role, part in {**bounded, "geometry": window}.items()}
+
+    def player(role: str, name: str) -> Any:
+        if name in features:
+            return DenseLineMatcher(features[name]) if role == "line_matches" else features[name]
+        if name == "mast3r":
+            return Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache))
+        kind: Any = {"mlsd": MlsdDetector, "letr": LetrDetector}.get(name, MogeDepth)
+        return kind(networks[name], _cache(cache))
+
+    bounded = {role: _BOUNDED[role](player(role, name)) for role, name in parts.items() if role in _BOUNDED}
+    refusals = {role: part.refusals for role, part in bounded.items()}
+    if "geometry" in parts:
+        model = _check_views(VggtWindow(networks[parts["geometry"]], _cache(cache)))
+        window = BoundedWindow(model)
+        bounded["geometry"] = WindowLocator(window, classical.geometry, views=model.views)
+        refusals["geometry"] = window.refusals
+    if {"points", "geometry"} & parts.keys():  # these ask for every frame's own points
+        bounded["flow"] = None
+    return bounded, refusals
 
 
 def _cache(folder: Path | None) -> OutputCache:
     return MemoryCache() if folder is None else FolderCache(folder)
 
 
-def _check_present(preset: str, place: Path) -> None:
-    missing = [NETWORKS[name].file for name in NEEDED[preset] if not (place / NETWORKS[name].file).is_file()]
+def _check_present(needed: Sequence[str], place: Path) -> None:
+    missing = [NETWORKS[name].file for name in needed if not (place / NETWORKS[name].file).is_file()]
     if missing:
         raise InputError(
-            f"`preset` {preset!r} needs {', '.join(missing)} in `{place}`, found no such "
+            f"what was chosen needs {', '.join(missing)} in `{place}`, found no such "
             f"{'files' if len(missing) > 1 else 'file'}; `vggtgeo models list` tells how to get each"
         )
 

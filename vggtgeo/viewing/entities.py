@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.covisibility import Pair
@@ -157,6 +158,19 @@ def log_points(stream: Any, keyframes: list[Keyframe], intrinsics: np.ndarray) -
         columns, rows = np.rint(keyframe.points.pixels[known]).astype(int).T
         colours.append(keyframe.image[rows, columns])
     stream.log("world/points", rr.Points3D(np.concatenate(points), colors=np.concatenate(colours), radii=-1.5))
+
+
+def log_mesh(stream: Any, mesh: Mesh) -> None:
+    """The map's surface; at all times."""
+    import rerun as rr
+
+    shape = rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=mesh.normals,
+        vertex_colors=mesh.colours,
+    )
+    stream.log("world/mesh", shape, static=True)
 
 
 def log_map(stream: Any, cloud: PointCloud) -> None:

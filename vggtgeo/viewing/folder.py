@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -43,7 +44,7 @@ def recording_of(folder: Path) -> Path | None:
 
 
 def log_folder(stream: Any, folder: Path) -> None:
-    """Path, keyframes and map, and each keyframe's depth and confidence where the run saved them.
+    """Path, keyframes, map and mesh, and each keyframe's depth and confidence where the run saved them.
 
     Raises:
         InputError: `folder` has no `trajectory.txt`, `keyframes.txt` or `map.ply`.
@@ -57,6 +58,8 @@ def log_folder(stream: Any, folder: Path) -> None:
     stream.set_time("frame", sequence=0)
     entities.log_path(stream, trajectory, Trajectory.load_tum(folder / "keyframes.txt"))
     entities.log_map(stream, PointCloud.load_ply(folder / "map.ply"))
+    if (folder / "mesh.ply").is_file():
+        entities.log_mesh(stream, Mesh.load_ply(folder / "mesh.ply"))
     for file in sorted(folder.glob("depth/*.depth.png")):
         _log_depth(stream, file)
     flush(stream)

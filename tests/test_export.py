@@ -1,0 +1,190 @@
+"""Files for other programs: read back by the programs' own packages, and reprojected."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recorded_run import recorded_run
+from scipy.spatial.transform import Rotation
+from test_stereo import keyframe_of, slots_of
+from typer.testing import CliRunner
+from vggtgeo.models.roles import LineMatches, PointMatches
+
+import vggtgeo as vg
+from vggtgeo.cli.main import make_app
+from vggtgeo.export import FORMATS, export
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.mapping.tracks import make_tracks
+from vggtgeo.results.scene import Scene
+from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.keyframe import Keyframe
+
+INTRINSICS = np.array([200.0, 210.0, 79.5, 59.5])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short simulated run with depth."""
+    place = tmp_path_factory.mktemp("run") / "room"
+    vg.Result.of(recorded_run().slam).save(place, depth=True)
+    return place
+
+
+def _keyframe(number: int, pose: np.ndarray, pixels: np.ndarray) -> Keyframe:
+    image = np.full((120, 160, 3), 10 * (number + 1), np.uint8)
+    return keyframe_of(number, image, pose, slots_of(pixels, np.ones(len(pixels))), np.full((120, 160), np.nan))
+
+
+def test_tracks_join_matches_and_leave_out_what_misses() -> None:
+    # Proves that matches chained over three views are one track with the point they show, that a false match costs its
+    # observation and not the point, and that two views from one place give no point. Oracle: the points projected.
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (30, 2)), rng.uniform(2, 3, 30)])
+    poses = [np.eye(4) for _ in range(3)]
+    for number, pose in enumerate(poses):
+        pose[0, 3] = -0.2 * number
+        pose[:3, :3] = Rotation.from_rotvec([0, 0.03 * number, 0]).as_matrix()
+    pixels = [rigid.project(points, pose, INTRINSICS) for pose in poses]
+    false = pixels[2].copy()
+    false[:5] += 15.0
+    keyframes = [
+        _keyframe(i, pose, seen) for i, (pose, seen) in enumerate(zip(poses, (*pixels[:2], false), strict=True))
+    ]
+    rows, none = np.arange(30), np.zeros(0, int)
+    pairs = [
+        Pair(i, i + 1, PointMatches(rows, rows, keyframes[i].features.pixels, keyframes[i + 1].features.pixels,
+        np.ones(30)),
+             LineMatches(none, none, np.zeros(0)))
+        for i in range(2)
+    ]  # fmt: skip
+    tracks = make_tracks(keyframes, pairs, INTRINSICS)
+    assert len(tracks) == 30
+    assert len(tracks.point) == 3 * 30 - 5
+    order = np.argsort(tracks.points[:, 0])
+    np.testing.assert_allclose(tracks.points[order], points[np.argsort(points[:, 0])], atol=2e-3)
+    assert tracks.mean_error(np.array(poses), INTRINSICS) < 0.05
+    assert set(tracks.colours.ravel()) == {10}
+    still = [_keyframe(i, np.eye(4), pixels[0]) for i in range(3)]
+    assert len(make_tracks(still, pairs, INTRINSICS)) == 0
+    assert len(make_tracks(keyframes, [], INTRINSICS)) == 0
+
+
+def test_colmap_reads_the_model_and_finds_the_error_that_is_stated(folder: Path, tmp_path: Path) -> None:
+    # Proves the layout, the half pixel, the poses and the tracks: COLMAP's own reprojection error is the stated one.
+    # Oracle: pycolmap.
+    pycolmap = pytest.importorskip("pycolmap")
+    stated = export(folder, "colmap", tmp_path)
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    scene = Scene.load(folder)
+    assert model.num_images() == len(scene.frames) == stated["images"]
+    assert model.num_points3D() == len(scene.tracks) == stated["points"]
+    assert stated["points"] > 50
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() == pytest.approx(stated["mean_reprojection_error_px"], abs=1e-3)
+    assert 0.01 < stated["mean_reprojection_error_px"] < 2.0
+    for image in model.images.values():
+        assert cv2.imread(str(tmp_path / "images" / image.name)).shape[:2] == scene.size[::-1]
+
+
+def test_the_model_s_bytes_are_those_of_the_format(folder: Path, tmp_path: Path) -> None:
+    # Proves camera, first image and the points' tracks without COLMAP. Oracle: the format's description, read by hand.
+    export(folder, "colmap", tmp_path)
+    scene = Scene.load(folder)
+    camera = struct.unpack("<QiiQQ4d", (tmp_path / "sparse/0/cameras.bin").read_bytes())
+    assert camera[:5] == (1, 1, 1, *scene.size)
+    np.testing.assert_allclose(camera[5:], scene.intrinsics + [0, 0, 0.5, 0.5])
+    raw = (tmp_path / "sparse/0/images.bin").read_bytes()
+    count, number, *pose, camera_id = struct.unpack_from("<Qi7di", raw)
+    assert (count, number, camera_id) == (len(scene.frames), 1, 1)
+    np.testing.assert_allclose(Rotation.from_quat(pose[:4], scalar_first=True).as_matrix(), scene.poses[0, :3, :3])
+    np.testing.assert_allclose(pose[4:], scene.poses[0, :3, 3])
+
+
+def test_nerfstudio_s_poses_and_depth_are_those_of_the_run(folder: Path, tmp_path: Path) -> None:
+    # Proves axes, half pixel and depth unit: a pixel carried to the world by the written pose and depth is the one that
+    # the run's own pose and depth give. Oracle: the run's folder.
+    counts = export(folder, "nerfstudio", tmp_path)
+    written, scene = json.loads((tmp_path / "transforms.json").read_text()), Scene.load(folder)
+    assert counts["depth_images"] == len(scene.frames) == len(written["frames"])
+    row, column = 120, 200
+    for view, frame in enumerate(written["frames"]):
+        depth = cv2.imread(str(tmp_path / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)[row, column] / 1000
+        if not depth:
+            continue
+        assert cv2.imread(str(tmp_path / frame["mask_path"]), cv2.IMREAD_UNCHANGED)[row, column] == 255
+        x, y = (column + 0.5 - written["cx"]) / written["fl_x"], (row + 0.5 - written["cy"]) / written["fl_y"]
+        found = np.array(frame["transform_matrix"]) @ [x * depth, -y * depth, -depth, 1.0]
+        own = cv2.imread(str(folder / f"depth/{scene.frames[view]:06d}.depth.png"), cv2.IMREAD_UNCHANGED)[row, column]
+        pixel = np.array([[float(column), float(row)]])
+        expected = rigid.unproject(pixel, np.array([5000.0 / own]), scene.poses[view], scene.intrinsics)
+        np.testing.assert_allclose(found[:3], expected[0], atol=2e-3)
+    assert len(vg.Result.load(folder).cloud) > 100
+    assert (tmp_path / written["ply_file_path"]).is_file()
+
+
+def test_the_mesh_opens_elsewhere(folder: Path, tmp_path: Path) -> None:
+    # Proves that the GLB holds the run's mesh, upright. Oracle: trimesh, and the run's own PLY.
+    trimesh = pytest.importorskip("trimesh")
+    counts = export(folder, "glb", tmp_path)
+    found = trimesh.load(tmp_path / "map.glb", force="mesh")
+    mesh = Mesh.load_ply(folder / "mesh.ply")
+    assert counts == {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    assert len(found.faces) == len(mesh.faces) > 100
+    np.testing.assert_allclose(found.bounds, _bounds(mesh.vertices * [1, -1, -1]), atol=1e-5)
+
+
+def _bounds(points: np.ndarray) -> np.ndarray:
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def test_points_for_surveyors(folder: Path, tmp_path: Path) -> None:
+    # Proves places to half a millimetre and colours of the LAS file. Oracle: laspy, and the run's own cloud.
+    laspy = pytest.importorskip("laspy")
+    export(folder, "las", tmp_path)
+    found, cloud = laspy.read(tmp_path / "map.las"), vg.Result.load(folder).cloud
+    np.testing.assert_allclose(np.column_stack([found.x, found.y, found.z]), cloud.points, atol=6e-4)
+    np.testing.assert_array_equal(np.asarray(found.red) // 257, cloud.colours[:, 0])
+
+
+def test_paths_and_clouds_as_text_and_ply(folder: Path, tmp_path: Path) -> None:
+    # Proves TUM, KITTI and PLY, through the command line. Oracle: the run's own trajectory and map.
+    result = vg.Result.load(folder)
+    for name in ("tum", "kitti", "ply"):
+        done = CliRunner().invoke(
+            make_app(), ["export", str(folder), "--to", name, "-o", str(tmp_path / name), "--json"]
+        )
+        assert done.exit_code == 0, done.output
+        assert json.loads(done.stdout)["format"] == name
+    rows = np.loadtxt(tmp_path / "kitti/poses.txt").reshape(-1, 3, 4)
+    np.testing.assert_allclose(rows, result.trajectory.poses[:, :3], atol=1e-8)
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "kitti/times.txt"), result.trajectory.timestamps, atol=1e-6)
+    assert (tmp_path / "tum/trajectory.txt").read_bytes() == (folder / "trajectory.txt").read_bytes()
+    assert (tmp_path / "ply/cloud.ply").read_bytes() == (folder / "map.ply").read_bytes()
+    assert (tmp_path / "ply/mesh.ply").read_bytes() == (folder / "mesh.ply").read_bytes()
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
+    # Proves the errors of an empty folder, an unknown format, and a scene of another layout, or damaged.
+    with pytest.raises(vg.InputError, match="holds no run"):
+        export(tmp_path, "colmap")
+    with pytest.raises(vg.InputError, match="`to` is 'obj'; it must be one of colmap"):
+        export(folder, "obj")
+    assert set(FORMATS) == {"colmap", "nerfstudio", "ply", "glb", "las", "tum", "kitti"}
+    np.savez(tmp_path / "scene.npz", version=99)
+    with pytest.raises(vg.InputError, match="is of layout 99"):
+        Scene.load(tmp_path)
+    with np.load(folder / "scene.npz") as data:
+        values = dict(data)
+    for name, wrong in (("track_view", values["track_view"] + 1000), ("poses", np.zeros(3)), ("frames", np.array(3.0))):
+        np.savez(tmp_path / "scene.npz", **{**values, name: wrong})
+        with pytest.raises(vg.InputError, match="cannot be read"):
+            Scene.load(tmp_path)
+    (tmp_path / "scene.npz").write_bytes((folder / "scene.npz").read_bytes()[:100])
+    with pytest.raises(vg.InputError, match="cannot be read"):
+        Scene.load(tmp_path)

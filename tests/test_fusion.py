@@ -1,0 +1,117 @@
+"""The fused map: mesh and cloud of depth maps of a sphere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_stereo import keyframe_of, slots_of
+
+from vggtgeo.evaluation import surface_points
+from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.io.errors import InputError
+from vggtgeo.mapping.cloud import map_points
+from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.tsdf import fused_mesh
+from vggtgeo.slam.keyframe import Keyframe
+
+RADIUS, AWAY, VOXEL = 0.5, 2.0, 0.04
+INTRINSICS = np.array([200.0, 200.0, 59.5, 59.5])
+SHAPE = (120, 120)
+
+
+def sphere_views(noise: float = 0.0) -> tuple[list[Keyframe], list[DepthMap]]:
+    """Fourteen cameras around a sphere at the origin, with its exact depth but for noise."""
+    rng, keyframes, depth_maps = np.random.default_rng(0), [], []
+    x, y = np.meshgrid((np.arange(120) - 59.5) / 200, (np.arange(120) - 59.5) / 200)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    square = (rays**2).sum(-1)
+    inside = AWAY**2 - square * (AWAY**2 - RADIUS**2)
+    depth = np.where(inside > 0, (AWAY - np.sqrt(np.maximum(inside, 0))) / square, np.nan)
+    for number, turn in enumerate(_around()):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, [0, 0, AWAY]
+        image = np.full((*SHAPE, 3), [200, 100, 10 * number], np.uint8)
+        noisy = (depth + noise * rng.normal(size=SHAPE)).astype(np.float32)
+        keyframes.append(keyframe_of(number, image, pose, slots_of(np.zeros((0, 2)), np.zeros(0)), noisy))
+        known = np.isfinite(noisy)
+        sigma = np.where(known, max(noise, 0.002) / AWAY, np.nan).astype(np.float32)
+        depth_maps.append(DepthMap(noisy, sigma, known.astype(np.float32)))
+    return keyframes, depth_maps
+
+
+def _around() -> list[np.ndarray]:
+    """Rotations that bring each of the axes' six directions and the eight corners of a cube before the camera."""
+    signs = (-1.0, 1.0)
+    corners = [(x, y, z) for x in signs for y in signs for z in signs]
+    directions = [*np.eye(3), *-np.eye(3), *np.array(corners)]
+    return [Rotation.align_vectors([[0.0, 0.0, -1.0]], [direction])[0].as_matrix() for direction in directions]
+
+
+def test_the_mesh_is_the_sphere() -> None:
+    # Proves that noisy views fuse to a closed surface (each edge has two faces, also where blocks meet), within a
+    # quarter of a voxel of the truth on average, with outward normals and faces, and the colours seen. Oracle: the
+    # sphere.
+    mesh = fused_mesh(*sphere_views(noise=0.01), INTRINSICS, VOXEL)
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    assert np.abs(radius - RADIUS).mean() < 0.25 * VOXEL
+    assert np.abs(radius - RADIUS).max() < 1.5 * VOXEL
+    edges = np.sort(np.concatenate([mesh.faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))]), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    assert (count == 2).mean() > 0.995
+    outward = mesh.vertices / radius[:, None]
+    assert ((mesh.normals * outward).sum(1) > 0.7).mean() > 0.99
+    corners = mesh.vertices[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((across * corners.mean(axis=1)).sum(1) > 0).mean() > 0.99
+    assert (mesh.colours[:, 0] == 200).all()
+    found = surface_points((mesh.vertices, mesh.faces), 0.025)
+    assert np.abs(np.linalg.norm(found, axis=1) - RADIUS).mean() < 0.25 * VOXEL
+    assert np.abs(found.mean(axis=0)).max() < 0.05 * RADIUS  # even: no side has more points than another
+
+
+def test_a_small_piece_is_left_out() -> None:
+    # Proves that a false depth of a few pixels, apart from everything, makes no surface. Oracle: the mesh without it.
+    keyframes, depth_maps = sphere_views()
+    mesh = fused_mesh(keyframes, depth_maps, INTRINSICS, VOXEL)
+    false = depth_maps[0].depth.copy()
+    false[5:9, 5:9] = 1.0
+    spoilt = DepthMap(false, np.full(SHAPE, 0.001, np.float32), np.isfinite(false).astype(np.float32))
+    again = fused_mesh(keyframes, [spoilt, *depth_maps[1:]], INTRINSICS, VOXEL)
+    assert np.linalg.norm(again.vertices, axis=1).max() == pytest.approx(
+        np.linalg.norm(mesh.vertices, axis=1).max(), abs=VOXEL
+    )
+
+
+def test_the_cloud_has_outward_normals() -> None:
+    # Proves that points of the cloud lie on the sphere, with normals away from its middle. Oracle: the sphere.
+    keyframes, depth_maps = sphere_views()
+    cloud = map_points(keyframes[6:8], INTRINSICS, depth_maps[6:8], voxel=VOXEL)
+    alone = map_points(keyframes[:1], INTRINSICS, depth_maps[:1], voxel=VOXEL)
+    assert len(alone) > 100
+    assert len(cloud) > 50  # what both see
+    for found in (cloud, alone):
+        assert found.normals is not None
+        np.testing.assert_allclose(np.linalg.norm(found.points, axis=1), RADIUS, atol=0.02)
+        known = np.linalg.norm(found.normals, axis=1) > 0.5
+        assert known.mean() > 0.7
+        assert ((found.normals * found.points).sum(1)[known] > 0.8 * RADIUS).mean() > 0.95
+
+
+def test_no_depth_is_no_mesh(tmp_path: Path) -> None:
+    # Proves that without any depth there is an empty mesh, that a mesh comes back from its file, and the errors of what
+    # cannot be a mesh. Oracle: the mesh written.
+    keyframes, depth_maps = sphere_views()
+    nothing = fused_mesh(keyframes, [None] * len(keyframes), INTRINSICS, VOXEL)
+    assert len(nothing.faces) == 0
+    mesh = fused_mesh(keyframes[:1], depth_maps[:1], INTRINSICS, 2 * VOXEL)
+    mesh.save_ply(tmp_path / "mesh.ply")
+    again = Mesh.load_ply(tmp_path / "mesh.ply")
+    for name in ("vertices", "faces", "normals", "colours"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(mesh, name))
+    with pytest.raises(InputError, match="`voxel` is 0"):
+        fused_mesh(keyframes, depth_maps, INTRINSICS, 0.0)
+    with pytest.raises(InputError, match="`faces` names vertex"):
+        Mesh(mesh.vertices[:2], mesh.faces, mesh.normals[:2], mesh.colours[:2])

@@ -1,0 +1,34 @@
+"""`vggtgeo export`: a finished run as files for other programs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from vggtgeo.cli.options import JsonOption, QuietOption
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that a run wrote.")],
+    to: Annotated[
+        Literal["colmap", "nerfstudio", "ply", "glb", "las", "tum", "kitti"], typer.Option(help="The format.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for the files; by default DIR/export/FORMAT.")
+    ] = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the run in DIR for another program."""
+    from vggtgeo.export import export as write
+
+    target = output or folder / "export" / to
+    written = write(folder, to, target)
+    if as_json:
+        typer.echo(json.dumps({"folder": str(target), "format": to, **written}))
+    elif not quiet:
+        counts = ", ".join(f"{value:.6g} {name.replace('_', ' ')}" for name, value in written.items())
+        typer.echo(f"{target}: {counts}")

@@ -1,0 +1,88 @@
+"""A COLMAP model: pictures, cameras, points with tracks, in the binary layout that gsplat and others read.
+
+Layout: https://colmap.github.io/format.html. COLMAP's pixel (0, 0) is the corner of the top-left pixel, ours its
+    centre:
+half a pixel is added.
+"""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.io.files import atomic_open
+from vggtgeo.results.scene import Scene
+
+PINHOLE = 1
+"""COLMAP's number of the model fx, fy, cx, cy."""
+
+
+def write_colmap(source: Path, target: Path) -> dict[str, float]:
+    """`images/` and `sparse/0/` below `target`, of the run in `source`.
+
+    Returns what was written: counts, and the mean reprojection error in pixels.
+    """
+    scene = Scene.load(source)
+    (target / "images").mkdir(parents=True, exist_ok=True)
+    for view in range(len(scene.frames)):
+        shutil.copyfile(source / "images" / scene.image_name(view), target / "images" / scene.image_name(view))
+    place_of = _places(scene)
+    model = target / "sparse" / "0"
+    for name, content in (
+        ("cameras.bin", _cameras(scene)),
+        ("images.bin", _images(scene)),
+        ("points3D.bin", _points(scene, place_of)),
+    ):
+        with atomic_open(model / name, "wb") as handle:
+            handle.write(content)
+    return {
+        "images": len(scene.frames),
+        "points": len(scene.tracks),
+        "observations": len(scene.tracks.point),
+        "mean_reprojection_error_px": scene.tracks.mean_error(scene.poses, scene.intrinsics),
+    }
+
+
+def _cameras(scene: Scene) -> bytes:
+    fx, fy, cx, cy = scene.intrinsics
+    return struct.pack("<QiiQQ4d", 1, 1, PINHOLE, *scene.size, fx, fy, cx + 0.5, cy + 0.5)
+
+
+def _places(scene: Scene) -> np.ndarray:
+    """Of each observation its place among those of its image."""
+    order = np.argsort(scene.tracks.view, kind="stable")
+    view = scene.tracks.view[order]
+    places = np.empty(len(order), np.int64)
+    places[order] = np.arange(len(order)) - np.searchsorted(view, view)
+    return places
+
+
+def _images(scene: Scene) -> bytes:
+    parts = [struct.pack("<Q", len(scene.frames))]
+    quaternions = rigid.to_quaternion(scene.poses)
+    row = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
+    for view in range(len(scene.frames)):
+        seen = scene.tracks.view == view
+        parts.append(struct.pack("<i7di", view + 1, *quaternions[view], 1))
+        parts.append(scene.image_name(view).encode() + b"\0")
+        rows = np.zeros(np.count_nonzero(seen), row)
+        rows["pixel"], rows["point"] = scene.tracks.pixel[seen] + 0.5, scene.tracks.point[seen] + 1
+        parts.append(struct.pack("<Q", len(rows)) + rows.tobytes())
+    return b"".join(parts)
+
+
+def _points(scene: Scene, place_of: np.ndarray) -> bytes:
+    tracks = scene.tracks
+    errors = tracks.errors(scene.poses, scene.intrinsics)
+    bounds = np.searchsorted(tracks.point, np.arange(len(tracks) + 1))
+    parts = [struct.pack("<Q", len(tracks))]
+    for number, (low, high) in enumerate(pairwise(bounds)):
+        head = (number + 1, *tracks.points[number], *tracks.colours[number].tolist(), float(errors[low:high].mean()))
+        seen = np.stack([tracks.view[low:high] + 1, place_of[low:high]], axis=1)
+        parts.append(struct.pack("<Q3d3BdQ", *head, high - low) + seen.astype("<i4").tobytes())
+    return b"".join(parts)

@@ -1,0 +1,47 @@
+"""The formats by name, and the one function behind `vggtgeo export`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from vggtgeo.export.colmap import write_colmap
+from vggtgeo.export.nerfstudio import write_nerfstudio
+from vggtgeo.export.paths import write_kitti, write_tum
+from vggtgeo.export.surfaces import write_glb, write_las, write_ply
+from vggtgeo.io.errors import InputError
+
+FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
+    "colmap": write_colmap,
+    "nerfstudio": write_nerfstudio,
+    "ply": write_ply,
+    "glb": write_glb,
+    "las": write_las,
+    "tum": write_tum,
+    "kitti": write_kitti,
+}
+"""Each writes below a folder what the format wants of a run's folder, and returns what was written, in numbers."""
+
+
+def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[str] | None = None) -> dict[str, float]:
+    """Writes the run in `source` for another program.
+
+    Args:
+        source: folder that `vggtgeo run` or `Result.save` wrote.
+        to: one of `FORMATS`.
+        target: folder, made where it does not exist; by default `export/` and the format's name, in `source`.
+
+    Returns:
+        What was written: counts, and for COLMAP the mean reprojection error in pixels.
+
+    Raises:
+        InputError: an unknown format, no run in `source`, or a package that is not installed.
+
+    """
+    place = Path(source)
+    if to not in FORMATS:
+        raise InputError(f"`to` is {to!r}; it must be one of {', '.join(FORMATS)}")
+    if not (place / "summary.json").is_file():
+        raise InputError(f"`{place}` holds no run (no `summary.json`); give a folder that `vggtgeo run` wrote")
+    return FORMATS[to](place, Path(target) if target is not None else place / "export" / to)

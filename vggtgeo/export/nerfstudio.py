@@ -1,0 +1,61 @@
+"""`transforms.json` with pictures, depth and points, as nerfstudio and its relatives read it.
+
+Poses are camera -> world with OpenGL's axes (x right, y up, z backward); pixel (0, 0) is the corner of the top-left
+pixel. Depth images hold thousandths of the unit in 16 bit, 0 = none (nerfstudio's own default).
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.files import atomic_path, write_json
+from vggtgeo.results.files import DEPTH_UNIT
+from vggtgeo.results.scene import Scene
+
+MILLI = 1000.0
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenCV's camera axes to OpenGL's."""
+
+
+def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
+    """`transforms.json`, `images/`, `depth/` and `masks/` (where the run saved depth), `points.ply`, below `target`.
+
+    A mask is white where the picture has a depth that other views confirm.
+    """
+    scene = Scene.load(source)
+    poses = rigid.invert(scene.poses) @ FLIP
+    frames, deep = [], 0
+    for view in range(len(scene.frames)):
+        name = scene.image_name(view)
+        (target / "images").mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source / "images" / name, target / "images" / name)
+        frame: dict[str, Any] = {"file_path": f"images/{name}", "transform_matrix": poses[view].tolist()}
+        depth = source / "depth" / f"{scene.frames[view]:06d}.depth.png"
+        if depth.is_file():
+            frame |= _depth(depth, target, f"{scene.frames[view]:06d}.png")
+            deep += 1
+        frames.append(frame)
+    PointCloud.load_ply(source / "map.ply").save_ply(target / "points.ply")
+    fx, fy, cx, cy = (float(value) for value in scene.intrinsics)
+    camera = {"camera_model": "PINHOLE", "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
+    size = {"w": scene.size[0], "h": scene.size[1]}
+    write_json(target / "transforms.json", {**camera, **size, "ply_file_path": "points.ply", "frames": frames})
+    return {"images": len(frames), "depth_images": deep}
+
+
+def _depth(file: Path, target: Path, name: str) -> dict[str, str]:
+    """Depth and mask of one picture in nerfstudio's units, and what `transforms.json` says of them."""
+    counts = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    assert counts is not None
+    milli = np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16)
+    for folder, image in (("depth", milli), ("masks", np.where(counts > 0, 255, 0).astype(np.uint8))):
+        with atomic_path(target / folder / name) as temporary:
+            cv2.imwrite(str(temporary), image)
+    return {"depth_file_path": f"depth/{name}", "mask_path": f"masks/{name}"}

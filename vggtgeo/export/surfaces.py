@@ -1,0 +1,74 @@
+"""Clouds and meshes: PLY, GLB (glTF), LAS."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_path
+
+UPRIGHT = np.array([1.0, -1.0, -1.0])
+"""From y down, z forward (the first camera's axes) to glTF's y up, z backward."""
+LAS_UNIT = 1e-3
+
+
+def write_ply(source: Path, target: Path) -> dict[str, float]:
+    """`cloud.ply`, and `mesh.ply` where the run has a mesh."""
+    cloud = PointCloud.load_ply(source / "map.ply")
+    cloud.save_ply(target / "cloud.ply")
+    if not (source / "mesh.ply").is_file():
+        return {"points": len(cloud), "faces": 0}
+    mesh = Mesh.load_ply(source / "mesh.ply")
+    mesh.save_ply(target / "mesh.ply")
+    return {"points": len(cloud), "faces": len(mesh.faces)}
+
+
+def write_glb(source: Path, target: Path) -> dict[str, float]:
+    """`map.glb`: the mesh where the run has one, else the cloud; the first camera's down is down."""
+    trimesh = _package("trimesh")
+    if (source / "mesh.ply").is_file():
+        mesh = Mesh.load_ply(source / "mesh.ply")
+        shape = trimesh.Trimesh(
+            mesh.vertices * UPRIGHT,
+            mesh.faces,
+            vertex_normals=mesh.normals * UPRIGHT,
+            vertex_colors=mesh.colours,
+            process=False,
+        )
+        counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    else:
+        cloud = PointCloud.load_ply(source / "map.ply")
+        shape = trimesh.PointCloud(cloud.points * UPRIGHT, colors=cloud.colours)
+        counts = {"vertices": len(cloud), "faces": 0}
+    with atomic_path(target / "map.glb") as temporary:
+        temporary.write_bytes(trimesh.Scene(shape).export(file_type="glb"))
+    return counts
+
+
+def write_las(source: Path, target: Path) -> dict[str, float]:
+    """`map.las`, version 1.4, point format 7: places to a millimetre, 16-bit colours."""
+    laspy = _package("laspy")
+    cloud = PointCloud.load_ply(source / "map.ply")
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales = np.full(3, LAS_UNIT)
+    header.offsets = np.floor(cloud.points.min(axis=0)) if len(cloud) else np.zeros(3)
+    record = laspy.LasData(header)
+    record.x, record.y, record.z = cloud.points.T.astype(np.float64)
+    record.red, record.green, record.blue = (cloud.colours.astype(np.uint16) * 257).T
+    with atomic_path(target / "map.las") as temporary:
+        record.write(str(temporary))
+    return {"points": len(cloud)}
+
+
+def _package(name: str) -> Any:
+    """An optional package; InputError, which says how to get it, where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise InputError(f"this export needs the package `{name}`; `pip install {name}` gets it") from None

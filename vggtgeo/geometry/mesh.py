@@ -1,0 +1,63 @@
+"""Coloured triangle meshes as binary PLY files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from vggtgeo.geometry.point_cloud import UNREADABLE
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_open
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Fields: vertices float32 [n, 3], world, metres; faces int32 [m, 3], counter-clockwise from outside; normals
+    float32 [n, 3], unit length; colours uint8 [n, 3], RGB. InputError for other shapes, or a face of a vertex that is
+    not there.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray
+
+    def __post_init__(self) -> None:
+        count = len(self.vertices)
+        for name, shape in (("vertices", (count, 3)), ("normals", (count, 3)), ("colours", (count, 3))):
+            if getattr(self, name).shape != shape:
+                raise InputError(f"`{name}` has shape {getattr(self, name).shape}; it must be {list(shape)}")
+        if self.faces.ndim != 2 or self.faces.shape[1] != 3:
+            raise InputError(f"`faces` has shape {self.faces.shape}; it must be [m, 3]")
+        if len(self.faces) and not (self.faces.min() >= 0 and self.faces.max() < count):
+            raise InputError(f"`faces` names vertex {self.faces.max()}; there are {count}")
+
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+
+    def save_ply(self, path: str | os.PathLike[str]) -> None:
+        """Writes binary little-endian PLY, atomically: float32 x y z nx ny nz, uint8 RGB, and the faces."""
+        names = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+        vertices = np.empty(len(self.vertices), names + [(name, "u1") for name in ("red", "green", "blue")])
+        columns = [*self.vertices.T, *self.normals.T, *self.colours.T]
+        for name, column in zip(vertices.dtype.names or (), columns, strict=True):
+            vertices[name] = column
+        faces = np.empty(len(self.faces), [("vertex_indices", "<i4", (3,))])
+        faces["vertex_indices"] = self.faces
+        elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+        with atomic_open(path, "wb") as handle:
+            PlyData(elements, byte_order="<").write(handle)
+
+    @classmethod
+    def load_ply(cls, path: str | os.PathLike[str]) -> Mesh:
+        """Reads what `save_ply` wrote."""
+        try:
+            data = PlyData.read(os.fspath(path), known_list_len={"face": {"vertex_indices": 3}})
+            vertices, faces = data["vertex"].data, data["face"].data["vertex_indices"]
+            column = lambda *names: np.column_stack([vertices[name] for name in names])
+            return cls(column("x", "y", "z"), np.array(faces), column("nx", "ny", "nz"), column("red", "green", "blue"))
+        except UNREADABLE as error:
+            raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY mesh: {error}") from None

@@ -1,0 +1,235 @@
+"""A mesh of all depth maps: a truncated signed distance, averaged in blocks of voxels near the surface.
+
+Each voxel holds the weighted mean over the keyframes of `clip((z_measured - z_voxel) / t, -1, 1)` (Curless and Levoy,
+"A volumetric method for building complex models from range images", SIGGRAPH 1996), the weight of a measurement being
+its confidence by its variance. Blocks are made only where a depth map has a surface, as in voxel hashing (Niessner et
+al., "Real-time 3D reconstruction at scale using voxel hashing", SIGGRAPH Asia 2013), and worked on in batches, so that
+memory is bounded by a batch and the mesh. Neighbouring blocks share a layer of voxels: their surfaces meet without a
+seam.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.ndimage import map_coordinates
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from vggtgeo.geometry.cells import cell_numbers
+from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.io.errors import InputError
+from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.models import pinhole
+from vggtgeo.slam.keyframe import Keyframe
+
+SIDE = 16
+"""Voxels along a block."""
+TRUNCATION = 4.0
+"""Of the distance, in voxels."""
+BATCH = 1024
+"""Blocks held at a time: 100 MB."""
+GROUP = 32
+"""Blocks that one compiled call works on."""
+LEAST_CONFIDENCE = 0.5
+"""Of a pixel that takes part, as in the cloud: below it lies a jump of depth, and no surface."""
+LEAST_PART = 200
+"""Faces of the smallest separate piece of surface that is kept: smaller ones are false depths."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A depth map with its picture and camera. pose: world -> camera; intrinsics: of both."""
+
+    depth_map: DepthMap
+    image: np.ndarray
+    pose: np.ndarray
+    intrinsics: np.ndarray
+
+
+def fused_mesh(
+    keyframes: Sequence[Keyframe],
+    depth_maps: Sequence[DepthMap | None],
+    intrinsics: np.ndarray,
+    voxel: float = 0.02,
+    least_views: int = 2,
+) -> Mesh:
+    """One coloured mesh of all keyframes' depth, in the world frame.
+
+    Args:
+        keyframes: poses world -> camera.
+        depth_maps: one a keyframe, None where there is none.
+        intrinsics: float64 [4], pixels.
+        voxel: edge of a voxel, metres.
+        least_views: keyframes that must have measured at a voxel, where there are so many; 1 where each depth was
+            confirmed by other views already.
+
+    """
+    if not voxel > 0:
+        raise InputError(f"`voxel` is {voxel}; it must be positive metres")
+    views = [
+        View(depth_map, keyframe.image, keyframe.pose, np.asarray(intrinsics, np.float64))
+        for keyframe, depth_map in zip(keyframes, depth_maps, strict=True)
+        if depth_map is not None and not depth_map.empty
+    ]
+    seen_by: dict[tuple[int, int, int], list[int]] = defaultdict(list)
+    for number, view in enumerate(views):
+        for block in _blocks(view, voxel):
+            seen_by[block].append(number)
+    least = min(least_views, len(views))
+    blocks = sorted(block for block, numbers in seen_by.items() if len(numbers) >= least)
+    parts = [
+        _batch(blocks[first : first + BATCH], seen_by, views, voxel, least) for first in range(0, len(blocks), BATCH)
+    ]
+    return _without_crumbs(_joined([mesh for part in parts for mesh in part], voxel))
+
+
+def _blocks(view: View, voxel: float) -> list[tuple[int, int, int]]:
+    """Corners, in blocks, of those that the view's surface passes within the truncation."""
+    depth = view.depth_map.depth
+    step = max(1, max(depth.shape) // 320)
+    rows, columns = np.nonzero(np.isfinite(depth[::step, ::step]))
+    pixels = np.column_stack([columns, rows]).astype(np.float64) * step
+    z = depth[::step, ::step][rows, columns].astype(np.float64)
+    rays = pinhole.rays(pixels, view.intrinsics)
+    reach = TRUNCATION * voxel
+    found = set()
+    for offset in (-reach, 0.0, reach):
+        world = (rays * (z + offset)[:, None] - view.pose[:3, 3]) @ view.pose[:3, :3]
+        found |= set(map(tuple, np.unique(np.floor(world / (SIDE * voxel)).astype(int), axis=0).tolist()))
+    return sorted(found)
+
+
+def _batch(
+    blocks: Sequence[tuple[int, int, int]],
+    seen_by: dict[tuple[int, int, int], list[int]],
+    views: Sequence[View],
+    voxel: float,
+    least: int,
+) -> list[Mesh]:
+    """The meshes of some blocks."""
+    grid = np.stack(np.meshgrid(*[np.arange(SIDE + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    volume = np.zeros((len(blocks), len(grid), 6), np.float32)
+    rows_of: dict[int, list[int]] = defaultdict(list)
+    for row, block in enumerate(blocks):
+        for number in seen_by[block]:
+            rows_of[number].append(row)
+    corners = np.array(blocks, np.float64) * SIDE
+    for number, rows in sorted(rows_of.items()):
+        view = views[number]
+        pixels, intrinsics = _packed(view), jnp.asarray(view.intrinsics, jnp.float32)
+        for first in range(0, len(rows), GROUP):
+            chosen = rows[first : first + GROUP]
+            padded = np.resize(chosen, GROUP)
+            points = (corners[padded][:, None] + grid) * voxel
+            local = (points @ view.pose[:3, :3].T + view.pose[:3, 3]).astype(np.float32)
+            added = np.asarray(_measured(jnp.asarray(local), pixels, intrinsics, np.float32(TRUNCATION * voxel)))
+            volume[chosen] += added[: len(chosen)]
+    shape = (SIDE + 1,) * 3
+    parts = [_surface(volume[row].reshape(*shape, 6), corners[row], voxel, least) for row in range(len(blocks))]
+    return [part for part in parts if part is not None]
+
+
+def _packed(view: View) -> Array:
+    """Depth (0 = none), weight and colour of each pixel, float32 [H, W, 5]: one read a voxel."""
+    depth_map = view.depth_map
+    sigma = np.maximum(depth_map.sigma * depth_map.depth, 1e-3)
+    good = np.isfinite(depth_map.depth) & (depth_map.confidence >= LEAST_CONFIDENCE)
+    weight = np.where(good, depth_map.confidence / sigma**2, 0.0)
+    depth = np.where(good, depth_map.depth, 0.0)
+    return jnp.asarray(np.concatenate([depth[..., None], weight[..., None], view.image], axis=2), jnp.float32)
+
+
+@jax.jit
+def _measured(
+    points: Float[Array, "b n 3"],
+    pixels: Float[Array, "h w 5"],
+    intrinsics: Float[Array, " 4"],
+    reach: float | Float[Array, ""],
+) -> Float[Array, "b n 6"]:
+    """What one view adds to voxels at `points` of its frame: weight times distance and colour, the weight, and 1."""
+    z = jnp.maximum(points[..., 2], 1e-3)
+    u = jnp.rint(points[..., 0] / z * intrinsics[0] + intrinsics[2]).astype(jnp.int32)
+    v = jnp.rint(points[..., 1] / z * intrinsics[1] + intrinsics[3]).astype(jnp.int32)
+    height, width, _ = pixels.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (points[..., 2] > 1e-3)
+    seen = pixels[jnp.clip(v, 0, height - 1), jnp.clip(u, 0, width - 1)]
+    distance = seen[..., :1] - z[..., None]
+    weight = jnp.where(inside[..., None] & (distance > -reach), seen[..., 1:2], 0.0)
+    values = jnp.concatenate([jnp.clip(distance / reach, -1.0, 1.0), seen[..., 2:]], axis=-1)
+    return jnp.concatenate([weight * values, weight, (weight > 0).astype(jnp.float32)], axis=-1)
+
+
+def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -> Mesh | None:
+    """The zero crossing in one block, in cubes that are known at all corners; None where there is none."""
+    weight = volume[..., 4]
+    known = volume[..., 5] >= least
+    distance = np.where(known, volume[..., 0] / np.where(known, weight, 1), 1.0)
+    if not ((distance[known] < 0).any() and (distance[known] > 0).any()):
+        return None
+    try:
+        places, faces, normals, _ = marching_cubes(distance, 0.0, mask=known)
+    except (ValueError, RuntimeError):  # skimage's way to say that no cube is known at all its corners
+        return None
+    faces = faces[_in_known_cubes(places[faces].mean(axis=1), known)]
+    if not len(faces):
+        return None
+    colour = volume[..., 1:4] / np.where(known, weight, 1)[..., None]
+    near = [map_coordinates(colour[..., k], places.T, order=0, mode="nearest") for k in range(3)]
+    return Mesh(
+        ((corner + places) * voxel).astype(np.float32),
+        faces[:, ::-1].astype(np.int32),
+        normals.astype(np.float32),
+        np.clip(np.stack(near, axis=1), 0, 255).round().astype(np.uint8),
+    )
+
+
+def _in_known_cubes(centres: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Whether all corners of the cube around each face's centre [m, 3] are known: skimage's mask asks one corner only,
+    and would close the surface at the border of what was seen.
+    """
+    whole = known
+    for axis in range(3):
+        whole = np.logical_and(np.take(whole, range(SIDE), axis), np.take(whole, range(1, SIDE + 1), axis))
+    inside: np.ndarray = whole[tuple(np.clip(np.floor(centres).astype(int), 0, SIDE - 1).T)]
+    return inside
+
+
+def _joined(parts: Sequence[Mesh], voxel: float) -> Mesh:
+    """One mesh; vertices that blocks share become one."""
+    if not parts:
+        nothing = np.zeros((0, 3), np.float32)
+        return Mesh(nothing, np.zeros((0, 3), np.int32), nothing, nothing.astype(np.uint8))
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)])
+    vertices, normals, colours = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "colours")
+    )
+    keys = np.rint(vertices / (1e-3 * voxel)).astype(np.int64)
+    _, first, row = np.unique(cell_numbers(keys), return_index=True, return_inverse=True)
+    faces = row.reshape(-1)[faces]
+    flat = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+    return Mesh(vertices[first], faces[~flat].astype(np.int32), normals[first], colours[first])
+
+
+def _without_crumbs(mesh: Mesh) -> Mesh:
+    """The mesh without pieces of fewer than `LEAST_PART` faces, and without vertices that no face has."""
+    count = len(mesh.vertices)
+    if not len(mesh.faces):
+        return mesh
+    ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
+    graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, piece = connected_components(graph, directed=False)
+    size = np.bincount(piece[mesh.faces[:, 0]], minlength=piece.max() + 1)
+    faces = mesh.faces[size[piece[mesh.faces[:, 0]]] >= LEAST_PART]
+    used = np.unique(faces)
+    renumbered = np.zeros(count, np.int32)
+    renumbered[used] = np.arange(len(used), dtype=np.int32)
+    return Mesh(mesh.vertices[used], renumbered[faces], mesh.normals[used], mesh.colours[used])
