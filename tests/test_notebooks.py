@@ -21,7 +21,7 @@ QUICK = ("solve",)
 # What the shorter run replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.
 SHORTER: dict[str, dict[str, str]] = {
     "own_video": {"frames=45": "frames=16", WINDOW: SMALL_WINDOW},
-    "evaluate": {'"paper-small", folder': '"paper-small", folder, sequences=["room"], seeds=1'},
+    "evaluate": {'sequences=["room"]': 'sequences=["room"], seeds=1'},
     "differentiate": {
         "tracked_windows(sequence, 8,": "tracked_windows(sequence, 3,",
         "tracked_windows(other, 4,": "tracked_windows(other, 2,",

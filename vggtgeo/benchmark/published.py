@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from typing import Any
 
 from vggtgeo.io.errors import InputError
 
@@ -43,5 +44,5 @@ def published(name: str) -> PublishedTable:
     return PublishedTable(name, columns=columns, rows=rows, **{key: _value(value) for key, value in values.items()})
 
 
-def _value(value: object) -> object:
+def _value(value: object) -> Any:
     return tuple(value) if isinstance(value, list) else value
