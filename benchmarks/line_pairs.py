@@ -26,6 +26,7 @@ from vggtgeo.models.roles import Features, LineFeatures
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -34,7 +35,7 @@ from vggtgeo.slam.tracking import Expectation, Sight, Track, track
 GAPS, FEW = (1, 3, 5), 100
 NEAR, FAR = (0.05, np.deg2rad(2.0)), (0.15, np.deg2rad(5.0))
 AWAY = (0.7, np.deg2rad(14.0))
-SETTINGS, ROLES = SlamSettings(), Roles()
+SETTINGS, ROLES = SlamSettings(), Roles(flow=None)
 METHODS = {
     "points": (True, False, False),
     "lines": (False, True, False),
@@ -88,7 +89,7 @@ class Pair:
         points, lines, picture = METHODS[method]
         view = self.second.view if picture else None
         features = self.second.features if points else self.second.blind
-        sight = Sight(self.second.frame, features, view, (lambda: self.second.lines) if lines else None)
+        sight = Sight(self.second.frame, Description.of(features), view, (lambda: self.second.lines) if lines else None)
         source = self.first.view if picture else None
         return track(sight, keyframe, source, expected or self.expected, self.first.intrinsics, ROLES)
 
@@ -137,7 +138,9 @@ def place(
 ) -> None:
     """Place one pair by every method, and by lines from a start that is far off; add to the results."""
     first = pair.first
-    keyframe = make_keyframe(0, first.frame, first.pose, first.features, ROLES, SETTINGS, first.intrinsics, first.lines)
+    keyframe = make_keyframe(
+        0, first.frame, first.pose, Description.of(first.features), ROLES, SETTINGS, first.intrinsics, first.lines
+    )
     found = {method: pair.by(method, keyframe) for method in METHODS}
     few = found["points"].evidence.matches < FEW
     own = {"motion so far": pair.expected.pose} | {method: one.pose for method, one in found.items()}

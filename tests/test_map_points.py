@@ -14,6 +14,7 @@ from vggtgeo.models.classical import SiftMatcher, search_near, search_tree
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation import simulate
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import tangent
 from vggtgeo.slam.fusion import with_systematic
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
@@ -49,7 +50,9 @@ def view() -> View:
     for number, index in enumerate((0, 3, 6, 8)):
         frame = sequence.frame(index)
         features = ROLES.points.describe(frame.image)
-        made.append(make_keyframe(number, frame, poses[index], features, ROLES, SlamSettings(), intrinsics))
+        made.append(
+            make_keyframe(number, frame, poses[index], Description.of(features), ROLES, SlamSettings(), intrinsics)
+        )
     return tuple(made[:3]), made[3], poses[8], intrinsics
 
 
@@ -100,7 +103,7 @@ def test_a_tie_counts_what_other_keyframes_know_only_once(view: View) -> None:
     Oracle: the track before the refinement.
     """
     keyframes, frame, true, intrinsics = view
-    sight = Sight(Frame(8, 0.8, frame.image, None, ""), frame.features, None)
+    sight = Sight(Frame(8, 0.8, frame.image, None, ""), Description.of(frame.features), None)
     expected = Expectation(true, np.eye(4))
     own = track(sight, keyframes[2], None, expected, intrinsics, ROLES)
     refined = refined_by_map(own, sight, keyframes, expected, intrinsics)
@@ -119,7 +122,7 @@ def test_keyframes_with_too_few_points_each_place_a_frame_together(view: View) -
     keyframes, frame, true, intrinsics = view
     poor = tuple(_knowing(keyframe, frame, true, intrinsics, 10) for keyframe in keyframes)
     wrong = rigid.exponential(np.array([0.05, -0.04, 0.04, 0.03, -0.035, 0.02])) @ true
-    sight = Sight(Frame(8, 0.8, frame.image, None, ""), frame.features, None)
+    sight = Sight(Frame(8, 0.8, frame.image, None, ""), Description.of(frame.features), None)
     expected = Expectation(wrong, np.eye(4))
     for keyframe in poor:
         assert not track(sight, keyframe, None, expected, intrinsics, ROLES).accepted

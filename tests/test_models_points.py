@@ -4,7 +4,7 @@ import numpy as np
 import plane_views as views
 import pytest
 from vggtgeo.models import roles
-from vggtgeo.models.classical import EpipolarVerifier, OrbMatcher, PatchAlignment, SiftMatcher
+from vggtgeo.models.classical import EpipolarVerifier, OrbMatcher, PatchAlignment, PatchFlow, SiftMatcher
 from vggtgeo.models.classical.key_points import spread
 from vggtgeo.models.classical.nearest import exclude_far, mutual_nearest
 
@@ -211,3 +211,28 @@ def test_wrong_arguments_are_named(build, name: str) -> None:
     # Proves that a setting or an image out of range is refused by name. Oracle: the broken argument.
     with pytest.raises(ValueError, match=f"`{name}`"):
         build()
+
+
+def test_flow_brings_a_wrong_expectation_to_the_place_of_the_point() -> None:
+    # Proves that points expected 10 px off are followed home, in a view turned by 6 degrees. Oracle: the homography.
+    first, second, homography = views.plane_pair(MOTION)
+    pixels = SiftMatcher(count=300).describe(first).pixels
+    true = views.move(homography, pixels)
+    seen = ((true > 12) & (true < np.array(views.SIZE) - 13)).all(1)
+    pixels, true = pixels[seen], true[seen]
+    moved, alike = PatchFlow().follow(first, second, pixels, true + [8.0, -6.0])
+    arrived = np.isfinite(alike)
+    errors = np.linalg.norm(moved - true, axis=1)[arrived]
+    measured = f"{arrived.mean():.0%} of {len(true)} arrived, median error {np.median(errors):.3f} px"
+    assert arrived.mean() > 0.7, measured
+    assert np.median(errors) < 0.3, measured
+    assert np.mean(errors < 1.0) > 0.97, measured
+
+
+def test_flow_finds_nothing_where_the_picture_is_another() -> None:
+    # Proves that points do not arrive in another texture, nor in the dark. Oracle: there is nothing to find.
+    first, other = (views.plane_pair(MOTION, seed)[0] for seed in (0, 1))
+    pixels = SiftMatcher(count=300).describe(first).pixels
+    for image in (other, np.zeros_like(first)):
+        _, alike = PatchFlow().follow(first, image, pixels, pixels)
+        assert np.isfinite(alike).mean() < 0.05

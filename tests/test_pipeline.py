@@ -23,13 +23,16 @@ from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.summary import pieces
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.compile_ahead import compile_global, expected_keyframes
 from vggtgeo.slam.global_adjustment import adjust_all
+from vggtgeo.slam.global_shape import padded_count, shape_for
 from vggtgeo.slam.loops import close_loops
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.window import solve_jit
 
 SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.
@@ -139,6 +142,32 @@ def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: floa
     assert _keyframe_error(wrong, room[2]) > 0.03
     error = _keyframe_error(finish(wrong, ROLES, settings), room[2])
     assert error < 0.01, f"{error:.4f} m"
+
+
+def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
+    """Compiled for a map of so many keyframes, the solver of the last adjustment is not compiled again; oracle: the
+    number of programs that JAX keeps of it.
+    """
+    settings = updated(
+        SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 2, "global_rounds": 1}}
+    )
+    kept = solve_jit._cached._cache_size
+    before = kept()
+    compile_global(shape_for(len(tracked.keyframes), settings), settings)
+    compiled = kept()
+    assert compiled == before + 1
+    finish(tracked, ROLES, settings)
+    assert kept() == compiled
+
+
+def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
+    """At 30 % of the frames a map of 6 keyframes will have 20, between those shares nothing is foreseen, and without an
+    end the map itself counts; oracle: by hand.
+    """
+    assert expected_keyframes(6, 30, 100) == 20
+    assert expected_keyframes(6, 31, 100) is None
+    assert [expected_keyframes(count, 31, None) for count in (7, 8, 70)] == [None, 8, 70]
+    assert [padded_count(count) for count in (1, 16, 17, 64, 65, 96, 97, 129)] == [16, 16, 64, 64, 96, 96, 128, 192]
 
 
 def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:

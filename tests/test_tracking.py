@@ -8,8 +8,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from vggtgeo.models.classical import NoDepth, PnpGeometry, SiftMatcher, place_vector
-from vggtgeo.models.roles import DepthEstimate, GeometryResult, PoseGuess, PoseQuery, Segments
+from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
+from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery, Segments
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
@@ -19,6 +19,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam import relocalisation
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.pieces import join_pieces, scaled_piece
@@ -139,13 +140,44 @@ def test_alignment_of_different_places_says_that_they_differ(room: Room) -> None
     assert found is None or found.correlation < 0.3
 
 
+class _Counting(SiftMatcher):
+    """Counts the images that it describes."""
+
+    described = 0
+
+    def describe(self, image: np.ndarray) -> Features:
+        _Counting.described += 1
+        return super().describe(image)
+
+
+def test_frames_are_described_where_flow_fails(room: Room) -> None:
+    """By flow most frames need no descriptors, and none where it has nothing to follow; both ways end near the truth.
+
+    Oracles: the number of descriptions, and the renderer's poses, from which the run by descriptors is the reference.
+    """
+    frames, camera, truth = room
+    errors = []
+    for flow, least, most in (
+        (PatchFlow(), 1, len(frames) // 2),
+        (PatchFlow(similarity=0.999), 30, 30),
+        (None, 30, 30),
+    ):
+        _Counting.described = 0
+        slam = _run(frames, camera, replace(ROLES, points=_Counting(count=500), flow=flow))
+        assert least <= _Counting.described <= most, f"{_Counting.described} descriptions with {flow}"
+        assert all(record.tracked for record in slam.frames)
+        errors.append(_error(slam, truth))
+    assert errors[1] == errors[2]
+    assert errors[0] < max(1.5 * errors[2], 0.01), f"{100 * errors[0]:.2f} cm by flow, {100 * errors[2]:.2f} without"
+
+
 def _by_lines(room: Room, keep: Callable[[np.ndarray], np.ndarray]) -> tuple[Track, np.ndarray]:
     """Frame 2 against a keyframe at frame 0 by its segments alone, those that `keep` says of their ends [l, 2, 2], from
     4 cm and 2 degrees off; and the true pose.
     """
     frames, camera, truth = room
     poses, intrinsics = rigid.invert(truth.poses), np.array(camera.intrinsics)
-    blank = ROLES.points.describe(np.zeros_like(frames[0].image))
+    blank = Description.of(ROLES.points.describe(np.zeros_like(frames[0].image)))
     keyframe = make_keyframe(0, frames[0], poses[0], blank, ROLES, SETTINGS, intrinsics)
     segments = ROLES.lines.detect(frames[2].image)
     kept = keep(segments.endpoints)
@@ -313,7 +345,7 @@ def test_a_place_that_drift_has_moved_is_used_again(room: Room, monkeypatch: pyt
     played, known = [*range(29, -1, -1)], len(slam.ties)
     for index, row in enumerate(played, start=len(frames)):
         frame = replace(frames[row], index=index, timestamp=index / 10)
-        slam = step(slam, frame, ROLES.points.describe(frame.image), ROLES, SETTINGS)
+        slam = step(slam, frame, Description.of(ROLES.points.describe(frame.image)), ROLES, SETTINGS)
     back = [record for record in slam.frames[len(frames) :] if record.tracked and record.reference < old]
     assert back, "no frame of the way back hangs on an old keyframe"
     assert any(min(tie.keyframes) < old <= max(tie.keyframes) for tie in slam.ties[known:])
@@ -368,7 +400,7 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
     moved[:3, 3] = [0.5, -1.0, 2.0]
     torn = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
     newest = whole.keyframes[-1]
-    sight = Sight(seen[newest.frame], newest.features, None)
+    sight = Sight(seen[newest.frame], Description.of(newest.features), None)
     joined = join_pieces(replace(apart, keyframes=torn), sight, roles, SETTINGS)
     assert joined.origins == (0,), joined.notes
     for before, after in zip(whole.keyframes[origin:], joined.keyframes[origin:], strict=True):

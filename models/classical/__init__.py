@@ -1,6 +1,7 @@
 """Classical implementations of the five perception roles: OpenCV and numpy, no weights."""
 
 from vggtgeo.models.classical.depth import NoDepth, SensorDepth
+from vggtgeo.models.classical.flow import PatchFlow
 from vggtgeo.models.classical.guided_search import can_search, search_around, search_near, search_tree
 from vggtgeo.models.classical.line_detector import LsdDetector
 from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
@@ -26,6 +27,7 @@ __all__ = [
     "NoDepth",
     "OrbMatcher",
     "PatchAlignment",
+    "PatchFlow",
     "PnpGeometry",
     "SensorDepth",
     "SiftMatcher",

@@ -62,18 +62,21 @@ def _move(ends: np.ndarray, relative: RelativeView) -> np.ndarray:
 
 def _near(moved: np.ndarray, ends_j: np.ndarray, distance: float, overlap: float) -> np.ndarray:
     lines = line_coefficients(ends_j)
-    off = np.abs(np.einsum("iex,jx->ije", moved, lines[:, :2]) + lines[:, 2, None])
     direction, length = _directions(ends_j)
-    place = np.einsum("iex,jx->ije", moved, direction) - (ends_j[:, 0] * direction).sum(axis=1)[:, None]
-    common = _common_part(place, length, _directions(moved)[1])
+    start = (ends_j[:, 0] * direction).sum(axis=1)
+    near = np.ones((len(moved), len(ends_j)), dtype=bool)
+    places = []
+    for end in (moved[:, 0], moved[:, 1]):
+        near &= np.abs(end @ lines[:, :2].T + lines[:, 2]) < distance
+        places.append(end @ direction.T - start)
+    common = _common_part(places[0], places[1], length, _directions(moved)[1])
     # A predicted end may miss by `distance`; both together must not turn the segment by more than 15 degrees.
-    return (off.max(axis=2) < distance) & (common > overlap) & (_direction_cosine(moved, ends_j) > np.cos(0.26))
+    return near & (common > overlap) & (_direction_cosine(moved, ends_j) > np.cos(0.26))
 
 
-def _common_part(place: np.ndarray, length: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Common part of [0, length_j] and the interval `place` [L_i, L_j, 2], relative to the shorter segment."""
-    low, high = place.min(axis=2), place.max(axis=2)
-    common = np.minimum(high, length) - np.maximum(low, 0.0)
+def _common_part(first: np.ndarray, second: np.ndarray, length: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Common part of [0, length_j] and the intervals `first` to `second` [L_i, L_j], relative to the shorter one."""
+    common = np.minimum(np.maximum(first, second), length) - np.maximum(np.minimum(first, second), 0.0)
     return common / np.maximum(np.minimum(length[None, :], own[:, None]), 1.0)
 
 
@@ -89,14 +92,16 @@ def _on_epipolar_beam(
     epipolar = np.concatenate([ends_i, np.ones_like(ends_i[..., :1])], axis=2) @ fundamental.T
     direction, length = _directions(ends_j)
     # Along end 0 + s * direction the epipolar line l is met at s = -l(end 0) / (l . direction).
-    rate = np.einsum("iex,jx->ije", epipolar[..., :2], direction)
-    value = np.einsum("iex,jx->ije", epipolar[..., :2], ends_j[:, 0]) + epipolar[:, None, :, 2]
-    norm = np.linalg.norm(epipolar[..., :2], axis=2)[:, None, :]
-    # A segment almost along its epipolar line is met nowhere in particular: the gate then says nothing.
-    parallel = np.abs(rate) < np.sin(0.17) * norm
-    place = -value / np.where(parallel, 1.0, rate)
-    meets = _common_part(place, length, np.abs(place[..., 1] - place[..., 0]).mean(axis=1)) > overlap
-    return (meets | parallel.any(axis=2)) & (_direction_cosine(_turned(ends_i, relative), ends_j) > np.cos(angle))
+    places, anywhere = [], np.zeros((len(ends_i), len(ends_j)), dtype=bool)
+    for line in (epipolar[:, 0], epipolar[:, 1]):
+        rate = line[:, :2] @ direction.T
+        # A segment almost along its epipolar line is met nowhere in particular: the gate then says nothing.
+        parallel = np.abs(rate) < np.sin(0.17) * np.linalg.norm(line[:, :2], axis=1)[:, None]
+        places.append(-(line[:, :2] @ ends_j[:, 0].T + line[:, 2:]) / np.where(parallel, 1.0, rate))
+        anywhere |= parallel
+    own = np.abs(places[1] - places[0]).mean(axis=1)
+    meets = _common_part(places[0], places[1], length, own) > overlap
+    return (meets | anywhere) & (_direction_cosine(_turned(ends_i, relative), ends_j) > np.cos(angle))
 
 
 def _turned(ends: np.ndarray, relative: RelativeView) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -92,7 +93,7 @@ def _foremost_depth(depth: np.ndarray, pixels: np.ndarray, jump: float = 0.15) -
 
 
 def _affine_ends(fraction: np.ndarray, inverse: np.ndarray, tolerance: float, least: int) -> np.ndarray:
-    first, second = np.triu_indices(len(fraction), k=max(1, len(fraction) // 3))
+    first, second = _far_apart(len(fraction))
     slope = (inverse[second] - inverse[first]) / (fraction[second] - fraction[first])
     offset = inverse[first] - slope * fraction[first]
     explained = np.abs(offset[:, None] + slope[:, None] * fraction - inverse) < tolerance * inverse
@@ -100,6 +101,15 @@ def _affine_ends(fraction: np.ndarray, inverse: np.ndarray, tolerance: float, le
     best = explained[int(np.argmax(score))]
     if np.count_nonzero(best) < max(least, len(fraction) // 2):
         return np.full(2, np.nan)
-    slope_fit, offset_fit = np.polyfit(fraction[best], inverse[best], 1)
+    x, y = fraction[best], inverse[best]
+    centred = x - x.mean()
+    slope_fit = (centred @ y) / (centred @ centred)
+    offset_fit = y.mean() - slope_fit * x.mean()
     ends = np.array([offset_fit, offset_fit + slope_fit])
     return 1.0 / ends if (ends > 1e-3).all() else np.full(2, np.nan)
+
+
+@cache
+def _far_apart(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of samples that are at least a third of the segment apart."""
+    return np.triu_indices(count, k=max(1, count // 3))

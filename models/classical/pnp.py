@@ -18,7 +18,8 @@ class PnpGeometry:
     """P3P inside MAGSAC++ (Barath et al. 2020), then a robust refinement weighted by confidence.
 
     The predicted pose competes with the sampled one: where the prediction explains more matches it is the start of
-    the refinement, so that a frame whose few matches defeat sampling is still tracked.
+    the refinement, so that a frame whose few matches defeat sampling is still tracked. Where the refined prediction
+    explains the share `sure` of the matches, no other pose could explain as many, and none is sampled.
 
     threshold: largest reprojection error of an inlier, pixels. least: fewest inliers of a success.
     """
@@ -27,6 +28,7 @@ class PnpGeometry:
     least: int = 12
     confidence: float = 0.999
     max_iterations: int = 1000
+    sure: float = 0.9
     two_view: TwoViewStart = field(default_factory=TwoViewStart)
 
     def __post_init__(self) -> None:
@@ -40,10 +42,9 @@ class PnpGeometry:
         if len(query.points) < self.least:
             return failed_guess(query, GeometryResult.TOO_FEW_MATCHES)
         intrinsics = np.asarray(query.intrinsics, dtype=np.float64)
-        starts = [pose for pose in (query.predicted, self._sample(query)) if pose is not None]
-        if not starts:
+        pose = self._start(query, intrinsics)
+        if pose is None:
             return failed_guess(query, GeometryResult.DEGENERATE)
-        pose = max(starts, key=lambda start: self._support(start, query))
         inliers = self._inliers(pose, query)
         for _ in range(2):
             if np.count_nonzero(inliers) < self.least:
@@ -65,6 +66,15 @@ class PnpGeometry:
     ) -> StartGuess:
         """Motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
         return self.two_view.start(pixels_i, pixels_j, intrinsics)
+
+    def _start(self, query: PoseQuery, intrinsics: np.ndarray) -> np.ndarray | None:
+        """The prediction, refined, where most matches agree with that; else the better of it and a sampled pose."""
+        if query.predicted is not None:
+            refined = refine_pose(query.predicted, query.points, query.pixels, query.confidence + 1e-3, intrinsics)
+            if np.count_nonzero(self._inliers(refined, query)) >= max(self.sure * len(query.points), 3 * self.least):
+                return refined
+        starts = [pose for pose in (query.predicted, self._sample(query)) if pose is not None]
+        return max(starts, key=lambda start: self._support(start, query)) if starts else None
 
     def _sample(self, query: PoseQuery) -> np.ndarray | None:
         try:

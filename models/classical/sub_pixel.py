@@ -65,6 +65,17 @@ class PatchAlignment:
         return np.where(accepted[:, None], target, pixels_j), accepted
 
 
+def patch_correlation(
+    gray_i: np.ndarray, gray_j: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray, radius: int = 7
+) -> np.ndarray:
+    """Normalised cross-correlation of the patches around `pixels_i` and `pixels_j`, float [n, 2] each; float32 [n]."""
+    grid, still = _grid(radius), np.broadcast_to(np.eye(2), (len(pixels_i), 2, 2))
+    first, second = (
+        _normalised(_sample(gray, at, still, grid)) for gray, at in ((gray_i, pixels_i), (gray_j, pixels_j))
+    )
+    return np.asarray((first * second).sum(axis=1))
+
+
 def _grid(radius: int) -> np.ndarray:
     """Offsets of a patch's pixels, float64 [P, 2]."""
     side = np.arange(-radius, radius + 1, dtype=np.float64)
@@ -73,8 +84,10 @@ def _grid(radius: int) -> np.ndarray:
 
 def _sample(gray: np.ndarray, centre: np.ndarray, warp: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """float32 [n, P]: `gray` at centre + warp @ offset."""
-    places = warp.astype(np.float32) @ grid.T.astype(np.float32) + centre[..., None].astype(np.float32)
-    values = cv2.remap(gray, places[:, 0], places[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    turn, middle, (x, y) = warp.astype(np.float32), centre.astype(np.float32), grid.T.astype(np.float32)
+    # Written out: numpy multiplies stacks of 2 x 2 matrices one by one.
+    column, row = (turn[:, i, :1] * x + turn[:, i, 1:] * y + middle[:, i, None] for i in (0, 1))
+    values = cv2.remap(gray, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return values.astype(np.float32)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from vggtgeo.datasets import Frame
 from vggtgeo.results import Result
@@ -24,11 +25,13 @@ class ProgressBar(Callback):
         self._progress = Progress(*columns, TextColumn("{task.fields[state]}"), console=console)
         self._notes = 0
         self._began = 0.0
+        self._stage: TaskID | None = None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._end_stage()
         self._progress.stop()
 
     def on_begin(self, name: str, total: int | None) -> None:
@@ -44,8 +47,16 @@ class ProgressBar(Callback):
             self._print(f"warning: {note}")
         self._notes = len(slam.notes)
 
-    def on_adjust(self, slam: Slam) -> None:
-        self._progress.stop()
+    def on_stage(self, name: str) -> None:
+        """A line of its own, whose clock runs while the stage lasts."""
+        self._end_stage()
+        self._stage = self._progress.add_task(name, total=None, state="")
+        self._progress.start()
+
+    def _end_stage(self) -> None:
+        if self._stage is not None:
+            self._progress.update(self._stage, total=1, completed=1)
+            self._stage = None
 
     def on_message(self, message: str) -> None:
         self._print(message)
@@ -60,13 +71,13 @@ def _state(slam: Slam) -> str:
     return "waiting for parallax" if slam.waiting else "tracking"
 
 
-def print_result(console: Console, result: Result, folder: Path) -> None:
-    """The report of a run; its last line is the verdict."""
-    summary, verdict = result.summary, result.verdict
-    fx, fy, cx, cy = result.intrinsics
-    rate, tracked = summary["frames_per_second"], summary["frames_tracked"]
+def print_result(console: Console, result: Result, summary: Mapping[str, Any], folder: Path) -> None:
+    """The report of a run; its last line is the verdict. summary: as it was written."""
+    verdict, (fx, fy, cx, cy) = result.verdict, result.intrinsics
+    rate, whole = summary["frames_per_second"], summary["frames_per_second_whole_run"]
     lines = [
-        f"{summary['frames']} frames ({tracked} tracked), {summary['keyframes']} keyframes, {rate:.1f} frames/s",
+        f"{summary['frames']} frames ({summary['frames_tracked']} tracked), {summary['keyframes']} keyframes, "
+        f"{rate:.1f} frames/s, {whole:.1f} with everything from compiling to writing",
         f"intrinsics fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}",
     ]
     if summary["scale"].startswith("free"):

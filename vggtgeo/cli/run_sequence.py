@@ -93,10 +93,11 @@ def run_and_write(
                 facts=facts,
                 warned=warned,
             )
-        result.save_into(folder, depth=output.save_depth, settings=output.flags)
+            bar.on_stage("writing")
+            summary = result.save_into(folder, depth=output.save_depth, settings=output.flags)
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: everything was done and is written", err=True)
-    print_result(console, result, output.folder)
+    print_result(console, result, summary, output.folder)
     if output.as_json:
         typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
     if output.rerun == "serve":

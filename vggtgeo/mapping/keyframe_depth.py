@@ -22,6 +22,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.threads import map_in_threads
 
 CELL = 24.0
 """Pixels a grid cell."""
@@ -107,15 +108,26 @@ def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[
         keyframe.depth.astype(np.float32) if np.any(np.isfinite(keyframe.depth)) else None for keyframe in keyframes
     ]
     for _ in range(ROUNDS):
-        pairs = list(zip(keyframes, depths, strict=True))
-        corrected = [None if depth is None else optimised_depth(keyframe, depth) for keyframe, depth in pairs]
-        pairs = list(zip(keyframes, corrected, strict=True))
-        clouds = [None if depth is None else _world_points(depth, keyframe, intrinsics) for keyframe, depth in pairs]
-        depths = [
-            None if depth is None else _averaged(depth, keyframe, _around(clouds, i), intrinsics)
-            for i, (keyframe, depth) in enumerate(pairs)
-        ]
+        depths = _one_round(keyframes, depths, intrinsics)
     return depths
+
+
+def _one_round(
+    keyframes: Sequence[Keyframe], depths: Sequence[np.ndarray | None], intrinsics: np.ndarray
+) -> list[np.ndarray | None]:
+    def correct(i: int) -> np.ndarray | None:
+        depth = depths[i]
+        return None if depth is None else optimised_depth(keyframes[i], depth)
+
+    def average(i: int) -> np.ndarray | None:
+        depth = corrected[i]
+        return None if depth is None else _averaged(depth, keyframes[i], _around(clouds, i), intrinsics)
+
+    numbers = range(len(keyframes))
+    corrected = map_in_threads(correct, numbers)
+    pairs = list(zip(keyframes, corrected, strict=True))
+    clouds = [None if depth is None else _world_points(depth, keyframe, intrinsics) for keyframe, depth in pairs]
+    return map_in_threads(average, numbers)
 
 
 def _around(clouds: Sequence[np.ndarray | None], i: int) -> list[np.ndarray]:

@@ -28,6 +28,7 @@ from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.compile_ahead import CompileAhead
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import default_roles, finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -100,7 +101,7 @@ def reconstruct(
         perception = _perception(roles, source.has_depth)
         check_dense(dense, perception.roles.metric)
         windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
-        hooks = _Callbacks((windows, evidence, *callbacks), clock)
+        hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
         tracked = _track(source, (start, end, stride), perception.roles, settings, hooks, stop)
@@ -140,9 +141,11 @@ def _concluded(
 ) -> Result:
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
+    hooks.each("on_stage", "dense map")
     with clock.measure("dense map"):
         built = dense_map(slam, run.dense)
     hooks.each("on_finish", slam, built.cloud)
+    hooks.each("on_stage", "verdict")
     with clock.measure("verdict"):
         left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
         verdict = judge(slam, evidence.frames, left_out)
@@ -229,6 +232,7 @@ class _Callbacks:
 
     def warm_up(self, settings: SlamSettings, roles: Roles) -> None:
         """Compile what every window needs, and what the callbacks make of windows."""
+        self.each("on_stage", "compiling")
         compiled = warm_up(settings, roles.metric)
         for member in self.members:
             member.on_warm_up(*compiled)
@@ -288,6 +292,7 @@ def _adjust(
     hooks.each("on_adjust", tracked.slam)
     if tracked.interrupted:
         return tracked.slam, True
+    hooks.each("on_stage", "last adjustment")
     try:
         with stop.at_once():
             return finish(tracked.slam, roles, settings, hooks.clock), False

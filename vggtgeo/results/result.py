@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from vggtgeo.report import write_page
 from vggtgeo.results.files import write_depth, write_settings, write_trajectories
 from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.scene import write_scene
-from vggtgeo.results.summary import compare, summarise
+from vggtgeo.results.summary import compare, summarise, with_writing
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import Evidence
@@ -140,7 +141,7 @@ class Result:
         *,
         depth: bool = False,
         settings: Mapping[str, Any] | None = None,
-    ) -> None:
+    ) -> dict[str, Any]:
         """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (where there is dense
         depth), `images/`, `scene.npz`, `trajectory.png`, `report.html`, `summary.json` and `settings.toml`;
         `vggtgeo.read` reads it. They are written beside and take their places
@@ -153,19 +154,25 @@ class Result:
             depth: write each keyframe's dense depth and confidence as well.
             settings: flags of the command line that tell how the run was made, beside the pipeline's own settings.
 
+        Returns:
+            What `summary.json` holds: the summary, and of a run how long it took with all its files.
+
         Raises:
             InputError: `depth` is asked of a result that was read from a folder, or the folder cannot be written, is
                 in use by a run, or holds a sequence of images.
 
         """
         with taken(folder) as place:
-            self.save_into(place, depth=depth, settings=settings)
+            return self.save_into(place, depth=depth, settings=settings)
 
-    def save_into(self, run: RunFolder, *, depth: bool = False, settings: Mapping[str, Any] | None = None) -> None:
+    def save_into(
+        self, run: RunFolder, *, depth: bool = False, settings: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """The same, into a folder that is taken already."""
         place = run.stage
         if depth and self.record is None:
             raise InputError("`depth` needs a result that is still in memory; this one was read from a folder")
+        began = time.perf_counter()
         run.release_reserve()
         used = {**(settings or {}), **self.summary.get("settings", {})}
         flags = {name.replace("_", "-"): value for name, value in used.items()}
@@ -179,13 +186,16 @@ class Result:
         self.cloud.save_ply(place / "map.ply")
         if self.mesh is not None:
             self.mesh.save_ply(place / "mesh.ply")
-        write_json(place / "summary.json", plain)
         self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
         if self.record is not None:
             write_scene(place, self.record.slam)
         if depth and self.record is not None:
             write_depth(place, self.record.slam.keyframes, self.record.dense.depth_maps, self.record.slam.metric)
+        if self.record is not None:
+            plain = with_writing(plain, time.perf_counter() - began)
+        write_json(place / "summary.json", plain)
         run.publish()
+        return plain
 
     def _draw(self, place: Path, name: str, summary: Mapping[str, Any]) -> None:
         record = self.record

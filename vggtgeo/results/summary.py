@@ -79,6 +79,18 @@ def pieces(slam: Slam) -> list[dict[str, Any]]:
     return found
 
 
+def with_writing(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+    """The summary of a run whose files took `seconds` to write: with that stage, and the frames a second of the whole,
+    from compilation to the last file. One without times stays as it is.
+    """
+    stages = dict(summary.get("seconds_by_stage", {}))
+    if "all" not in stages:
+        return dict(summary)
+    whole = stages.pop("all") + seconds
+    stages |= {"write": round(seconds, 3), "all": round(whole, 3)}
+    return {**summary, "seconds_by_stage": stages, "frames_per_second_whole_run": round(summary["frames"] / whole, 2)}
+
+
 SCALE_BASIS = "the depth alone: images do not tell a constant factor on it"
 
 

@@ -100,9 +100,8 @@ def _observed(
     """
     points, lines = selected
     depths, informed = _initial_depths(keyframes, edges, local, points, intrinsics)
-    slots = [(keyframes[h].points, s) for h, s in zip(points.host, points.slot, strict=True)]
-    slots += [(keyframes[h].samples, s) for h, s in zip(lines.host, lines.slot, strict=True)]
-    read = lambda name: np.array([getattr(group, name)[s] for group, s in slots], np.float64)
+    key_points, samples = [keyframe.points for keyframe in keyframes], [keyframe.samples for keyframe in keyframes]
+    read = lambda name: np.concatenate([points.read(key_points, name), lines.read(samples, name)])
     prior, sigma = read("prior"), read("sigma")
     has_prior = np.isfinite(prior) & np.isfinite(sigma)
     depths = np.concatenate([depths, read("inverse_depth")[len(points.host) :]])
@@ -244,7 +243,7 @@ def _initial_depths(
     intrinsics: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth of each point landmark: its estimate, else triangulated; and whether views determine it."""
-    current = np.array([keyframes[h].points.inverse_depth[s] for h, s in zip(points.host, points.slot, strict=True)])
+    current = points.read([keyframe.points for keyframe in keyframes], "inverse_depth")
     weighted, information = np.zeros(len(current)), np.zeros(len(current))
     for edge in edges:
         host, target = keyframes[local[edge.host]], keyframes[local[edge.target]]

@@ -31,6 +31,9 @@ class Callback:
     def on_adjust(self, slam: Slam) -> None:
         """The state after the last frame, before the adjustment of the whole map."""
 
+    def on_stage(self, name: str) -> None:
+        """A stage after the last frame begins, which may take some seconds."""
+
     def on_message(self, message: str) -> None:
         """Something that the user should know at once."""
 

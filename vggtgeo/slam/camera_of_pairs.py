@@ -17,8 +17,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import t as student_t
 
 LEAST_PAIRS = 8
@@ -108,7 +108,7 @@ def _predict(
 
 def _moved(pose: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     step = np.eye(4)
-    step[:3, :3] = Rotation.from_rotvec(tangent[3:]).as_matrix()
+    step[:3, :3] = cv2.Rodrigues(tangent[3:])[0]
     step[:3, 3] = tangent[:3]
     return step @ pose
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.slam.factors import surface_term
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.threads import map_in_threads
 
 CELL = 4
 """Pixels a side of the blocks whose median depth makes one surface point."""
@@ -26,6 +28,15 @@ FARTHEST = 0.10
 """Metres between surfaces that can be one."""
 LEAST_COSINE = 0.8
 LEAST_POINTS = 300
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceRows:
+    """Cells in a row: points and unit normals float32 [3, m], camera frame, standard deviations of the depth [m]."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    sigma: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +62,18 @@ class Surface:
         single = (image.astype(np.float32) for image in (points, _normals(points), sigma))
         return cls(*single, coarse)
 
+    @cached_property
+    def rows(self) -> SurfaceRows:
+        """All cells, row by row of the image."""
+        flat = (np.ascontiguousarray(grid.reshape(-1, 3).T) for grid in (self.points, self.normals))
+        return SurfaceRows(*flat, self.sigma.ravel())
+
+    @cached_property
+    def known(self) -> SurfaceRows:
+        """The cells that have a normal."""
+        good = np.flatnonzero(np.isfinite(self.rows.normals[0]))
+        return SurfaceRows(self.rows.points[:, good], self.rows.normals[:, good], self.rows.sigma[good])
+
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
@@ -70,27 +93,29 @@ def align(
 
     Neighbouring depths share their errors: however many points there are, they count as `effective` ones.
     """
-    source, target = surfaces[first], surfaces[second]
-    good = np.isfinite(source.normals[..., 0])
-    points = source.points[good] @ relative[:3, :3].T + relative[:3, 3]
-    normals = source.normals[good] @ relative[:3, :3].T
-    inside, rows, columns = pinhole.visible(points, target.intrinsics, target.normals.shape[:2])
-    points, normals = points[inside], normals[inside]
-    n, q = target.normals[rows, columns], target.points[rows, columns]
-    sigma = np.hypot(source.sigma[good][inside], target.sigma[rows, columns])
+    source, target = surfaces[first].known, surfaces[second]
+    turn = relative[:3, :3]
+    points = turn @ source.points + relative[:3, 3:]
+    inside, rows, columns = pinhole.visible(points.T, target.intrinsics, target.sigma.shape)
+    seen, cell = np.flatnonzero(inside), rows * target.sigma.shape[1] + columns
+    away, n = points.take(seen, 1) - target.rows.points.take(cell, 1), target.rows.normals.take(cell, 1)
+    facing = (n * (turn @ source.normals.take(seen, 1))).sum(0)
+    # A comparison with NaN, where the target has no surface, is false.
     with np.errstate(invalid="ignore"):
-        one = (np.linalg.norm(points - q, axis=1) < FARTHEST) & ((n * normals).sum(1) > LEAST_COSINE)
-    if np.count_nonzero(one) < LEAST_POINTS:
+        one = np.flatnonzero(((away * away).sum(0) < FARTHEST**2) & (facing > LEAST_COSINE))
+    if len(one) < LEAST_POINTS:
         return None
-    points, q, n, sigma = points[one], q[one], n[one], sigma[one]
-    residual = (n * (points - q)).sum(1)
+    seen, cell, away, n = seen.take(one), cell.take(one), away.take(one, 1), n.take(one, 1)
+    sigma = np.hypot(source.sigma.take(seen), target.rows.sigma.take(cell))
+    residual = (n * away).sum(0)
     # Tukey's biweight, wide enough for a pose that is off by a few standard deviations.
     scale = max(float(np.median(np.abs(residual / sigma))) * 4.7, 3.0)
     weight = np.maximum(1 - (residual / sigma / scale) ** 2, 0.0) ** 2 / sigma**2
-    weight *= min(effective / len(points), 1.0)
-    jacobian = np.concatenate([n, np.cross(points, n)], 1)
-    hessian = (jacobian * weight[:, None]).T @ jacobian
-    return Alignment(first, second, hessian, jacobian.T @ (weight * residual), len(points))
+    weight *= min(effective / len(one), 1.0)
+    (x, y, z), (a, b, c) = points.take(seen, 1), n
+    jacobian = np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
+    weighted = jacobian * weight
+    return Alignment(first, second, weighted @ jacobian.T, weighted @ residual, len(one))
 
 
 def align_pairs(
@@ -98,15 +123,22 @@ def align_pairs(
     pairs: Sequence[tuple[int, int]],
     surfaces: Sequence[Surface],
     effective: float,
+    room: int | None = None,
 ) -> SurfaceAlignment:
-    """All pairs' alignments at the current poses, as one term; pairs that do not overlap have no weight."""
-    relative = np.array([keyframes[j].pose @ rigid.invert(keyframes[i].pose) for i, j in pairs]).reshape(-1, 4, 4)
-    hessians, gradients = np.zeros((len(pairs), 6, 6)), np.zeros((len(pairs), 6))
+    """All pairs' alignments at the current poses, as one term; pairs that do not overlap have no weight.
+
+    room: observations of the term, by default one a pair.
+    """
+    room = len(pairs) if room is None else room
+    relative = np.tile(np.eye(4), (room, 1, 1))
     for row, (i, j) in enumerate(pairs):
-        found = align(i, j, surfaces, relative[row], effective)
-        if found is not None:
-            hessians[row], gradients[row] = found.hessian, found.gradient
-    return surface_term(pairs, relative, hessians, gradients)
+        relative[row] = keyframes[j].pose @ rigid.invert(keyframes[i].pose)
+    hessians, gradients = np.zeros((room, 6, 6)), np.zeros((room, 6))
+    found = map_in_threads(lambda row: align(*pairs[row], surfaces, relative[row], effective), range(len(pairs)))
+    for row, alignment in enumerate(found):
+        if alignment is not None:
+            hessians[row], gradients[row] = alignment.hessian, alignment.gradient
+    return surface_term([*pairs, *[(0, 0)] * (room - len(pairs))], relative, hessians, gradients)
 
 
 def _block_medians(values: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -63,6 +64,9 @@ TIE_WIDTH = 12.6**0.5
 """Mahalanobis distance at which a measured motion counts half, so that one that all else contradicts (a false loop)
 gives way: the 95 % level of 6 degrees of freedom."""
 
+_quadratic_jit = jax.jit(quadratic)
+"""Compiled at once: one by one its operations take four times as long to compile."""
+
 Factor = MeasuredRotation | MeasuredBaseline | MeasuredRelativePose
 
 
@@ -93,7 +97,7 @@ def surface_term(
     relative poses `[m, 4, 4]`, for pairs of rows of the problem. A zero Hessian is a pair that was not aligned.
     """
     at = jnp.asarray(rigid.to_quaternion(relative))
-    measured, root = quadratic(at, jnp.asarray(hessians), jnp.asarray(gradients))
+    measured, root = _quadratic_jit(at, jnp.asarray(hessians), jnp.asarray(gradients))
     first, second = np.asarray(pairs, int).reshape(-1, 2).T
     aligned = np.any(hessians != 0, (1, 2)).astype(np.float64)
     return SurfaceAlignment(

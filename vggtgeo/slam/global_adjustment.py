@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from vggtgeo.bundle.problem import State
-from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.calibration import Refinement, keyframe_pairs, try_camera
@@ -15,10 +14,10 @@ from vggtgeo.slam.covisibility import Directed, directions
 from vggtgeo.slam.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.factors import factor_terms
 from vggtgeo.slam.gauge import gauge_notes, with_one_gauge
+from vggtgeo.slam.global_shape import GlobalShape, global_solver, shape_of
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import solve_jit, window_size
-from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.slam.window import solve_jit
 
 MUCH = 0.01
 """Relative change of the camera beyond which the user is told."""
@@ -33,8 +32,8 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
     edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
     edges = _thin(edges, len(slam.keyframes), settings)
-    degree = max(np.bincount([edge.host for edge in edges]))
-    size = replace(window_size(settings), keyframes=len(slam.keyframes), degree=int(degree), edges=len(edges))
+    degrees = np.bincount([edge.host for edge in edges])
+    shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.factors, len(slam.pairs), settings)
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = _surfaces(slam)
     given = slam.given_intrinsics
@@ -44,21 +43,17 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             edges,
             slam.intrinsics,
             settings,
-            size=size,
+            size=shape.size,
             given_intrinsics=given,
             intrinsics_sigma=slam.intrinsics_sigma,
             fixed_pose=fixed,
-            terms=_terms(slam, surfaces, settings),
+            terms=_terms(slam, surfaces, shape, settings),
         )
         problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(slam.keyframes), slam.metric)
         adjustment = replace(adjustment, problem=problem)
         told = gauge_notes(gauge, adjustment.keyframes, "global adjustment") if number == 0 else ()
         slam = replace(slam, notes=(*slam.notes, *told))
-        solver = SchurLevenbergMarquardt(
-            max_iterations=settings.refinement.global_iterations,
-            rtol=1e-5,
-            reduced_solver=choose_reduced_solver(adjustment.problem),
-        )
+        solver = global_solver(adjustment.problem, settings)
         solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
@@ -106,17 +101,14 @@ def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
     return [f"the lens distorts, and the calibration does not say so: k1 about {k1:.3f}, {warp:.0f} px in the corners"]
 
 
-def _terms(slam: Slam, surfaces: list[Surface], settings: SlamSettings) -> tuple[AbstractTerm, ...]:
+def _terms(slam: Slam, surfaces: list[Surface], shape: GlobalShape, settings: SlamSettings) -> tuple[AbstractTerm, ...]:
     """What is known about poses beyond matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
-    room: dict[type, int] = {}
-    for factor in slam.factors:
-        room[type(factor)] = room.get(type(factor), 0) + 1
-    terms = factor_terms(slam.factors, places, room)
+    terms = factor_terms(slam.factors, places, shape.room)
     if not surfaces or settings.depth.surface_points <= 0:
         return terms
     pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
-    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points))
+    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points, shape.pairs))
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:

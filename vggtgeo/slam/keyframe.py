@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.keyframe_images import KeyframeImages, array_of
 from vggtgeo.slam.settings import Roles, SlamSettings
 
@@ -91,7 +93,7 @@ def make_keyframe(
     number: int,
     frame: Frame,
     pose: np.ndarray,
-    features: Features,
+    description: Description,
     roles: Roles,
     settings: SlamSettings,
     intrinsics: np.ndarray,
@@ -101,9 +103,12 @@ def make_keyframe(
 
     lines: the frame's segments, where tracking has found them already.
     """
-    depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
-    confidence = roles.confidence.confidence(frame.image)
-    lines = find_lines(frame.image, roles, settings) if lines is None else lines
+    with ThreadPoolExecutor(1, thread_name_prefix="describe") as pool:
+        described = pool.submit(lambda: description.features)  # beside the rest: it takes as long as all of that
+        depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
+        confidence = roles.confidence.confidence(frame.image)
+        lines = find_lines(frame.image, roles, settings) if lines is None else lines
+        features = described.result()
     ends = lines.segments.endpoints
     line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
     segment, pixels, fraction = sample_segments(ends, settings.line.line_spacing)

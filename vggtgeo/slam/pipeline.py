@@ -12,6 +12,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.covisibility import without_matches
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
@@ -40,19 +41,20 @@ def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
 
 @in_double_precision
 def step(
-    slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock | None = None
+    slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock | None = None
 ) -> Slam:
-    """Take one frame (undistorted) with its described key points into the state."""
+    """Take one frame (undistorted) into the state; its key points are found if they are needed."""
     clock = clock or Clock()
     if not slam.metric:
         roles = without_depth(roles)
     if not slam.keyframes:
-        return _first(slam, frame, features, roles, settings)
+        return _first(slam, frame, description.features, roles, settings)
     if not _started(slam):
         with clock.measure("start"):
+            features = description.features
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
             return begun or start_without_depth(slam, frame, features, roles, settings)
-    return _follow(slam, frame, features, roles, settings, clock)
+    return _follow(slam, frame, description, roles, settings, clock)
 
 
 def _started(slam: Slam) -> bool:
@@ -63,7 +65,7 @@ def _started(slam: Slam) -> bool:
 def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
     """Begin a map at this frame: at the world's origin, or where tracking was lost."""
     number = len(slam.keyframes)
-    keyframe = make_keyframe(number, frame, slam.last_pose, features, roles, settings, slam.intrinsics)
+    keyframe = make_keyframe(number, frame, slam.last_pose, Description.of(features), roles, settings, slam.intrinsics)
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, len(features))
     return replace(
         slam,
@@ -81,9 +83,11 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
     )
 
 
-def _follow(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
+def _follow(
+    slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock
+) -> Slam:
     with clock.measure("track"):
-        sight = _with_lines(sight_of(frame, features, slam, roles), roles, settings)
+        sight = _with_lines(sight_of(frame, description, slam, roles), roles, settings)
         found = _find(slam, sight, roles, settings)
     if not found.accepted and slam.lost:
         with clock.measure("relocalise"):
@@ -115,7 +119,8 @@ def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Tra
         if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
             break
     assert best is not None
-    if not settings.tracking.search_map:
+    # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
+    if not settings.tracking.search_map or (best.accepted and not sight.description.described):
         return best
     piece = slam.keyframes[slam.origins[-1] :]
     if not best.accepted:
@@ -148,7 +153,7 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     number = len(slam.keyframes)
     with clock.measure("keyframe"):
         keyframe = make_keyframe(
-            number, frame, found.pose, sight.features, roles, settings, slam.intrinsics, sight.found_lines
+            number, frame, found.pose, sight.description, roles, settings, slam.intrinsics, sight.found_lines
         )
     with clock.measure("match keyframes"):
         tie = tie_to(found, number)

@@ -234,6 +234,8 @@ def _players(
         window = BoundedWindow(model)
         bounded["geometry"] = WindowLocator(window, classical.geometry, views=model.views)
         refusals["geometry"] = window.refusals
+    if {"points", "geometry"} & parts.keys():  # these ask for every frame's own points
+        bounded["flow"] = None
     return bounded, refusals
 
 

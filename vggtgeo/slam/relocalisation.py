@@ -11,6 +11,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import place_vector
 from vggtgeo.models.roles import Features
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles
@@ -95,7 +96,7 @@ def place_waiting(slam: Slam, roles: Roles) -> Slam:
     source = view_of(keyframe, slam, roles)
     for number, waiting in enumerate(reversed(slam.waiting)):
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
-        sight = sight_of(frame, waiting.features, slam, roles)
+        sight = sight_of(frame, Description.of(waiting.features), slam, roles)
         expected = Expectation(step @ pose, step, waited=min(number, 3))
         found = track(sight, keyframe, source, expected, slam.intrinsics, roles)
         if not found.accepted:
@@ -106,12 +107,13 @@ def place_waiting(slam: Slam, roles: Roles) -> Slam:
     return replace(slam, frames=frames, waiting=())
 
 
-def sight_of(frame: Frame, features: Features, slam: Slam, roles: Roles) -> Sight:
+def sight_of(frame: Frame, description: Description, slam: Slam, roles: Roles) -> Sight:
     """The frame as it is tracked."""
     view = None
     if roles.alignment is not None and slam.metric:
-        view = RgbdView.of(frame.image, roles.tracking_depth(frame.depth), slam.intrinsics)
-    return Sight(frame, features, view)
+        view = description.view_by(slam.intrinsics)
+        view = view or RgbdView.of(frame.image, roles.tracking_depth(frame.depth), slam.intrinsics)
+    return Sight(frame, description, view)
 
 
 def record_of(frame: Frame, found: Track) -> FramePose:

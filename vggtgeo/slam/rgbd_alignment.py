@@ -7,7 +7,8 @@ the motion source camera -> target camera, `x = T p` of a source point `p`:
     r_D = n . (x - q)                      `q, n` the target's surface at the pixel that x falls on
 
 Each iteration solves the 6 x 6 normal equations of both over the left tangent (`T <- exp(xi) T`, translation first),
-weighted by Tukey's biweight. Cost: O(samples) an iteration, 1 ms for 5,000.
+weighted by Tukey's biweight. Cost: O(samples) an iteration, 0.6 ms for 6,000: coordinates stand in rows [3, n], in
+single precision, whose rounding moves a pose by micrometres.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ import cv2
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
-from vggtgeo.slam.rgbd_view import LEVELS, RgbdView
+from vggtgeo.slam.rgbd_view import LEVELS, RgbdView, Samples
 
 FARTHEST = 0.15
 """Metres between a point and the surface it may belong to."""
 LEAST_COSINE = 0.7
 LEAST_SAMPLES = 60
+NAN = float("nan")
 TUKEY = 4.685
 """Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
 
@@ -64,108 +65,131 @@ class RgbdAlignment:
     def align(self, source: RgbdView, target: RgbdView, start: np.ndarray) -> Aligned | None:
         """The motion source -> target from `start` float64 [4, 4]; None where they share too little."""
         motion = start
-        rows = None
         for level in reversed(range(LEVELS)):
-            step = 2 if level else 1
-            points, normals, noise = source.samples
-            samples = points[::step], normals[::step], noise[::step]
+            samples = source.samples.every(2 if level else 1)
             for _ in range(self.iterations[level]):
-                rows = self._rows(source, target, level, samples, motion)
-                if rows is None:
+                edges, surface = _brightness(source, target, level, motion), _planes(samples, target, motion)
+                if edges is None and surface is None:
                     return None
-                change = _solve(*rows[:2])
+                change = _solve(*self._normal_equations(edges, surface))
                 motion = rigid.exponential(change) @ motion
                 if np.abs(change).max() < (1e-5 if level == 0 else 1e-4):
                     break
-        rows = self._rows(source, target, 0, source.samples, motion)
-        if rows is None:
-            return None
-        information, _, evidence = rows
-        return Aligned(motion, information, *evidence, overlap=evidence[3] / max(len(source.samples[0]), 1))
+        return self._judged(source, target, motion)
 
-    def _rows(
-        self,
-        source: RgbdView,
-        target: RgbdView,
-        level: int,
-        samples: tuple[np.ndarray, np.ndarray, np.ndarray],
-        motion: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, tuple[float, float, int, int, float]] | None:
-        """Normal equations `H, g` of both terms at `motion`, and how far they agree."""
-        hessian, gradient = np.zeros((6, 6)), np.zeros(6)
-        edges = _brightness(source, target, level, motion)
-        surface = _planes(*samples, target, motion)
-        shares, counts = [float("nan")] * 2, [0, 0]
-        correlation = float("nan")
-        if edges is not None:
-            jacobian, residual, correlation = edges
-            sigma = max(1.4826 * float(np.median(np.abs(residual))), self.brightness_noise)
-            weight = _biweight(residual / sigma) / (sigma**2 * self.edge_spread)
-            hessian += (jacobian * weight[:, None]).T @ jacobian
-            gradient += jacobian.T @ (weight * residual)
-            shares[0], counts[0] = float(np.mean(np.abs(residual) < 3 * self.brightness_noise)), len(residual)
-        if surface is not None:
-            jacobian, residual = surface
-            scale = max(1.4826 * float(np.median(np.abs(residual))), 1.0)
-            weight = _biweight(residual / scale) / (scale**2 * self.surface_spread)
-            hessian += (jacobian * weight[:, None]).T @ jacobian
-            gradient += jacobian.T @ (weight * residual)
-            shares[1], counts[1] = float(np.mean(np.abs(residual) < 3)), len(residual)
+    def _judged(self, source: RgbdView, target: RgbdView, motion: np.ndarray) -> Aligned | None:
+        """The result, with how far both terms agree with it."""
+        edges, surface = _brightness(source, target, 0, motion), _planes(source.samples, target, motion)
         if edges is None and surface is None:
             return None
-        return hessian, gradient, (shares[0], shares[1], counts[0], counts[1], correlation)
+        seen = 0 if surface is None else len(surface.residual)
+        return Aligned(
+            motion,
+            self._normal_equations(edges, surface)[0],
+            edges=NAN if edges is None else edges.share_within(3 * self.brightness_noise),
+            surface=NAN if surface is None else surface.share_within(3),
+            edge_count=0 if edges is None else len(edges.residual),
+            surface_count=seen,
+            correlation=NAN if edges is None else edges.correlation,
+            overlap=seen / max(len(source.samples.sigma), 1),
+        )
+
+    def _normal_equations(self, edges: _Rows | None, surface: _Rows | None) -> tuple[np.ndarray, np.ndarray]:
+        """`H, g` float64 [6, 6], [6] of the terms that there are."""
+        hessian, gradient = np.zeros((6, 6)), np.zeros(6)
+        for rows, noise, spread in (
+            (edges, self.brightness_noise, self.edge_spread),
+            (surface, 1, self.surface_spread),
+        ):
+            if rows is not None:
+                scale = max(1.4826 * _median(np.abs(rows.residual)), noise)
+                weighted = rows.jacobian * (_biweight(rows.residual, scale) / (scale**2 * spread))
+                hessian += weighted @ rows.jacobian.T
+                gradient += weighted @ rows.residual
+        return hessian, gradient
 
 
-def _brightness(
-    source: RgbdView, target: RgbdView, level: int, motion: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Rows of `r_I`, float32 [m, 6], residuals [m] in grey levels, and the correlation of the brightness."""
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """One term at a motion: jacobian float32 [6, m] over its left tangent, residual [m]. correlation: of brightness."""
+
+    jacobian: np.ndarray
+    residual: np.ndarray
+    correlation: float = NAN
+
+    @classmethod
+    def of(cls, points: np.ndarray, by_point: np.ndarray, residual: np.ndarray, correlation: float = NAN) -> _Rows:
+        """From the derivative by the point that moves, both [3, m]: the tangent's rotation turns it, `x cross row`."""
+        (x, y, z), (a, b, c) = points, by_point
+        return cls(np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a]), residual, correlation)
+
+    def share_within(self, gate: float) -> float:
+        return float(np.mean(np.abs(self.residual) < gate))
+
+
+def _brightness(source: RgbdView, target: RgbdView, level: int, motion: np.ndarray) -> _Rows | None:
+    """`r_I` in grey levels; None of too few samples in view."""
     gray = target.levels[level]
-    if len(source.edges) < LEAST_SAMPLES:
+    if source.edges.shape[1] < LEAST_SAMPLES:
         return None
-    x = source.edges @ motion[:3, :3].T + motion[:3, 3]
-    height, width = gray.value.shape
-    u, v = pinhole.project(x, gray.intrinsics, nearest=0.1).T
-    with np.errstate(invalid="ignore"):
-        inside = (u > 1) & (v > 1) & (u < width - 2) & (v < height - 2)
-    if np.count_nonzero(inside) < LEAST_SAMPLES:
+    x = _moved(source.edges, motion)
+    u, v = _projected(x, gray.intrinsics)
+    height, width = gray.image.shape[:2]
+    inside = np.flatnonzero((u > 1) & (v > 1) & (u < width - 2) & (v < height - 2))
+    if len(inside) < LEAST_SAMPLES:
         return None
-    x, u, v = x[inside], u[inside].astype(np.float32)[None], v[inside].astype(np.float32)[None]
-    seen, dx, dy = (cv2.remap(image, u, v, cv2.INTER_LINEAR)[0] for image in (gray.value, gray.dx, gray.dy))
-    reference = source.edge_values[level][inside]
+    x = x.take(inside, 1)
+    seen, dx, dy = cv2.remap(gray.image, u.take(inside), v.take(inside), cv2.INTER_LINEAR).reshape(-1, 3).T
+    reference = source.edge_values[level].take(inside)
     both = float(seen @ reference)
     correlation = both / float(np.linalg.norm(seen) * np.linalg.norm(reference) + 1e-9)
-    exposure = float(np.clip(both / (reference @ reference + 1e-9), 0.6, 1.7))
-    fx, fy = gray.intrinsics[:2]
-    along_x, along_y = fx * dx / x[:, 2], fy * dy / x[:, 2]
-    by_point = np.stack([along_x, along_y, -(along_x * x[:, 0] + along_y * x[:, 1]) / x[:, 2]], 1)
-    jacobian = np.concatenate([by_point, np.cross(x, by_point)], 1)
-    return jacobian, seen - exposure * reference, correlation
+    exposure = np.float32(np.clip(both / float(reference @ reference + 1e-9), 0.6, 1.7))
+    fx, fy = gray.intrinsics[:2].astype(np.float32)
+    along_x, along_y = fx * dx / x[2], fy * dy / x[2]
+    by_point = np.stack([along_x, along_y, -(along_x * x[0] + along_y * x[1]) / x[2]])
+    return _Rows.of(x, by_point, seen - exposure * reference, correlation)
 
 
-def _planes(
-    points: np.ndarray, normals: np.ndarray, noise: np.ndarray, target: RgbdView, motion: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rows of `r_D` [m, 6] and residuals [m], both in standard deviations of the two depths.
+def _planes(samples: Samples, target: RgbdView, motion: np.ndarray) -> _Rows | None:
+    """`r_D` and its rows, both in standard deviations of the two depths; None of too few samples in view.
 
     Along the normal the error is at most that of the depth: a standard deviation on the safe side.
     """
-    if len(points) < LEAST_SAMPLES or not len(target.surface):
+    if len(samples.sigma) < LEAST_SAMPLES:
         return None
-    turn, shift = motion[:3, :3].astype(np.float32), motion[:3, 3].astype(np.float32)
-    x = points @ turn.T + shift
-    inside, rows, columns = pinhole.visible(x, target.surface_intrinsics, target.surface.shape[:2])
-    x = x[inside]
-    q, n = target.surface[rows, columns], target.normals[rows, columns]
-    turned = normals[inside] @ turn.T
-    residual = ((x - q) * n).sum(1)
-    with np.errstate(invalid="ignore"):
-        one = (np.abs(residual) < FARTHEST) & ((n * turned).sum(1) > LEAST_COSINE)
-    if np.count_nonzero(one) < LEAST_SAMPLES:
+    height, width = target.surface.shape
+    x = _moved(samples.points, motion)
+    u, v = np.rint(_projected(x, target.surface.intrinsics))
+    inside = np.flatnonzero((u >= 0) & (v >= 0) & (u < width) & (v < height))
+    x = x.take(inside, 1)
+    cells = target.surface.cells.take((v.take(inside) * width + u.take(inside)).astype(np.intp), 1)
+    q, n = cells[:3], cells[3:6]
+    turned = motion[:3, :3].astype(np.float32) @ samples.normals.take(inside, 1)
+    residual = ((x - q) * n).sum(0)
+    # A cell without a surface has no normal: the cosine of zero is below any level.
+    one = np.flatnonzero((np.abs(residual) < FARTHEST) & ((n * turned).sum(0) > LEAST_COSINE))
+    if len(one) < LEAST_SAMPLES:
         return None
-    x, n, residual = x[one], n[one], residual[one]
-    sigma = np.hypot(noise[inside][one], target.sigma[rows, columns][one])
-    return np.concatenate([n, np.cross(x, n)], 1) / sigma[:, None], residual / sigma
+    sigma = np.hypot(samples.sigma.take(inside.take(one)), cells[6].take(one))
+    return _Rows.of(x.take(one, 1), n.take(one, 1) / sigma, residual.take(one) / sigma)
+
+
+def _moved(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    near = motion.astype(np.float32)
+    return near[:3, :3] @ points + near[:3, 3:]
+
+
+def _projected(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Pixels float32 [2, n]; NaN, which is in no image, of points nearer than 10 cm, where sensors of depth begin."""
+    z = np.where(points[2] > 0.1, points[2], np.float32(np.nan))
+    focal, centre = intrinsics.astype(np.float32).reshape(2, 2, 1)
+    return points[:2] / z * focal + centre
+
+
+def _median(values: np.ndarray) -> float:
+    """The middle value, the upper one of an even number."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
 
 
 def _solve(hessian: np.ndarray, gradient: np.ndarray) -> np.ndarray:
@@ -173,5 +197,7 @@ def _solve(hessian: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     return -np.linalg.solve(damped, gradient)
 
 
-def _biweight(residual: np.ndarray) -> np.ndarray:
-    return np.maximum(1 - (residual / TUKEY) ** 2, 0.0) ** 2
+def _biweight(residual: np.ndarray, scale: float) -> np.ndarray:
+    share = residual * np.float32(1 / (TUKEY * scale))
+    inner = np.maximum(1 - share * share, 0)
+    return inner * inner

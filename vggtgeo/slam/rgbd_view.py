@@ -26,31 +26,49 @@ MOST_POINTS = 2400
 
 @dataclass(frozen=True, eq=False)
 class Gray:
-    """One level: brightness without its local mean and its derivatives, float32 [h, w]; intrinsics of the level."""
+    """One level. image: float32 [h, w, 3], brightness without its local mean and its derivatives by x and y."""
 
-    value: np.ndarray
-    dx: np.ndarray
-    dy: np.ndarray
+    image: np.ndarray
     intrinsics: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Cells of an image with depth. cells: float32 [7, h w], the point in the camera frame, metres, the unit normal
+    towards the camera, and the standard deviation of the depth, metres; normal zero = none. shape: h, w.
+    """
+
+    cells: np.ndarray
+    shape: tuple[int, int]
+    intrinsics: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Cells spread over the image: points float32 [3, n], normals [3, n], standard deviations of the depth [n]."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    sigma: np.ndarray
+
+    def every(self, step: int) -> Samples:
+        """Each `step`-th."""
+        if step == 1:
+            return self
+        return Samples(*(np.ascontiguousarray(rows[..., ::step]) for rows in (self.points, self.normals, self.sigma)))
 
 
 @dataclass(frozen=True, eq=False)
 class RgbdView:
     """What an alignment needs of one image.
 
-    levels: finest first. surface: float32 [h, w, 3] points in the camera frame, metres, and normals: the same of unit
-    normals towards the camera, NaN = none; sigma: float32 [h, w], standard deviation of their depth, metres;
-    surface_intrinsics of that grid. samples: points and normals float32 [n, 3] and standard deviations [n] of cells
-    spread over the image. edges: float64 [m, 3] points in the camera frame with a strong gradient, and edge_values:
-    one float32 [m] of brightness for each level.
+    levels: finest first. edges: float32 [3, m] points in the camera frame with a strong gradient, metres, and
+    edge_values: one float32 [m] of brightness for each level.
     """
 
     levels: tuple[Gray, ...]
-    surface: np.ndarray
-    normals: np.ndarray
-    sigma: np.ndarray
-    surface_intrinsics: np.ndarray
-    samples: tuple[np.ndarray, np.ndarray, np.ndarray]
+    surface: Surface
+    samples: Samples
     edges: np.ndarray
     edge_values: tuple[np.ndarray, ...]
 
@@ -59,18 +77,17 @@ class RgbdView:
         """From an image uint8 [H, W, 3], its depth float [H, W], metres, NaN = none, and that one's relative sigma."""
         factor = max(round(image.shape[1] / WIDTH), 1)
         gray = _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), factor)
-        own = pinhole.coarser(intrinsics, factor)
-        levels = _pyramid(gray, own)
-        if depth is None or not np.isfinite(depth[0]).any():
-            nothing = np.full((1, 1, 3), np.nan, np.float32)
-            none, empty = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-            return cls(levels, nothing, nothing, nothing[..., 0], own, (none, none, empty), none, (empty,) * LEVELS)
-        cells, sigma = _cell_means(*depth, factor * BLOCK)
+        levels = _pyramid(gray, pinhole.coarser(intrinsics, factor))
         coarse = pinhole.coarser(intrinsics, factor * BLOCK)
-        surface = _unproject_grid(cells, coarse)
-        normals = _normals(surface)
+        if depth is None or not np.isfinite(depth[0]).any():
+            none, empty = np.zeros((3, 0), np.float32), np.zeros(0, np.float32)
+            nothing = Surface(np.zeros((7, 1), np.float32), (1, 1), coarse)
+            return cls(levels, nothing, Samples(none, none, empty), none, (empty,) * LEVELS)
+        cells, sigma = _cell_means(*depth, factor * BLOCK)
+        points = _unproject_grid(cells, coarse)
+        normals = _normals(points)
         edges, values = _edge_samples(levels, cells)
-        return cls(levels, surface, normals, sigma, coarse, _spread(surface, normals, sigma), edges, values)
+        return cls(levels, _surface(points, normals, sigma, coarse), _spread(points, normals, sigma), edges, values)
 
 
 def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
@@ -86,7 +103,7 @@ def _pyramid(gray: np.ndarray, intrinsics: np.ndarray) -> tuple[Gray, ...]:
         value = image - cv2.GaussianBlur(image, (0, 0), BACKGROUND)
         dx = cv2.Scharr(value, cv2.CV_32F, 1, 0, scale=1 / 32)
         dy = cv2.Scharr(value, cv2.CV_32F, 0, 1, scale=1 / 32)
-        levels.append(Gray(value, dx, dy, pinhole.coarser(intrinsics, 2**level)))
+        levels.append(Gray(cv2.merge([value, dx, dy]), pinhole.coarser(intrinsics, 2**level)))
     return tuple(levels)
 
 
@@ -129,19 +146,26 @@ def _normals(points: np.ndarray) -> np.ndarray:
     return normals
 
 
-def _spread(surface: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals and standard deviations of at most about `MOST_POINTS` cells, evenly spread."""
+def _surface(points: np.ndarray, normals: np.ndarray, sigma: np.ndarray, intrinsics: np.ndarray) -> Surface:
+    known = np.isfinite(normals[..., :1])
+    cells = np.where(known, np.concatenate([points, normals, sigma[..., None]], 2), np.float32(0))
+    return Surface(np.ascontiguousarray(cells.reshape(-1, 7).T), (sigma.shape[0], sigma.shape[1]), intrinsics)
+
+
+def _spread(surface: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> Samples:
+    """At most about `MOST_POINTS` cells, evenly spread."""
     known = np.nonzero(np.isfinite(normals[..., 0]).ravel())[0]
     # A fixed shuffle: a regular stride would take whole columns of the grid.
     order = np.random.default_rng(0).permutation(len(known))[:MOST_POINTS]
     chosen = np.sort(known[order])
-    return surface.reshape(-1, 3)[chosen], normals.reshape(-1, 3)[chosen], sigma.ravel()[chosen]
+    rows = (np.ascontiguousarray(grid.reshape(-1, 3)[chosen].T) for grid in (surface, normals))
+    return Samples(*rows, sigma.ravel()[chosen])
 
 
 def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """The strongest gradient of each cell whose depth is known: points float64 [m, 3], brightness of each level."""
+    """The strongest gradient of each cell whose depth is known: points float32 [3, m], brightness of each level."""
     finest = levels[0]
-    strength = np.hypot(finest.dx, finest.dy)
+    strength = np.hypot(finest.image[..., 1], finest.image[..., 2])
     height, width = (side // EDGE_CELL * EDGE_CELL for side in strength.shape)
     blocks = strength[:height, :width].reshape(height // EDGE_CELL, EDGE_CELL, width // EDGE_CELL, EDGE_CELL)
     flat = blocks.transpose(0, 2, 1, 3).reshape(height // EDGE_CELL, width // EDGE_CELL, -1)
@@ -158,5 +182,6 @@ def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarr
     values = []
     for number, level in enumerate(levels):
         x, y = ((pixels + 0.5) / 2**number - 0.5).astype(np.float32).T
-        values.append(cv2.remap(level.value, x[None], y[None], cv2.INTER_LINEAR)[0] if len(x) else x)
-    return points, tuple(values)
+        value = np.ascontiguousarray(level.image[..., 0])
+        values.append(cv2.remap(value, x[None], y[None], cv2.INTER_LINEAR)[0] if len(x) else x)
+    return np.ascontiguousarray(points.T, np.float32), tuple(values)

@@ -19,10 +19,12 @@ from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.connected import pieces_by_size
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.loops import close_loops
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
@@ -80,8 +82,8 @@ def run_frames(
 ) -> Iterator[Slam]:
     """The same over any iterable of frames of one camera."""
     slam = begin(camera, roles, settings)
-    for frame, features in _described(frames, camera, roles, clock):
-        slam = step(slam, frame, features, roles, settings, clock)
+    for frame, description in _described(frames, camera, roles, clock):
+        slam = step(slam, frame, description, roles, settings, clock)
         yield slam
 
 
@@ -160,26 +162,41 @@ def keyframe_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
     return Trajectory(np.array([keyframe.timestamp for keyframe in own]), poses)
 
 
-def _described(frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock) -> Iterator[tuple[Frame, Features]]:
-    """Undistorted frames with their key points, prepared in a thread of their own while earlier ones are tracked."""
-    undistorter = camera.undistorter()
+def _described(
+    frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock
+) -> Iterator[tuple[Frame, Description]]:
+    """Undistorted frames, prepared in a thread of their own while earlier ones are tracked; where every frame needs its
+    key points, with them.
+    """
+    undistorter, intrinsics = camera.undistorter(), np.array(camera.intrinsics, np.float64)
 
-    def prepare(frame: Frame) -> tuple[Frame, Features]:
+    def describe(image: np.ndarray, stage: str) -> Features:
+        with clock.measure(stage):
+            return roles.points.describe(image)
+
+    def prepare(frame: Frame) -> tuple[Frame, Description]:
         _check_size(frame, camera)
-        with clock.measure("describe (own thread)"):
-            image = undistorter.image(frame.image)
-            depth = None if frame.depth is None else undistorter.depth(frame.depth)
-            frame = Frame(frame.index, frame.timestamp, image, depth, frame.name)
-            return frame, roles.points.describe(image)
+        image = undistorter.image(frame.image)
+        depth = None if frame.depth is None else undistorter.depth(frame.depth)
+        frame = Frame(frame.index, frame.timestamp, image, depth, frame.name)
+        view = None
+        if roles.alignment is not None and roles.metric and camera.known:
+            with clock.measure("prepare (own thread)"):
+                view = RgbdView.of(image, roles.tracking_depth(depth), intrinsics)
+        if roles.follows:
+            return frame, Description(lambda: describe(image, "describe"), view, intrinsics)
+        return frame, Description.of(describe(image, "describe (own thread)"), view, intrinsics)
 
-    def read_and_prepare() -> tuple[Frame, Features] | None:
+    def read_and_prepare() -> tuple[Frame, Description] | None:
         with clock.measure("read (own thread)"):
             frame = next(source, None)
         return None if frame is None else prepare(frame)
 
     source = iter(frames)
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames") as pool:
-        queue: deque[Future[tuple[Frame, Features] | None]] = deque(pool.submit(read_and_prepare) for _ in range(AHEAD))
+        queue: deque[Future[tuple[Frame, Description] | None]] = deque(
+            pool.submit(read_and_prepare) for _ in range(AHEAD)
+        )
         try:
             while (ready := queue.popleft().result()) is not None:
                 queue.append(pool.submit(read_and_prepare))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.slam.covisibility import Directed
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.line_support import spread_samples
 from vggtgeo.slam.settings import SlamSettings
 
@@ -20,6 +20,12 @@ class Selection:
     host: np.ndarray
     slot: np.ndarray
     table: tuple[np.ndarray, ...]
+
+    def read(self, slots: Sequence[Slots], name: str) -> np.ndarray:
+        """One field of the chosen slots, float64 [m, ...]; `slots` are those of each host."""
+        ends = np.cumsum(np.bincount(self.host, minlength=len(slots)))
+        own = np.split(self.slot, ends[:-1])
+        return np.concatenate([getattr(of_host, name)[chosen] for of_host, chosen in zip(slots, own, strict=True)])
 
     @classmethod
     def of(cls, chosen: list[np.ndarray], sizes: list[int]) -> Selection:

@@ -12,6 +12,7 @@ from vggtgeo.models.classical import (
     BandLineMatcher,
     LsdDetector,
     NoDepth,
+    PatchFlow,
     PnpGeometry,
     SensorDepth,
     SiftMatcher,
@@ -52,6 +53,9 @@ class Roles:
     geometry: InitialGeometry = field(default_factory=PnpGeometry)
     alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
     """Aligns a frame's picture and depth to a keyframe's as a whole, beside its key points; None leaves that out."""
+    flow: PatchFlow | None = field(default_factory=PatchFlow)
+    """Follows a keyframe's key points into frames that `alignment` then refines, so that most frames need no
+    descriptors; None describes and matches every frame."""
 
     def tracking_depth(self, sensor_depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
         """What of a frame's own depth is used to track it, metres and relative standard deviation, float32 [H, W].
@@ -64,6 +68,11 @@ class Roles:
         with np.errstate(invalid="ignore"):
             depth = np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.float32(np.nan))
         return depth, self.depth.noise(depth)
+
+    @property
+    def follows(self) -> bool:
+        """Whether frames are followed by flow, and described only where that fails."""
+        return self.flow is not None and self.alignment is not None and isinstance(self.depth, SensorDepth)
 
     @property
     def coarse_points(self) -> PointMatcher:

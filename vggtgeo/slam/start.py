@@ -10,6 +10,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, GeometryResult, PoseQuery
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import FramePose, Slam, Waiting
@@ -36,7 +37,9 @@ def begin_again_with_depth(
     if not np.any(np.isfinite(depth.depth)):
         return None
     blind = slam.keyframes[slam.window[-1]]
-    keyframe = make_keyframe(blind.number, frame, blind.pose, features, roles, settings, slam.intrinsics)
+    keyframe = make_keyframe(
+        blind.number, frame, blind.pose, Description.of(features), roles, settings, slam.intrinsics
+    )
     if np.count_nonzero(np.isfinite(keyframe.points.inverse_depth)) < settings.tracking.least_inliers:
         return None
     note = f"the depth of frame {blind.frame} is not known; the map begins at frame {frame.index} ({frame.name})"
@@ -77,7 +80,9 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
     keyframes = (*slam.keyframes[:-1], first)
     slam = replace(slam, keyframes=keyframes)
     number = len(keyframes)
-    second = make_keyframe(number, frame, relative @ first.pose, features, roles, settings, slam.intrinsics)
+    second = make_keyframe(
+        number, frame, relative @ first.pose, Description.of(features), roles, settings, slam.intrinsics
+    )
     slam = enter(slam, second, roles, settings)
     slam = adjust(replace(slam, factors=(*slam.factors, scale_anchor(slam))), settings)
     slam = _place_waiting(slam, slam.keyframes[first.number], roles)

@@ -16,12 +16,13 @@ from vggtgeo.models.roles import (
     GeometryResult,
     LineFeatures,
     PointMatcher,
-    PointMatches,
     PoseGuess,
     PoseQuery,
 )
+from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.following import Located, located_by_flow
 from vggtgeo.slam.fusion import Motion, agreed, drawn_to, wanting, with_lines, with_systematic
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.map_points import joint_matches, refine_by_map
@@ -44,7 +45,7 @@ class Sight:
     """
 
     frame: Frame
-    features: Features
+    description: Description
     view: RgbdView | None
     find_lines: Callable[[], LineFeatures] | None = None
 
@@ -58,6 +59,11 @@ class Sight:
         """The segments, where they were asked for."""
         found: LineFeatures | None = self.__dict__.get("lines")
         return found
+
+    @property
+    def features(self) -> Features:
+        """Its key points, found when they are first asked for."""
+        return self.description.features
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +128,13 @@ def track(
     """
     views = None if source is None or sight.view is None else (source, sight.view)
     aligner = roles.alignment if views is not None else None
-    matcher = roles.points if aligner is None else roles.coarse_points
-    guess, matches, points = _by_points(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
-    return _placed(sight, keyframe, views, expected, guess, points, len(matches), intrinsics, roles)
+    located = None
+    if aligner is not None and expected is not None and roles.flow is not None and roles.follows:
+        located = located_by_flow(sight.frame.image, keyframe, expected.pose, intrinsics, roles.flow, roles.geometry)
+    if located is None:
+        matcher = roles.points if aligner is None else roles.coarse_points
+        located = _by_descriptors(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
+    return _placed(sight, keyframe, views, expected, located, intrinsics, roles)
 
 
 def track_by_map(
@@ -144,9 +154,9 @@ def track_by_map(
         sight.features, tuple(keyframes), expected.pose, intrinsics, ROUGH_RADIUS
     )
     query = PoseQuery(sight.frame.image, intrinsics, points, pixels, confidence, expected.pose)
-    guess = roles.geometry.locate(query)
+    located = Located(roles.geometry.locate(query), len(points), points, PIXEL_SIGMA)
     views = None if source is None or sight.view is None else (source, sight.view)
-    return _placed(sight, reference, views, expected, guess, points, len(points), intrinsics, roles)
+    return _placed(sight, reference, views, expected, located, intrinsics, roles)
 
 
 def _placed(
@@ -154,25 +164,21 @@ def _placed(
     keyframe: Keyframe,
     views: tuple[RgbdView, RgbdView] | None,
     expected: Expectation | None,
-    guess: PoseGuess,
-    points: np.ndarray,
-    matches: int,
+    located: Located,
     intrinsics: np.ndarray,
     roles: Roles,
 ) -> Track:
-    """The pose by key points, then by picture, surface and lines from there, or from where the motion so far leads.
-
-    points: [n, 3], the world points that `guess` is from, of so many `matches`.
-    """
+    """The pose by key points, then by picture, surface and lines from there, or from where the motion so far leads."""
+    guess = located.guess
     known = guess.result is GeometryResult.SUCCESS
     aligner, dense = roles.alignment, None
     if aligner is not None and views is not None and (known or expected):
         dense = aligner.align(*views, guess.pose @ rigid.invert(keyframe.pose))
     by_points = None
     if known:
-        information = pose_information(guess.pose, points[guess.inliers], intrinsics, PIXEL_SIGMA)
+        information = pose_information(guess.pose, located.points[guess.inliers], intrinsics, located.sigma)
         by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
-    evidence = _seen(guess, matches, by_points, dense)
+    evidence = _seen(guess, located.matches, by_points, dense)
     prior = None if expected is None else expected.motion_from(keyframe)
     found = agreed(by_points, dense, evidence)
     if found is not None and prior is not None:
@@ -236,7 +242,7 @@ def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
     )
 
 
-def _by_points(
+def _by_descriptors(
     sight: Sight,
     keyframe: Keyframe,
     expected: Expectation | None,
@@ -244,8 +250,8 @@ def _by_points(
     matcher: PointMatcher,
     roles: Roles,
     window: tuple[Keyframe, ...],
-) -> tuple[PoseGuess, PointMatches, np.ndarray]:
-    """The pose by key points; their matches whose depth is known, and those points in the world."""
+) -> Located:
+    """The pose by key points that match in their descriptors, as far as their depth is known."""
     matches = matcher.match(keyframe.features, sight.features)
     inverse_depth = keyframe.points.inverse_depth[matches.index_i]
     known = np.isfinite(inverse_depth)
@@ -262,7 +268,7 @@ def _by_points(
         window_poses=tuple(member.pose for member in window),
         window_depths=tuple(member.depth for member in window) if roles.metric else (),
     )
-    return roles.geometry.locate(query), matches, points
+    return Located(roles.geometry.locate(query), len(matches), points, PIXEL_SIGMA)
 
 
 def _judged(

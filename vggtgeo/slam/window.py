@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import equinox as eqx
@@ -14,7 +16,9 @@ from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
+from vggtgeo.models.classical import can_search
 from vggtgeo.slam.adjustment import Adjustment, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
@@ -24,6 +28,7 @@ from vggtgeo.slam.line_triangulation import with_segment_depths
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
@@ -41,12 +46,37 @@ def window_size(settings: SlamSettings) -> PaddedSize:
     )
 
 
-@in_double_precision
 def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State]:
     """Compile what every window needs, on a problem of the right shape that holds one observation.
 
-    Returns that problem and its solution, for whoever has more to compile.
+    Both programs at once, on two cores. Returns that problem and where it starts, for whoever has more to compile.
     """
+    problem, initial = _smallest_window(settings, metric)
+    with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
+        marginalising = pool.submit(_compile_marginalisation, problem, initial)
+        _compile_solver(problem, initial, settings)
+        marginalising.result()
+    return problem, initial
+
+
+@in_double_precision
+def _compile_solver(problem: Problem, initial: State, settings: SlamSettings) -> None:
+    solve_jit(problem, initial, solver=window_solver(settings)).energy.block_until_ready()
+
+
+@in_double_precision
+def _compile_marginalisation(problem: Problem, initial: State) -> None:
+    marginalise_jit(problem, initial, jnp.asarray(0)).root.block_until_ready()
+
+
+@in_double_precision
+def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, State]:
+    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric)))
+    return smallest_problem(window_size(settings), settings, terms)
+
+
+def smallest_problem(size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm]) -> tuple[Problem, State]:
+    """A problem of the given shape that holds one observation, and where it starts: to compile for that shape."""
     one = Observations(
         edges=np.array([[0, 1]]),
         host=np.zeros(1, int),
@@ -59,13 +89,9 @@ def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
     intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
-    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric)))
-    problem, initial, _ = pack(
-        one, poses, intrinsics, np.ones(1), size=window_size(settings), kernel=settings.window.kernel, terms=terms
-    )
-    solution = solve_jit(problem, initial, solver=window_solver(settings))
-    marginalise_jit(problem, solution.state, jnp.asarray(0)).root.block_until_ready()
-    return problem, solution.state
+    kernel = settings.window.kernel
+    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=size, kernel=kernel, terms=terms)
+    return problem, initial
 
 
 def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
@@ -97,9 +123,10 @@ def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, 
     The images of those outside the window are compressed.
     """
     slam = make_room(slam, settings, tied_to)
-    matched = [
-        match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics) for number in slam.window
-    ]
+    match = lambda number: match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics)
+    # A network takes all cores, or the GPU, for one pair.
+    alone = not can_search(keyframe.features)
+    matched = [match(number) for number in slam.window] if alone else map_in_threads(match, slam.window)
     pairs = tuple(pair for pair in matched if pair is not None)
     inside = (*slam.window, keyframe.number)
     kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in slam.keyframes)

@@ -7,7 +7,9 @@ is right says how far away they are. About 4 ms a frame (640 x 480), 4 kB a fram
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -28,6 +30,8 @@ CONTRAST = 50.0
 """Grey levels, standard deviation."""
 ROUND_TRIP = 0.5
 """Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
+MOST_WAITING = 4
+"""Frames that wait to be looked at; they hold their images."""
 _FLOW = {
     "winSize": (15, 15),
     "maxLevel": 4,
@@ -69,7 +73,9 @@ class EvidenceRecorder(Callback):
     """
 
     def __init__(self, camera: Camera) -> None:
-        self.frames: list[FrameEvidence] = []
+        self._frames: list[FrameEvidence] = []
+        self._waiting: deque[Future[None]] = deque()
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="evidence")
         self._camera = camera
         self._image: np.ndarray | None = None
         self._depth: np.ndarray | None = None
@@ -77,11 +83,25 @@ class EvidenceRecorder(Callback):
         self._pixels = np.zeros((0, 2), np.float32)
         self._next = 0
 
+    @property
+    def frames(self) -> list[FrameEvidence]:
+        """What was noted of each frame so far."""
+        while self._waiting:
+            self._waiting.popleft().result()
+        return self._frames
+
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        self.add(frame)
+        """Beside the run, in a thread of its own: nothing here needs its state."""
+        while len(self._waiting) > MOST_WAITING:
+            self._waiting.popleft().result()
+        self._waiting.append(self._pool.submit(self._add, frame))
 
     def add(self, frame: Frame) -> None:
         """Follow the corners into this frame, and begin new ones where there are none."""
+        self.frames  # noqa: B018 - what came before is noted before
+        self._add(frame)
+
+    def _add(self, frame: Frame) -> None:
         scale = max(frame.image.shape[:2]) / WIDTH
         grey, contrast = _small_grey(frame.image, scale)
         if self._image is not None and len(self._ids):
@@ -97,7 +117,7 @@ class EvidenceRecorder(Callback):
         changed, median = self._compare_depth(frame.depth)
         depth = np.full(len(full), np.nan, np.float32) if frame.depth is None else _read(frame.depth, full)
         ideal = _undistorted(full, self._camera).astype(np.float32)
-        self.frames.append(
+        self._frames.append(
             FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth, median, changed, contrast)
         )
 

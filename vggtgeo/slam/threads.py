@@ -1,0 +1,24 @@
+"""Independent pieces of numpy and OpenCV work, spread over the cores: both let other threads run while they compute."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+MOST_THREADS = 4
+"""More wait for Python's lock: the pieces here are some milliseconds long."""
+
+
+def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+    """`[function(item) for item in items]`, in that order; `function` is pure, so that threads change no result."""
+    todo = list(items)
+    workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, len(todo))
+    if workers < 2:
+        return [function(item) for item in todo]
+    with ThreadPoolExecutor(min(workers, MOST_THREADS), thread_name_prefix="work") as pool:
+        return list(pool.map(function, todo))
