@@ -21,6 +21,7 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import end_on_signals, interruption
 from vggtgeo.io.locks import LockedError, locked
+from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.results import Result
 from vggtgeo.results.files import write_depth
 from vggtgeo.results.run_folder import RESERVE, check_finished, taken
@@ -87,9 +88,11 @@ def check_one_run(out: Path, frames: int) -> None:
         if file.is_file() and file.name != "notes.txt":
             assert file.read_bytes() != b"of the run before", file
     assert sorted(path.name for path in out.iterdir() if path.name not in ("notes.txt", "trajectory.png")) == [
+        "images",
         "keyframes.txt",
         "map.ply",
         "report.html",
+        "scene.npz",
         "settings.toml",
         "summary.json",
         "trajectory.txt",
@@ -338,10 +341,10 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     """Counts are 1/5000 m, what is too far for 16 bits is none, the folder says its unit, and without depth there is no
     folder but a warning; oracle: the depth that was given.
     """
-    keyframe = object.__new__(Keyframe)  # of which two fields count
+    keyframe = object.__new__(Keyframe)  # of which one field counts
     object.__setattr__(keyframe, "frame", 7)
-    object.__setattr__(keyframe, "depth_confidence", np.full((2, 2), 255, np.uint8))
-    depth = np.array([[1.0, np.nan], [13.2, 0.5]])
+    metres, one = np.array([[1.0, np.nan], [13.2, 0.5]], np.float32), np.ones((2, 2), np.float32)
+    depth = DepthMap(metres, one, one)
     write_depth(tmp_path, [keyframe, keyframe], [depth, None], metric=False)
     assert sorted(path.name for path in (tmp_path / "depth").iterdir()) == [
         "000007.confidence.png",

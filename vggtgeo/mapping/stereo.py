@@ -7,9 +7,7 @@ Each keyframe is compared with the neighbours that see its points from a good an
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -25,11 +23,10 @@ from vggtgeo.mapping.stereo_views import choose_views, known_points
 from vggtgeo.mapping.uncertainty import support
 from vggtgeo.models import pinhole
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.threads import map_in_threads
 
 LEAST_POINTS = 8
 """Known points in view, below which nobody knows between which depths to search."""
-MOST_AT_ONCE = 8
-"""Keyframes searched at a time."""
 LARGEST_SIGMA = 0.05
 """Largest relative standard deviation of a depth: what is known worse would only blur the map."""
 BLEND = 0.03
@@ -83,9 +80,7 @@ def stereo_depths(
         depth_map = _search(around, photos[i], [photos[j] for j in views[i]], settings)
         return None if depth_map is None else PosedDepth(depth_map, photos[i].pose, photos[i].intrinsics)
 
-    # OpenCV and JAX leave Python's lock; a search holds some 150 MB.
-    with ThreadPoolExecutor(max_workers=min(MOST_AT_ONCE, os.cpu_count() or 1)) as pool:
-        found = list(pool.map(search, range(len(photos))))
+    found = map_in_threads(search, range(len(photos)))  # a search holds some 150 MB
     result: list[DepthMap | None] = []
     for i, own in enumerate(found):
         others = [other for j in views[i] if (other := found[j]) is not None]

@@ -1,17 +1,17 @@
 """A mesh of all depth maps: a truncated signed distance, averaged in blocks of voxels near the surface.
 
-Each voxel holds the weighted mean over the keyframes of `clip((z_measured - z_voxel) / t, -1, 1)` (Curless and Levoy,
-"A volumetric method for building complex models from range images", SIGGRAPH 1996), the weight of a measurement being
-its confidence by its variance. Blocks are made only where a depth map has a surface, as in voxel hashing (Niessner et
-al., "Real-time 3D reconstruction at scale using voxel hashing", SIGGRAPH Asia 2013), and worked on in batches, so that
-memory is bounded by a batch and the mesh. Neighbouring blocks share a layer of voxels: their surfaces meet without a
-seam.
+Each voxel holds the weighted mean of `(z_measured - z_voxel) / t` over the keyframes that measure it within `t`
+(Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996), the weight of a
+measurement being its confidence by its variance. Blocks are made only where a depth map has a surface, as in voxel
+hashing (Niessner et al., "Real-time 3D reconstruction at scale using voxel hashing", SIGGRAPH Asia 2013), and worked
+on in batches, so that memory is bounded by a batch and the mesh. Neighbouring blocks share a layer of voxels: their
+surfaces meet without a seam.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -30,6 +30,8 @@ from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
 from vggtgeo.slam.keyframe import Keyframe
 
+Block = tuple[int, int, int]
+"""Corner of a block of voxels, in blocks."""
 SIDE = 16
 """Voxels along a block."""
 TRUNCATION = 4.0
@@ -79,10 +81,12 @@ def fused_mesh(
         for keyframe, depth_map in zip(keyframes, depth_maps, strict=True)
         if depth_map is not None and not depth_map.empty
     ]
-    seen_by: dict[tuple[int, int, int], list[int]] = defaultdict(list)
+    touched: dict[Block, list[int]] = defaultdict(list)
     for number, view in enumerate(views):
         for block in _blocks(view, voxel):
-            seen_by[block].append(number)
+            touched[block].append(number)
+    # The far layer of a block is the near one of the next: both must see it by the same views.
+    seen_by = {block: _together(block, touched) for block in touched}
     least = min(least_views, len(views))
     blocks = sorted(block for block, numbers in seen_by.items() if len(numbers) >= least)
     parts = [
@@ -91,7 +95,14 @@ def fused_mesh(
     return _without_crumbs(_joined([mesh for part in parts for mesh in part], voxel))
 
 
-def _blocks(view: View, voxel: float) -> list[tuple[int, int, int]]:
+def _together(block: Block, seen_by: Mapping[Block, Sequence[int]]) -> list[int]:
+    """The views of a block and of the seven that share its far layers."""
+    x, y, z = block
+    near = ((x + i, y + j, z + k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
+    return sorted({number for other in near for number in seen_by.get(other, ())})
+
+
+def _blocks(view: View, voxel: float) -> list[Block]:
     """Corners, in blocks, of those that the view's surface passes within the truncation."""
     depth = view.depth_map.depth
     step = max(1, max(depth.shape) // 320)
@@ -108,8 +119,8 @@ def _blocks(view: View, voxel: float) -> list[tuple[int, int, int]]:
 
 
 def _batch(
-    blocks: Sequence[tuple[int, int, int]],
-    seen_by: dict[tuple[int, int, int], list[int]],
+    blocks: Sequence[Block],
+    seen_by: Mapping[Block, Sequence[int]],
     views: Sequence[View],
     voxel: float,
     least: int,
@@ -162,8 +173,9 @@ def _measured(
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (points[..., 2] > 1e-3)
     seen = pixels[jnp.clip(v, 0, height - 1), jnp.clip(u, 0, width - 1)]
     distance = seen[..., :1] - z[..., None]
-    weight = jnp.where(inside[..., None] & (distance > -reach), seen[..., 1:2], 0.0)
-    values = jnp.concatenate([jnp.clip(distance / reach, -1.0, 1.0), seen[..., 2:]], axis=-1)
+    # Beyond the truncation, in front too, a view says nothing: whether a block asks it depends on the block.
+    weight = jnp.where(inside[..., None] & (jnp.abs(distance) <= reach), seen[..., 1:2], 0.0)
+    values = jnp.concatenate([distance / reach, seen[..., 2:]], axis=-1)
     return jnp.concatenate([weight * values, weight, (weight > 0).astype(jnp.float32)], axis=-1)
 
 
