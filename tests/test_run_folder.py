@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -340,7 +341,7 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     """
     keyframe = object.__new__(Keyframe)  # of which two fields count
     object.__setattr__(keyframe, "frame", 7)
-    object.__setattr__(keyframe, "depth_confidence", np.full((2, 2), 255, np.uint8))
+    object.__setattr__(keyframe, "images", SimpleNamespace(depth_confidence=np.full((2, 2), 255, np.uint8)))
     depth = np.array([[1.0, np.nan], [13.2, 0.5]])
     write_depth(tmp_path, [keyframe, keyframe], [depth, None], metric=False)
     assert sorted(path.name for path in (tmp_path / "depth").iterdir()) == [
@@ -354,3 +355,16 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     with pytest.warns(InputWarning, match="there is none to save"):
         write_depth(tmp_path / "none", [keyframe], [None])
     assert not (tmp_path / "none").exists()
+
+
+def test_a_folder_whose_name_is_no_utf8(frames: Path, tmp_path: Path) -> None:
+    """A name in another encoding costs nothing of the result; oracle: the files of any run."""
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/B\xfcro"))
+    try:
+        frames.rename(odd)
+    except OSError:
+        pytest.skip("this file system takes no such name")
+    out = tmp_path / "out"
+    done = call(odd, out)
+    assert done.exit_code == 3, done.output
+    check_one_run(out, FRAMES)
