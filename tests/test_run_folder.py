@@ -357,3 +357,16 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     with pytest.warns(InputWarning, match="there is none to save"):
         write_depth(tmp_path / "none", [keyframe], [None])
     assert not (tmp_path / "none").exists()
+
+
+def test_a_folder_whose_name_is_no_utf8(frames: Path, tmp_path: Path) -> None:
+    """A name in another encoding costs nothing of the result; oracle: the files of any run."""
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/B\xfcro"))
+    try:
+        frames.rename(odd)
+    except OSError:
+        pytest.skip("this file system takes no such name")
+    out = tmp_path / "out"
+    done = call(odd, out)
+    assert done.exit_code == 3, done.output
+    check_one_run(out, FRAMES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import io
 import sys
 import warnings
 from collections.abc import Callable
@@ -194,6 +195,8 @@ def _leave(error: BaseException) -> NoReturn:
         message, code = f"error: `{error.filename}`: {error.strerror}", EXIT_INPUT
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
+    elif isinstance(error, MemoryError):
+        message, code = f"error: there is not enough memory ({error}); give fewer or smaller images", EXIT_INPUT
     elif _is_usage_error(error):
         message, code = f"error: {_usage_message(error)}", EXIT_INPUT
     else:
@@ -250,6 +253,9 @@ def main() -> None:
     """Entry point of the program."""
     set_jax_flags()
     end_on_signals()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may know fewer letters than names have
+            stream.reconfigure(errors="replace")
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
     make_app()(prog_name="vggtgeo")
 

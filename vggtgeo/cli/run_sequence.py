@@ -71,11 +71,12 @@ def run_and_write(
 
     """
     silent = output.quiet or output.as_json
+    title = (title or sequence.name).encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
     console = Console(stderr=False, quiet=silent)
     start, end, stride = selection
     # From the first frame to the last file a signal only ends the work early; what is there is written as a whole.
     with interruption() as stop, taken(output.folder, output.source, RESERVE) as folder:
-        callbacks, url = _rerun_callbacks(output, folder, title or sequence.name)
+        callbacks, url = _rerun_callbacks(output, folder, title)
         if callbacks:
             settings = updated(settings, {"window": {"record_iterations": True}})
         with as_input_errors(), ProgressBar(console) as bar:

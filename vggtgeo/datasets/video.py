@@ -98,7 +98,10 @@ class VideoFile:
 
 @contextmanager
 def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
-    capture = cv2.VideoCapture(str(path))
+    try:
+        capture = cv2.VideoCapture(str(path))
+    except UnicodeError:
+        raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
     try:
         if not capture.isOpened():
             raise InputError(f"`{path}` cannot be opened as a video: it is damaged, or no video that OpenCV knows")

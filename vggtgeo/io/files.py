@@ -47,8 +47,9 @@ def atomic_open(path: str | os.PathLike[str], mode: str = "w") -> Iterator[IO[An
     """
     if mode not in ("w", "wb"):
         raise ValueError(f"`mode` is {mode!r}; an atomic write replaces the whole file: use 'w' or 'wb'")
-    encoding = "utf-8" if mode == "w" else None
-    with atomic_path(path) as temporary, open(temporary, mode, encoding=encoding) as handle:
+    # A name of a file may be no UTF-8; that must not cost what is written about it.
+    text: dict[str, Any] = {"encoding": "utf-8", "errors": "backslashreplace"} if mode == "w" else {}
+    with atomic_path(path) as temporary, open(temporary, mode, **text) as handle:
         yield handle
 
 

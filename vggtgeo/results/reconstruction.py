@@ -204,8 +204,9 @@ def _opened(frames: str | os.PathLike[str] | Sequence | Iterable[Any], camera: C
         frames = open_sequence(Path(frames))
     if not isinstance(frames, Sequence):
         return _Source("frames", frame_stream(frames, camera), None)
+    name = frames.name.encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
     view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
-    return _Source(frames.name, view, _truth(frames))
+    return _Source(name, view, _truth(frames))
 
 
 def _truth(sequence: Sequence) -> Trajectory | None:

@@ -42,6 +42,8 @@ def check_target(target: str) -> str:
         raise InputError(
             f"`--rerun` is {target!r}; it must be `spawn` (a window), `serve` (a browser) or a file ending with `.rrd`"
         )
+    if Path(target).is_dir():
+        raise InputError(f"`--rerun` is `{target}`, which is a folder; give a new file ending with `.rrd`")
     return target
 
 

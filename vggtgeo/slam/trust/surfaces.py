@@ -40,9 +40,10 @@ def check_surfaces(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> Ite
 
 
 def _share_off(first: Keyframe, second: Keyframe, intrinsics: np.ndarray) -> float | None:
-    height, width = first.depth.shape
+    one, other = first.depth, second.depth
+    height, width = one.shape
     rows, columns = (axis.ravel() for axis in np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP])
-    depth = first.depth[rows, columns].astype(np.float64)
+    depth = one[rows, columns].astype(np.float64)
     known = np.isfinite(depth) & (depth > 0)
     pixels = np.stack([columns, rows], axis=1)[known]
     rays = np.concatenate([(pixels - intrinsics[2:]) / intrinsics[:2], np.ones((len(pixels), 1))], axis=1)
@@ -53,7 +54,7 @@ def _share_off(first: Keyframe, second: Keyframe, intrinsics: np.ndarray) -> flo
     place = np.rint(points[ahead, :2] / carried[:, None] * intrinsics[:2] + intrinsics[2:])
     inside = ((place >= 0) & (place < (width, height))).all(axis=1)
     x, y = place[inside].astype(int).T
-    there = second.depth[y, x].astype(np.float64)
+    there = other[y, x].astype(np.float64)
     both = np.isfinite(there) & (there > 0)
     if np.count_nonzero(both) < LEAST:
         return None
