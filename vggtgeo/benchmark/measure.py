@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.benchmark.inputs import Input, exact_cloud
-from vggtgeo.evaluation import Similarity, TrajectoryReport, cloud_error, depth_error, evaluate_trajectory, focal_error
+from vggtgeo.evaluation import (
+    DepthError,
+    Similarity,
+    TrajectoryReport,
+    cloud_error,
+    depth_error,
+    evaluate_trajectory,
+    focal_error,
+)
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.results import Result
@@ -114,14 +122,15 @@ def depth_errors(result: Result, given: Input, alignment: Similarity | None) -> 
     keyframes = result.record.slam.keyframes
     scale = np.float32(alignment.scale)
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, _DEPTH_MAPS).round().astype(int))
-    found, prior = [], []
+    found: list[DepthError] = []
+    prior: list[DepthError] = []
     for number in chosen:
         keyframe, fused = keyframes[number], result.record.dense.depth_maps[number]
         truth = given.oracle.depth(keyframe.frame)
         for depth, kept in ((fused.depth if fused else None, found), (keyframe.depth, prior)):
             if depth is not None and np.isfinite(depth).any():
                 kept.append(depth_error((scale * depth).astype(np.float64), truth))
-    weights = np.array([one.count for one in found], float)
+    weights = np.array([one.count for one in found], np.float64)
     if not weights.sum():
         return {}
     pooled = lambda values: float(np.average(np.array(values), weights=weights))

@@ -49,6 +49,17 @@ class CheckedTable:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RowTable(CheckedTable):
+    """A table that makes rows of the report. name: short; title: as people read it."""
+
+    name: str
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SequenceTable(CheckedTable):
     """`[[sequence]]`: recorded (`path`) or rendered (`simulate`).
 
@@ -95,7 +106,7 @@ class SequenceTable(CheckedTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SettingTable(CheckedTable):
+class SettingTable(RowTable):
     """`[[setting]]`: one row of a table.
 
     Keys:
@@ -111,8 +122,6 @@ class SettingTable(CheckedTable):
         set: settings of the pipeline.
     """
 
-    name: str
-    title: str = ""
     sequences: tuple[str, ...] = ()
     seeds: int | None = None
     rgb_only: bool = False
@@ -124,7 +133,7 @@ class SettingTable(CheckedTable):
     set: Tables = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_name(self.name)
+        super().__post_init__()
         _one_of("perception", self.perception, ("classical", "light", "paper", "simulated"))
         _one_of("features", self.features, ("sift", "orb"))
         _one_of("start_of_pose", self.start_of_pose, ("pnp", "constant-velocity", "window"))
@@ -136,15 +145,10 @@ class SettingTable(CheckedTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExternalTable(CheckedTable):
+class ExternalTable(RowTable):
     """`[[external]]`: trajectories of another system. files: TUM format; `{sequence}` and `{seed}` stand for both."""
 
-    name: str
     files: str
-    title: str = ""
-
-    def __post_init__(self) -> None:
-        _check_name(self.name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,7 +314,7 @@ def _chosen(what: str, wanted: tuple[str, ...], tables: tuple[Any, ...]) -> tupl
     return tuple(table for table in tables if table.name in wanted)
 
 
-def _check_name(name: str) -> None:
+def _check_name(name: object) -> None:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InputError(f"`name` is {name!r}; it must be of letters, digits, `-`, `_` and `+`")
 

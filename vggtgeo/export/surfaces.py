@@ -41,7 +41,7 @@ def write_glb(source: Path, target: Path) -> dict[str, float]:
             vertex_colors=mesh.colours,
             process=False,
         )
-        counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+        counts: dict[str, float] = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     else:
         cloud = PointCloud.load_ply(source / "map.ply")
         shape = trimesh.PointCloud(cloud.points * UPRIGHT, colors=cloud.colours)

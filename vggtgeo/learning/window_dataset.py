@@ -157,7 +157,7 @@ class WindowDataset:
         problem, initial, _ = load_problem(self.folder / f"{row:07d}.npz", terms=self.terms)
         with np.load(self.folder / f"{row:07d}.labels.npz", allow_pickle=False) as file:
             labels = {name: file[name] for name in file.files}
-        return LabelledWindow(*jax.tree.map(np.asarray, (problem, initial)), labels)
+        return LabelledWindow(jax.tree.map(np.asarray, problem), jax.tree.map(np.asarray, initial), labels)
 
     def order(self, seed: int, epoch: int = 0) -> np.ndarray:
         """Every row once, int [n], shuffled; it follows from `seed` and `epoch` alone."""

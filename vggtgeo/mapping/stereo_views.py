@@ -46,7 +46,7 @@ def choose_views(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, most: in
             continue
         reach = float(np.median(np.linalg.norm(points - centres[i], axis=1)))
         near = np.nonzero(np.linalg.norm(centres - centres[i], axis=1) < reach)[0]
-        scores = {int(j): _score(points, centres[i], keyframes[j], intrinsics) for j in near if j != i}
+        scores = {j: _score(points, centres[i], keyframes[j], intrinsics) for j in near.tolist() if j != i}
         ranked = sorted(scores, key=lambda j: -scores[j])
         chosen.append(tuple(j for j in ranked[:most] if scores[j] > LEAST_SCORE))
     return chosen

@@ -14,7 +14,7 @@ import os
 import shutil
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -109,19 +109,20 @@ def taken(folder: str | os.PathLike[str], source: Path | None = None, reserve: i
     _refuse_input(place, source)
     made = _missing(place)
     try:
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-            holding = locked(place / _LOCK)
-            holding.__enter__()
-        except LockedError as error:
-            raise InputError(f"`{place}` is in use by another run ({error}); give another folder with `-o`") from None
-        except OSError as error:
-            raise _not_written(place, error) from None
-        try:
-            yield _begun(RunFolder(place), reserve)
-        finally:
-            _end(place / UNFINISHED)
-            holding.__exit__(None, None, None)
+        with ExitStack() as holding:
+            try:
+                place.mkdir(parents=True, exist_ok=True)
+                holding.enter_context(locked(place / _LOCK))
+            except LockedError as error:
+                raise InputError(
+                    f"`{place}` is in use by another run ({error}); give another folder with `-o`"
+                ) from None
+            except OSError as error:
+                raise _not_written(place, error) from None
+            try:
+                yield _begun(RunFolder(place), reserve)
+            finally:
+                _end(place / UNFINISHED)
     finally:
         for path in made:
             _remove_if_empty(path)

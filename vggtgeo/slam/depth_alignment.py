@@ -59,14 +59,13 @@ class Surface:
         points = pinhole.grid_rays(middle.shape, coarse) * middle[..., None]
         sigma = _block_medians(keyframe.depth_sigma) * middle
         # Those of all keyframes are in memory together: half a megabyte each in single precision.
-        single = (image.astype(np.float32) for image in (points, _normals(points), sigma))
-        return cls(*single, coarse)
+        return cls(points.astype(np.float32), _normals(points).astype(np.float32), sigma.astype(np.float32), coarse)
 
     @cached_property
     def rows(self) -> SurfaceRows:
         """All cells, row by row of the image."""
-        flat = (np.ascontiguousarray(grid.reshape(-1, 3).T) for grid in (self.points, self.normals))
-        return SurfaceRows(*flat, self.sigma.ravel())
+        points, normals = (np.ascontiguousarray(grid.reshape(-1, 3).T) for grid in (self.points, self.normals))
+        return SurfaceRows(points, normals, self.sigma.ravel())
 
     @cached_property
     def known(self) -> SurfaceRows:

@@ -43,7 +43,7 @@ class MeasuredBaseline:
     sigma: float
 
     @property
-    def keyframes(self) -> tuple[int, ...]:
+    def keyframes(self) -> tuple[int, int]:
         return self.first, self.second
 
 
@@ -57,7 +57,7 @@ class MeasuredRelativePose:
     information: np.ndarray
 
     @property
-    def keyframes(self) -> tuple[int, ...]:
+    def keyframes(self) -> tuple[int, int]:
         return self.first, self.second
 
 

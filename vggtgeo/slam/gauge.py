@@ -177,7 +177,7 @@ class _PriorKnowledge:
         information = root.T @ root
         fixed = np.asarray(problem.fixed_pose)[:keyframes]
         scale = np.sqrt(np.diag(information))
-        spoken = (scale > 0).reshape(keyframes, -1).any(1)
+        spoken = scale.reshape(keyframes, -1).max(1) > 0
         about = (scale > 0) & np.repeat(~fixed, lie.TANGENT)
         safe = np.where(scale > 0, scale, 1.0)
         values, vectors = np.linalg.eigh((information / np.outer(safe, safe))[np.ix_(about, about)])
@@ -189,7 +189,7 @@ class _PriorKnowledge:
         # A left tangent as seen in the world, so that a rigid motion of both is the same for both.
         common = np.stack([rigid.adjoint(rigid.invert(pose)) @ own for pose, own in zip(world, moved, strict=True)])
         apart = np.linalg.norm(common[:, None] - common[None], axis=2).max(2, initial=0.0)
-        still = np.linalg.norm(moved, axis=1).max(1, initial=0.0) < 1e-6
+        still: np.ndarray = np.linalg.norm(moved, axis=1).max(1, initial=0.0) < 1e-6
         tied = (apart < 1e-6) & spoken[:, None] & spoken[None]
         return cls(tied & ~np.eye(keyframes, dtype=bool), still & spoken)
 

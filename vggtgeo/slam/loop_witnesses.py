@@ -32,7 +32,7 @@ def witnessed(
     ends = np.array([(loop.first, loop.second) for loop in loops])
     for number, loop in enumerate(loops):
         apart = np.abs(ends[number + 1 :] - ends[number])
-        for other in number + 1 + np.nonzero((apart <= NEAR).all(1))[0]:
+        for other in (number + 1 + np.flatnonzero((apart <= NEAR).all(1))).tolist():
             if _distance(loop, loops[other], placed, step) < gate:
                 agreed[[number, other]] = True
     return agreed

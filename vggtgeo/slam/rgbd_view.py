@@ -158,8 +158,8 @@ def _spread(surface: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> Samp
     # A fixed shuffle: a regular stride would take whole columns of the grid.
     order = np.random.default_rng(0).permutation(len(known))[:MOST_POINTS]
     chosen = np.sort(known[order])
-    rows = (np.ascontiguousarray(grid.reshape(-1, 3)[chosen].T) for grid in (surface, normals))
-    return Samples(*rows, sigma.ravel()[chosen])
+    points, unit = (np.ascontiguousarray(grid.reshape(-1, 3)[chosen].T) for grid in (surface, normals))
+    return Samples(points, unit, sigma.ravel()[chosen])
 
 
 def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:

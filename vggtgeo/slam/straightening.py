@@ -93,14 +93,12 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
     motions: list[MeasuredRelativePose] = []
     matched = {pair.key for pair in slam.pairs if len(pair.points)}
     for number in range(1, len(slam.keyframes)):
-        tie = tree.get(number)
-        if tie is None and (number - 1, number) not in matched:
-            continue
-        if tie is None:
-            tie = MeasuredRelativePose(number - 1, number, between(number - 1, number), loose)
-        elif distance(tie, poses) < BELIEF:
-            tie = replace(tie, pose=between(tie.first, tie.second))
-        motions.append(tie)
+        if number in tree:
+            tie = tree[number]
+            agrees = distance(tie, poses) < BELIEF
+            motions.append(replace(tie, pose=between(tie.first, tie.second)) if agrees else tie)
+        elif (number - 1, number) in matched:
+            motions.append(MeasuredRelativePose(number - 1, number, between(number - 1, number), loose))
     return motions, others
 
 
