@@ -43,10 +43,9 @@ def sphere_views(noise: float = 0.0) -> tuple[list[Keyframe], list[DepthMap]]:
 
 
 def _around() -> list[np.ndarray]:
-    """Rotations that bring each of the axes' six directions and the eight corners of a cube before the camera."""
-    signs = (-1.0, 1.0)
-    corners = [(x, y, z) for x in signs for y in signs for z in signs]
-    directions = [*np.eye(3), *-np.eye(3), *np.array(corners)]
+    """Rotations that bring the faces, edges and corners of a cube before the camera, 26 in all."""
+    steps = (-1.0, 0.0, 1.0)
+    directions = [np.array([x, y, z]) for x in steps for y in steps for z in steps if x or y or z]
     return [Rotation.align_vectors([[0.0, 0.0, -1.0]], [direction])[0].as_matrix() for direction in directions]
 
 

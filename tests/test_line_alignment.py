@@ -15,6 +15,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.covisibility import Directed, match_keyframes
 from vggtgeo.slam.evidence import LARGEST_SIGMA, tangent, worst_sigma
 from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.keyframe_images import KeyframeImages
 from vggtgeo.slam.line_alignment import END_SIGMA, align_lines
 from vggtgeo.slam.line_triangulation import with_segment_depths
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -72,11 +73,9 @@ def _keyframe(points: np.ndarray, rng: np.random.Generator, sigma: float) -> Key
     none, image = np.zeros(0), np.zeros((*SIZE[::-1], 3), np.uint8)
     points_slots = Slots(np.zeros((0, 2)), none, none, none, none, none)
     blank = np.zeros(image.shape[:2], np.float16)
+    images = KeyframeImages(image, blank, blank, blank.astype(np.uint8))
     features = Features(np.zeros((0, 2)), none)
-    return Keyframe(
-        *(0, 0, 0.0, np.eye(4), image, features, lines, 1.0 / inverse, blank, blank, blank.astype(np.uint8)),
-        *(points_slots, samples, segment),
-    )
+    return Keyframe(0, 0, 0.0, np.eye(4), images, features, lines, 1.0 / inverse, points_slots, samples, segment)
 
 
 def test_lines_bring_a_wrong_start_to_the_true_motion() -> None:

@@ -52,7 +52,7 @@ def test_the_depth_prior_follows_the_chosen_confidence() -> None:
     own, saliency = np.array([0.2, 0.9]), np.array([0.7, 0.1])
     expected = {"own": own, "saliency": saliency, "complement": 1 - saliency}
     for name, values in expected.items():
-        settings = SlamSettings(depth=DepthSettings(depth_trust=name))
+        settings = SlamSettings(depth_terms=DepthSettings(depth_trust=name))
         np.testing.assert_array_equal(_prior_trust(own, saliency, settings), values)
         without = replace(settings, weights=WeightSettings(use_confidence=False))
         np.testing.assert_array_equal(_prior_trust(own, saliency, without), 1.0)

@@ -136,7 +136,10 @@ def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: floa
     """Keyframes moved by 5 cm and 2 degrees each come back to below 1 cm; oracle: the renderer's poses."""
     settings = updated(
         SETTINGS,
-        {"refinement": {"global_adjustment": True, "global_iterations": 20}, "depth": {"surface_points": surfaces}},
+        {
+            "refinement": {"global_adjustment": True, "global_iterations": 20},
+            "depth_terms": {"surface_points": surfaces},
+        },
     )
     wrong = _shaken(tracked, 0.05, 2.0)
     assert _keyframe_error(wrong, room[2]) > 0.03
@@ -177,7 +180,7 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
     """
     middle, settings = (
         len(tracked.keyframes) // 2,
-        updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth": {"surface_points": 0.0}}),
+        updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth_terms": {"surface_points": 0.0}}),
     )
     apart = _shaken(tracked, 0.05, 2.0, from_keyframe=middle, together=True)
     within = [pair for pair in apart.pairs if (pair.first < middle) == (pair.second < middle)]
@@ -205,7 +208,7 @@ def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
     """A second visit 3 m and 40 degrees away, where no keyframe should see what the first visit saw: what it looks like
     finds it, and a pose graph brings it back before the adjustment. Oracle: the keyframes of the first visit.
     """
-    settings = updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth": {"surface_points": 0.0}})
+    settings = updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth_terms": {"surface_points": 0.0}})
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_rotvec(np.deg2rad(40.0) * np.array([0.2, 0.97, 0.1])).as_matrix()
     motion[:3, 3] = 2.0, 0.5, -2.0

@@ -40,9 +40,9 @@ WRONG = {
     "line.two_ends_lines": (None,),
     "line.segment_samples": (1,),
     "line.manhattan": (0,),
-    "depth.depth_weight": (-2.0,),
-    "depth.depth_trust": ("omega", 1),
-    "depth.surface_points": (-1.0,),
+    "depth_terms.depth_weight": (-2.0,),
+    "depth_terms.depth_trust": ("omega", 1),
+    "depth_terms.surface_points": (-1.0,),
     "weights.use_confidence": ("on",),
     "weights.confidence_gain": (-1.0,),
     "weights.confidence_floor": (float("nan"),),
@@ -62,7 +62,7 @@ WRONG = {
     "refinement.loop_candidates": (-1, 1.5),
 }
 OTHER = {bool: lambda value: not value, int: lambda value: 2 * value + 2, float: lambda value: 0.5 * value}
-WORDS = {"depth.depth_trust": "saliency", "window.kernel": "huber 1.25", "camera.refine_intrinsics": "never"}
+WORDS = {"depth_terms.depth_trust": "saliency", "window.kernel": "huber 1.25", "camera.refine_intrinsics": "never"}
 
 
 def _other(name: str) -> Any:

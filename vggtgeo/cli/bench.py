@@ -47,12 +47,13 @@ def bench(
     """Run a suite of sequences, settings and seeds, and write its tables and its page."""
     from vggtgeo.benchmark.cluster import Cluster
     from vggtgeo.benchmark.runner import bench as run_suite  # brings JAX, which --help does without
-    from vggtgeo.benchmark.suite import shipped
+    from vggtgeo.benchmark.suite import load_suite, shipped
 
     if suite == "list":
         for name, title in shipped().items():
             typer.echo(f"{name:14s} {title}")
         return
+    load_suite(Path(suite))  # what is wrong with it is told before the bar begins
     folder = output or Path("runs") / Path(suite).stem
     with _Bar(quiet or as_json) as bar:
         report = run_suite(

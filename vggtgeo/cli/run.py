@@ -73,7 +73,7 @@ def run(
     switches: Switches = {
         "lines": {"line": {"use_lines": lines}},
         "confidence": {"weights": {"use_confidence": confidence}},
-        "depth_prior": {"depth": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},
+        "depth_prior": {"depth_terms": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},
         "global_adjustment": {"refinement": {"global_adjustment": global_adjustment}},
         "refine_intrinsics": {"camera": {"refine_intrinsics": REFINE[refine_intrinsics]}},
     }

@@ -1,6 +1,6 @@
 """A mesh of all depth maps: a truncated signed distance, averaged in blocks of voxels near the surface.
 
-Each voxel holds the weighted mean of `(z_measured - z_voxel) / t` over the keyframes that measure it within `t`
+Each voxel holds the weighted mean of `min((z_measured - z_voxel) / t, 1)` over the keyframes that measure at it
 (Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996), the weight of a
 measurement being its confidence by its variance. Blocks are made only where a depth map has a surface, as in voxel
 hashing (Niessner et al., "Real-time 3D reconstruction at scale using voxel hashing", SIGGRAPH Asia 2013), and worked
@@ -36,6 +36,8 @@ SIDE = 16
 """Voxels along a block."""
 TRUNCATION = 4.0
 """Of the distance, in voxels."""
+FREE = 4.0
+"""As far in front of a surface a view says that nothing is there, in truncations: a block at most, see `_together`."""
 BATCH = 1024
 """Blocks held at a time: 100 MB."""
 GROUP = 32
@@ -85,7 +87,7 @@ def fused_mesh(
     for number, view in enumerate(views):
         for block in _blocks(view, voxel):
             touched[block].append(number)
-    # The far layer of a block is the near one of the next: both must see it by the same views.
+    # Blocks share layers of voxels: all of them must see such a layer by the same views.
     seen_by = {block: _together(block, touched) for block in touched}
     least = min(least_views, len(views))
     blocks = sorted(block for block, numbers in seen_by.items() if len(numbers) >= least)
@@ -96,9 +98,9 @@ def fused_mesh(
 
 
 def _together(block: Block, seen_by: Mapping[Block, Sequence[int]]) -> list[int]:
-    """The views of a block and of the seven that share its far layers."""
+    """The views of a block and of all that touch it: whoever says something within `FREE` of a voxel is among them."""
     x, y, z = block
-    near = ((x + i, y + j, z + k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
+    near = ((x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1))
     return sorted({number for other in near for number in seen_by.get(other, ())})
 
 
@@ -173,9 +175,9 @@ def _measured(
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (points[..., 2] > 1e-3)
     seen = pixels[jnp.clip(v, 0, height - 1), jnp.clip(u, 0, width - 1)]
     distance = seen[..., :1] - z[..., None]
-    # Beyond the truncation, in front too, a view says nothing: whether a block asks it depends on the block.
-    weight = jnp.where(inside[..., None] & (jnp.abs(distance) <= reach), seen[..., 1:2], 0.0)
-    values = jnp.concatenate([distance / reach, seen[..., 2:]], axis=-1)
+    # A little farther in front it is free; beyond that a view says nothing: whether a block asks it depends on the block.
+    weight = jnp.where(inside[..., None] & (distance >= -reach) & (distance <= FREE * reach), seen[..., 1:2], 0.0)
+    values = jnp.concatenate([jnp.minimum(distance / reach, 1.0), seen[..., 2:]], axis=-1)
     return jnp.concatenate([weight * values, weight, (weight > 0).astype(jnp.float32)], axis=-1)
 
 
@@ -197,8 +199,8 @@ def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -
     near = [map_coordinates(colour[..., k], places.T, order=0, mode="nearest") for k in range(3)]
     return Mesh(
         ((corner + places) * voxel).astype(np.float32),
-        faces[:, ::-1].astype(np.int32),
-        normals.astype(np.float32),
+        faces.astype(np.int32),
+        -normals.astype(np.float32),  # skimage has them towards smaller values: into the surface
         np.clip(np.stack(near, axis=1), 0, 255).round().astype(np.uint8),
     )
 

@@ -51,7 +51,7 @@ def evaluate(
         >>> import vggtgeo as vg
         >>> truth = vg.simulate("room", 30).ground_truth()
         >>> print(vg.evaluate(truth, truth))
-        30 poses: ATE 0.000 m after SE(3), 0.000 m after Sim(3) (scale 1.0000); RPE over 1: 0.000 m, 0.000 deg
+        30 poses: ATE 0.000 m after SE(3), 0.000 m after Sim(3) (scale 1.0000); RPE over 1 pose: 0.000 m, 0.000 deg
 
     """
     return evaluate_trajectory(_estimate(estimate), _truth(truth), **options)

@@ -114,8 +114,8 @@ def _observed(
         **_line_rows(keyframes, edges, local, lines, settings, len(points.host), intrinsics),
         depth_mean=np.where(has_prior, prior, 1.0),
         depth_sigma=np.where(has_prior, sigma, 1.0),
-        depth_weight=weight if settings.depth.depth_weight > 0 else np.zeros_like(weight),
-        alpha=settings.depth.depth_weight,
+        depth_weight=weight if settings.depth_terms.depth_weight > 0 else np.zeros_like(weight),
+        alpha=settings.depth_terms.depth_weight,
         segment=_segments(keyframes, points, lines) if settings.line.two_ends_lines else None,
     )
     return observations, depths, np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
@@ -226,7 +226,7 @@ def _line_rows(
 def _prior_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
     if not settings.weights.use_confidence:
         return np.ones_like(own)
-    return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth.depth_trust]
+    return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth_terms.depth_trust]
 
 
 def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:

@@ -67,6 +67,6 @@ def compile_global(shape: GlobalShape, settings: SlamSettings) -> None:
     """Compile the adjustment of maps of a shape, on a problem that holds one observation."""
     nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
     surfaces = surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing)
-    terms = (*factor_terms((), {}, shape.room), *([surfaces] if settings.depth.surface_points > 0 else []))
+    terms = (*factor_terms((), {}, shape.room), *([surfaces] if settings.depth_terms.surface_points > 0 else []))
     problem, initial = smallest_problem(shape.size, settings, terms)
     solve_jit(problem, initial, solver=global_solver(problem, settings)).energy.block_until_ready()

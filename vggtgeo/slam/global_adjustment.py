@@ -105,10 +105,10 @@ def _terms(slam: Slam, surfaces: list[Surface], shape: GlobalShape, settings: Sl
     """What is known about poses beyond matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
     terms = factor_terms(slam.factors, places, shape.room)
-    if not surfaces or settings.depth.surface_points <= 0:
+    if not surfaces or settings.depth_terms.surface_points <= 0:
         return terms
     pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
-    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth.surface_points, shape.pairs))
+    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth_terms.surface_points, shape.pairs))
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:

@@ -117,11 +117,11 @@ class DepthSettings(CheckedSettings):
         >>> vg.DepthSettings(depth_trust="omega")
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `depth.depth_trust` is 'omega'; it must be own, saliency or complement
+        vggtgeo.io.errors.InputError: `depth_terms.depth_trust` is 'omega'; it must be own, saliency or complement
 
     """
 
-    group: ClassVar[str] = "depth"
+    group: ClassVar[str] = "depth_terms"
     depth_weight: float = not_negative(2.0)
     """The paper's alpha; 0 switches the depth prior off."""
     depth_trust: str = one_of("own", "saliency", "complement")

@@ -105,7 +105,7 @@ class SlamSettings:
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     line: LineSettings = field(default_factory=LineSettings)
-    depth: DepthSettings = field(default_factory=DepthSettings)
+    depth_terms: DepthSettings = field(default_factory=DepthSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
