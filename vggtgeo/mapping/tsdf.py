@@ -175,7 +175,7 @@ def _measured(
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (points[..., 2] > 1e-3)
     seen = pixels[jnp.clip(v, 0, height - 1), jnp.clip(u, 0, width - 1)]
     distance = seen[..., :1] - z[..., None]
-    # A little farther in front it is free; beyond that a view says nothing: whether a block asks it depends on the block.
+    # In front it is free, to a limit beyond which a view says nothing: whether a block asks it depends on the block.
     weight = jnp.where(inside[..., None] & (distance >= -reach) & (distance <= FREE * reach), seen[..., 1:2], 0.0)
     values = jnp.concatenate([jnp.minimum(distance / reach, 1.0), seen[..., 2:]], axis=-1)
     return jnp.concatenate([weight * values, weight, (weight > 0).astype(jnp.float32)], axis=-1)
