@@ -52,6 +52,7 @@ def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleTyp
     del sys.modules["vggtgeo.bundle.terms.camera_height"]
 
 
+@pytest.mark.long
 def test_one_file_is_all(added: ModuleType, tmp_path: Path) -> None:
     # Proves that a term which no other file names is solved (from 1 cm off), judged, marginalised, counted,
     # saved, read and batched. Oracles: the truth; the same problem without the term; the problem that was saved.

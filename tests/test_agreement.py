@@ -70,6 +70,7 @@ def expected(kernel: str, lines: str) -> Solution:
     return run(*problem_of(kernel, "float64", lines), SchurLevenbergMarquardt(rtol=1e-13, max_iterations=100))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("solver", "kernel", "dtype", "lines"),
     [pytest.param(*case, marks=() if case in COVERING else pytest.mark.slow, id="-".join(case)) for case in ALL],

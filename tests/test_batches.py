@@ -94,6 +94,7 @@ np.testing.assert_allclose(two.energy, one.energy, rtol=1e-12)
 """
 
 
+@pytest.mark.long
 def test_a_batch_is_shared_out_over_devices() -> None:
     # Proves sharding over two host devices. Oracle: the same batch on one device, in the same process.
     here = str(Path(__file__).parent)

@@ -116,6 +116,7 @@ def test_changed_settings_and_code_are_run_again(tmp_path: Path) -> None:
         store.load(jobs[0])
 
 
+@pytest.mark.long
 def test_two_hundred_runs_with_ten_kills_end_as_undisturbed(tmp_path: Path) -> None:
     # Proves that workers that are killed at random cost nothing but time: each run is there once, and every number is
     # that of a batch that nobody disturbed. Oracle: that batch.

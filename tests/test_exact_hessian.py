@@ -43,6 +43,7 @@ def both(problem: Problem, state: State) -> tuple[jax.Array, ...]:
     return gradient, matrix, jax.grad(total)(flat), jax.hessian(total)(flat)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("strength", [0.0, 3.0], ids=["no prior", "marginal prior"])
 @pytest.mark.parametrize("depth", [None, 60.0], ids=["in front", "behind"])
 def test_hessian_is_that_of_automatic_differentiation(strength: float, depth: float | None) -> None:

@@ -34,6 +34,7 @@ def batch(windows: list[TrackedWindow]) -> Batch:
     return stack(windows)
 
 
+@pytest.mark.long
 def test_windows_hold_what_they_say(windows: list[TrackedWindow]) -> None:
     """Features are finite, also where the tracker went astray, and the errors are those of the targets; oracle: the
     shapes, and that right matches are right.
@@ -60,6 +61,7 @@ def test_every_match_is_stored_with_its_own_features(windows: list[TrackedWindow
     assert int(batch.present.sum()) == sum(len(window.error) for window in windows)
 
 
+@pytest.mark.long
 def test_the_gradient_is_that_of_the_error(batch: Batch) -> None:
     """The gradient through the optimum agrees with central differences of the whole adjustment."""
     window = batch.select(0)
@@ -74,6 +76,7 @@ def test_the_gradient_is_that_of_the_error(batch: Batch) -> None:
     assert not np.asarray(gradient)[~np.asarray(window.present)].any()
 
 
+@pytest.mark.long
 def test_a_failed_solve_is_no_small_error(batch: Batch) -> None:
     """Weights that are no numbers give NaN, not the error of the start."""
     window = batch.select(0)

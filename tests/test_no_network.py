@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 import tiny_sequences as tiny
 from bad_files import problem, walk
 
@@ -35,6 +36,7 @@ print("done")
 """
 
 
+@pytest.mark.long
 def test_default_paths_open_no_socket(tmp_path: Path) -> None:
     """Oracle: `socket` with its connections taken away, in a process of its own."""
     pixels = np.random.default_rng(1).integers(0, 255, (12, 16, 3)).astype(np.uint8).repeat(10, 0).repeat(10, 1)

@@ -28,6 +28,7 @@ CORE = (
 """Energy, the terms' normal equations, a step, a solve and a gradient through it."""
 
 
+@pytest.mark.long
 def test_a_gradient_through_the_optimum() -> None:
     # Proves the derivative of the optimum by the matches on a problem that compiles quickly. Oracle: central
     # differences of the polished optimum (tests/test_gradients.py has every leaf).

@@ -132,6 +132,7 @@ def test_wheel_holds_every_source_file_and_nothing_else(source: Path, wheel: Pat
     assert Path("vggtgeo/benchmark/suites/quick.toml") in data
 
 
+@pytest.mark.long
 def test_every_module_imports_from_a_users_folder(installation: Installation, source: Path, user_folder: Path) -> None:
     # Proves that all modules import, from the installation and without optional packages, where a user's
     # `models/` and `solvers/` come first on the path. Oracle: the files of the source tree.

@@ -147,6 +147,7 @@ def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: floa
     assert error < 0.01, f"{error:.4f} m"
 
 
+@pytest.mark.long
 def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
     """Compiled for a map of so many keyframes, the solver of the last adjustment is not compiled again; oracle: the
     number of programs that JAX keeps of it.
@@ -173,6 +174,7 @@ def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
     assert [padded_count(count) for count in (1, 16, 17, 64, 65, 96, 97, 129)] == [16, 16, 64, 64, 96, 96, 128, 192]
 
 
+@pytest.mark.long
 def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
     """A map cut in two, its later part moved by 5 cm and 2 degrees: only matches of places seen before join it again.
 
@@ -204,6 +206,7 @@ def _visited_twice(slam: Slam, motion: np.ndarray) -> Slam:
     return replace(slam, **everything, factors=(*slam.factors, *ties), origins=(0, count))
 
 
+@pytest.mark.long
 def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
     """A second visit 3 m and 40 degrees away, where no keyframe should see what the first visit saw: what it looks like
     finds it, and a pose graph brings it back before the adjustment. Oracle: the keyframes of the first visit.
@@ -266,6 +269,7 @@ def test_a_map_begins_where_depth_does(room) -> None:
     assert error < 0.015, f"ATE {error:.4f} m"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("points", [ROLES.points, _Dense()], ids=["key points", "dense"])
 def test_depth_that_fails_on_keyframes_leaves_map_and_scale(room, tracked: Slam, points: PointMatcher) -> None:
     """Keyframes without depth, also where matches end at no key point, neither start a new map nor change the scale.
@@ -283,6 +287,7 @@ def test_depth_that_fails_on_keyframes_leaves_map_and_scale(room, tracked: Slam,
     assert error < 0.02, f"ATE {error:.4f} m"
 
 
+@pytest.mark.long
 def test_metric_depth_that_never_comes_frees_the_scale(room) -> None:
     """Where the depth role knows nothing at first, the map starts with a free scale, says so, and ignores later depth,
     which would contradict it; oracle: the renderer's poses up to scale."""

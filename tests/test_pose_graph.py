@@ -75,6 +75,7 @@ def _errors(poses: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     return float(max(off)), float(np.rad2deg(max(turned)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(
     ("false", "bias", "alike"),

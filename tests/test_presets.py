@@ -71,6 +71,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     return runs
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("preset", ["paper", "light"])
 def test_a_run_asks_every_network_and_from_a_cache_none(
     files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int], preset: str
@@ -96,6 +97,7 @@ def test_a_run_asks_every_network_and_from_a_cache_none(
     np.testing.assert_array_equal(poses[0], poses[1])
 
 
+@pytest.mark.long
 def test_depth_that_knows_nothing_leaves_every_other_network_its_part(
     files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
 ) -> None:

@@ -67,6 +67,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.long
 def test_the_notebook_and_the_command_line_write_the_same_folder(folder: Path, tmp_path: Path) -> None:
     """The same names, the same bytes of the data files, the same summary but for times and flags; oracle: the folder of
     `vggtgeo run` on the same frames with the same settings.
@@ -114,6 +115,7 @@ def test_the_notebook_and_the_command_line_write_the_same_folder(folder: Path, t
     assert written[1] == {**written[0], "output": str(again), "quiet": False}
 
 
+@pytest.mark.long
 def test_a_saved_result_is_read_again(folder: Path, tmp_path: Path) -> None:
     """Load and save bring back poses, map, verdict and summary; oracle: the result in memory, and what it wrote."""
     result = vg.reconstruct(folder, end=2)

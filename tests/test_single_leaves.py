@@ -99,6 +99,7 @@ def test_second_derivative() -> None:
     assert float(second(alpha)) == pytest.approx(float(difference), rel=1e-5)
 
 
+@pytest.mark.long
 def test_a_landmark_at_its_bound_is_held() -> None:
     # Proves that a landmark which wants to lie behind infinity rests on its bound, is counted, meets the condition of
     # Karush, Kuhn and Tucker, and gives the others their right derivative. Oracle: finite differences of the solve.

@@ -82,6 +82,7 @@ def solve_exactly(
     return exact_model(system, solver, lambda: definite).solve(vector)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("definite", [True, False])
 def test_exact_hessians_are_solved(name: str, definite: bool, solved: State) -> None:

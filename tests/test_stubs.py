@@ -39,6 +39,7 @@ def test_stubs_fulfil_their_roles_and_say_that_they_are_simulated(oracle: Simula
     assert all(stub.simulated for stub in (matcher, lines, depth, confidence, window))
 
 
+@pytest.mark.long
 def test_answers_depend_on_seed_and_frames_not_on_the_order_of_calls(oracle: SimulatedOracle, images: list) -> None:
     # A second, fresh stub asked in another order gives the same bytes; another seed gives others.
     one, two, other = (SimulatedMast3r(oracle, seed=seed, count=200) for seed in (1, 1, 2))
@@ -80,6 +81,7 @@ def test_smooth_fields_have_unit_variance_and_memory() -> None:
     assert abs(np.mean(first * later) - expected) < 4 * np.sqrt(2 / count), f"{np.mean(first * later)=} {expected=}"
 
 
+@pytest.mark.long
 def test_simulated_depth_has_the_stated_errors(oracle: SimulatedOracle, images: list) -> None:
     # Over seeds and frames: log errors divided by the stated sigma have variance 1; error is smooth; truth where exact.
     ratios, steps = [], []
@@ -96,6 +98,7 @@ def test_simulated_depth_has_the_stated_errors(oracle: SimulatedOracle, images: 
     assert np.abs(exact.depth - oracle.depth(0)).max() < 1e-5
 
 
+@pytest.mark.long
 def test_simulated_depth_wobbles_in_scale_from_frame_to_frame(oracle: SimulatedOracle, images: list) -> None:
     # With the smooth error off, each frame is off by one factor, whose logarithm has the stated deviation.
     moge = SimulatedMoge(oracle, error=0.0, wobble=0.05)

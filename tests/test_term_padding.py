@@ -40,6 +40,7 @@ def packed() -> Packed:
     return SCENE.pack(terms=own_terms())
 
 
+@pytest.mark.long
 def test_padding_changes_neither_energy_nor_gradient(packed) -> None:
     # Proves that room for more keyframes, edges, landmarks and observations says nothing, for terms on edges, poses
     # and pairs and a marginal prior. Oracle: the problem without room; with one observation less it differs.
@@ -143,6 +144,7 @@ def test_a_class_of_a_notebook_is_found_by_its_name() -> None:
         find_class("elsewhere:PositionFix", OWN)
 
 
+@pytest.mark.long
 def test_a_batch_of_windows_with_different_terms(packed) -> None:
     # Proves that windows may differ in which own terms they have and how many observations of each. Oracle: the energy
     # and gradient of each window packed alone.

@@ -213,6 +213,7 @@ def assembled(
     return found, (normal, curved, slope, slope, slope)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_normal_equations_are_those_of_the_residual(kind: str) -> None:
     # Proves for each kind of term, a user's own among them, the assembly of matrix, exact Hessian and gradient, with a

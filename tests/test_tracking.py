@@ -150,6 +150,7 @@ class _Counting(SiftMatcher):
         return super().describe(image)
 
 
+@pytest.mark.long
 def test_frames_are_described_where_flow_fails(room: Room) -> None:
     """By flow most frames need no descriptors, and none where it has nothing to follow; both ways end near the truth.
 
@@ -287,6 +288,7 @@ def test_black_frames_are_lost_and_the_map_goes_on(room: Room) -> None:
     assert _error(slam, truth) < 0.015
 
 
+@pytest.mark.long
 def test_a_camera_that_comes_back_is_found_again(room: Room) -> None:
     """Away to a place never seen and back at the clip's beginning: found in the old map; oracle: the true poses."""
     frames, camera, truth = room
@@ -357,6 +359,7 @@ def test_a_place_that_drift_has_moved_is_used_again(room: Room, monkeypatch: pyt
         assert off < 0.03, f"frame {record.frame} is {100 * off:.1f} cm off"
 
 
+@pytest.mark.long
 def test_pieces_join_where_they_meet(room: Room) -> None:
     """Two parts of a room, the second begun without knowing the first, become one map when the camera comes back.
 

@@ -149,6 +149,7 @@ def test_the_covariance_is_that_of_the_dense_inverse() -> None:
     np.testing.assert_allclose(np.diag(found.poses[1]), expected[6:12], rtol=1e-6)
 
 
+@pytest.mark.long
 def test_gradients_are_those_of_central_differences() -> None:
     # Proves implicit differentiation through the constrained optimum. Oracle: central differences of whole solves.
     problem, state, _ = scene().pack()

@@ -179,6 +179,7 @@ def test_on_a_system_that_no_camera_made() -> None:
     assert int(found.rank) == len(free)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("delta", "low"), [(1e6, 0.98), (1.5, 0.94)], ids=["square", "Huber"])
 def test_errors_have_the_covariance_claimed(delta: float, low: float) -> None:
     # Proves that poses and intrinsics of 200 random problems err as their covariances say, and inverse depths too, with

@@ -142,6 +142,7 @@ def test_second_derivatives_are_derived(own) -> None:
         assert error < 1e-10 * size, error
 
 
+@pytest.mark.long
 def test_gradient_by_own_data(own) -> None:
     # Proves that the optimum is differentiated by the data of a user's term, under `vmap` too. Oracle: finite
     # differences of the solve.
@@ -163,6 +164,7 @@ def test_gradient_by_own_data(own) -> None:
     assert abs(found - difference) < 1e-5 * abs(difference), (found, difference)
 
 
+@pytest.mark.long
 def test_own_terms_are_known_everywhere(own, solved) -> None:
     # Proves that covariances shrink by an own fix, that observability and statistics name it, and that marginalisation
     # takes it along. Oracle: the same problem without it; what is named.
