@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -107,17 +107,16 @@ def _together(block: Block, seen_by: Mapping[Block, Sequence[int]]) -> list[int]
 def _blocks(view: View, voxel: float) -> list[Block]:
     """Corners, in blocks, of those that the view's surface passes within the truncation."""
     depth = view.depth_map.depth
-    step = max(1, max(depth.shape) // 320)
+    step = max(1, max(depth.shape) // 160)  # some centimetres apart, where a block is some tens wide
     rows, columns = np.nonzero(np.isfinite(depth[::step, ::step]))
     pixels = np.column_stack([columns, rows]).astype(np.float64) * step
     z = depth[::step, ::step][rows, columns].astype(np.float64)
     rays = pinhole.rays(pixels, view.intrinsics)
     reach = TRUNCATION * voxel
-    found = set()
-    for offset in (-reach, 0.0, reach):
-        world = (rays * (z + offset)[:, None] - view.pose[:3, 3]) @ view.pose[:3, :3]
-        found |= set(map(tuple, np.unique(np.floor(world / (SIDE * voxel)).astype(int), axis=0).tolist()))
-    return sorted(found)
+    local = np.concatenate([rays * (z + offset)[:, None] for offset in (-reach, 0.0, reach)])
+    cells = np.floor((local - view.pose[:3, 3]) @ view.pose[:3, :3] / (SIDE * voxel)).astype(int)
+    _, first = np.unique(cell_numbers(cells), return_index=True)
+    return list(map(tuple, cells[first].tolist()))
 
 
 def _batch(
@@ -128,25 +127,22 @@ def _batch(
     least: int,
 ) -> list[Mesh]:
     """The meshes of some blocks."""
-    grid = np.stack(np.meshgrid(*[np.arange(SIDE + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    volume = np.zeros((len(blocks), len(grid), 6), np.float32)
+    volume = np.zeros((len(blocks), SIDE + 1, SIDE + 1, SIDE + 1, 6), np.float32)
     rows_of: dict[int, list[int]] = defaultdict(list)
     for row, block in enumerate(blocks):
         for number in seen_by[block]:
             rows_of[number].append(row)
-    corners = np.array(blocks, np.float64) * SIDE
+    corners = np.array(blocks, np.int32).reshape(-1, 3) * SIDE
     for number, rows in sorted(rows_of.items()):
         view = views[number]
         pixels, intrinsics = _packed(view), jnp.asarray(view.intrinsics, jnp.float32)
+        motion = jnp.asarray(view.pose[:3] * [voxel, voxel, voxel, 1.0], jnp.float32)
         for first in range(0, len(rows), GROUP):
             chosen = rows[first : first + GROUP]
-            padded = np.resize(chosen, GROUP)
-            points = (corners[padded][:, None] + grid) * voxel
-            local = (points @ view.pose[:3, :3].T + view.pose[:3, 3]).astype(np.float32)
-            added = np.asarray(_measured(jnp.asarray(local), pixels, intrinsics, np.float32(TRUNCATION * voxel)))
+            padded = jnp.asarray(corners[np.resize(chosen, GROUP)])
+            added = np.asarray(_measured(padded, motion, pixels, intrinsics, np.float32(TRUNCATION * voxel)))
             volume[chosen] += added[: len(chosen)]
-    shape = (SIDE + 1,) * 3
-    parts = [_surface(volume[row].reshape(*shape, 6), corners[row], voxel, least) for row in range(len(blocks))]
+    parts = [_surface(volume[row], corners[row], voxel, least) for row in range(len(blocks))]
     return [part for part in parts if part is not None]
 
 
@@ -162,17 +158,31 @@ def _packed(view: View) -> Array:
 
 @jax.jit
 def _measured(
-    points: Float[Array, "b n 3"],
+    corners: Int[Array, "b 3"],
+    motion: Float[Array, "3 4"],
     pixels: Float[Array, "h w 5"],
     intrinsics: Float[Array, " 4"],
     reach: float | Float[Array, ""],
-) -> Float[Array, "b n 6"]:
-    """What one view adds to voxels at `points` of its frame: weight times distance and colour, the weight, and 1."""
-    z = jnp.maximum(points[..., 2], 1e-3)
-    u = jnp.rint(points[..., 0] / z * intrinsics[0] + intrinsics[2]).astype(jnp.int32)
-    v = jnp.rint(points[..., 1] / z * intrinsics[1] + intrinsics[3]).astype(jnp.int32)
+) -> Float[Array, "b i j k 6"]:
+    """What one view adds to the voxels of blocks: weight times distance and colour, the weight, and 1.
+
+    corners: of the blocks, in voxels. motion: from places in voxels to the view's frame. A voxel that two blocks share
+    is computed from the same numbers in the same order, so that both find the same.
+    """
+    steps = (corners[:, :, None] + jnp.arange(SIDE + 1)).astype(jnp.float32)
+    x, y, z = (
+        row[0] * steps[:, 0, :, None, None]
+        + row[1] * steps[:, 1, None, :, None]
+        + row[2] * steps[:, 2, None, None]
+        + row[3]
+        for row in motion
+    )
+    ahead = z > 1e-3
+    z = jnp.maximum(z, 1e-3)
+    u = jnp.rint(x / z * intrinsics[0] + intrinsics[2]).astype(jnp.int32)
+    v = jnp.rint(y / z * intrinsics[1] + intrinsics[3]).astype(jnp.int32)
     height, width, _ = pixels.shape
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (points[..., 2] > 1e-3)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & ahead
     seen = pixels[jnp.clip(v, 0, height - 1), jnp.clip(u, 0, width - 1)]
     distance = seen[..., :1] - z[..., None]
     # In front it is free, to a limit beyond which a view says nothing: whether a block asks it depends on the block.
