@@ -230,6 +230,35 @@ def test_a_wrong_calibration_is_told_with_the_right_one(healthy: Walk, factor: f
     assert _camera(repaired, healthy.evidence) == [], "a run that ends with the right camera is in order"
 
 
+def test_turns_alone_say_nothing_of_the_depth() -> None:
+    """A camera that only turns, tracked to a third of a millimetre, has no word on the depth, though one corner in ten
+    slipped by some 30 pixels, which is parallax to such a motion; oracle: the walk's own depth, which is right.
+    """
+    turning, rng = walk(step=0.0, sway=0.0), np.random.default_rng(3)
+    poses = turning.estimate.poses.copy()
+    poses[:, :3, 3] += 3e-4 * rng.standard_normal((len(poses), 3))
+    slips = lambda pixels: 30.0 * rng.standard_normal(pixels.shape) * (rng.random((len(pixels), 1)) < 0.1)
+    evidence = [
+        replace(frame, pixels=(frame.pixels + slips(frame.pixels)).astype(np.float32)) for frame in turning.evidence
+    ]
+    assert _depth(turning.with_poses(poses), evidence) == []
+
+
+def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
+    """Images that were cut or turned after the calibration are told without any opinion of theirs; a camera that the
+    images confirm is none of these. Oracle: the intrinsics that the walk was made with.
+    """
+    check = lambda estimate, opinion, size: [f.text for f in check_camera(estimate, opinion, size)]
+    width, height = SIZE
+    assert check(healthy.estimate, None, (width, height)) == []
+    for size in ((3 * width // 4, 3 * height // 4), (height, width), (width // 2, height // 2)):
+        assert any("cut, turned or scaled" in text for text in check(healthy.estimate, None, size)), size
+    opinion = camera_opinion(healthy.estimate, healthy.evidence)
+    assert opinion is not None
+    confirmed = check(healthy.estimate, opinion, (3 * width // 4, 3 * height // 4))
+    assert not any("cut, turned or scaled" in text for text in confirmed), "the images know their camera"
+
+
 def test_distortion_that_was_not_told_is_named() -> None:
     """k1 = -0.2 in the images is found within 0.05, and called distortion; oracle: the lens of the walk."""
 

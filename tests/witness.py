@@ -29,15 +29,22 @@ class Walk:
         return replace(self.estimate, poses=poses)
 
 
-def walk(count: int = 40, seed: int = 0, noise: float = 0.3, lens: Lens | None = None, step: float = 0.06) -> Walk:
+def walk(
+    count: int = 40,
+    seed: int = 0,
+    noise: float = 0.3,
+    lens: Lens | None = None,
+    step: float = 0.06,
+    sway: float = 1.0,
+) -> Walk:
     """A sideways walk with turns past points 1.5 to 5 m away.
 
     noise: of the pixels; depth has 1 % and is wrong (an edge) at 2 % of the points. lens: what the camera does to ideal
-    pixels, float64 [m, 2] -> [m, 2].
+    pixels, float64 [m, 2] -> [m, 2]. step: how far it goes sideways a frame; sway: other motion; both 0: turns alone.
     """
     rng = np.random.default_rng(seed)
     times = np.arange(count) / 10
-    centres = np.column_stack([step * np.arange(count), 0.05 * np.sin(times), 0.3 * np.sin(0.5 * times)])
+    centres = np.column_stack([step * np.arange(count), 0.05 * sway * np.sin(times), 0.3 * sway * np.sin(0.5 * times)])
     turns = Rotation.from_euler("yx", np.column_stack([0.15 * np.sin(0.8 * times), 0.05 * np.cos(times)]))
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = turns.as_matrix()

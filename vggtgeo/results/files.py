@@ -16,6 +16,7 @@ from vggtgeo.io.files import atomic_open, write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 
@@ -38,12 +39,21 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
     Of a map in pieces they hold the one of most frames, `trajectory-2.txt` and `keyframes-2.txt` the next, and so on.
     Those of pieces that have been joined since they were last written are taken away.
     """
-    for name in ("trajectory", "keyframes"):
+    for name in ("trajectory", "keyframes", "uncertainty"):
         for old in folder.glob(f"{name}-[0-9]*.txt"):
             old.unlink()
     for piece in range(max(len(pieces_by_size(slam)), 1)):
         frame_trajectory(slam, piece).save_tum(folder / piece_file("trajectory", piece))
         keyframe_trajectory(slam, piece).save_tum(folder / piece_file("keyframes", piece))
+        uncertainty = frame_uncertainty(slam, piece)
+        if uncertainty is not None:
+            write_text(folder / piece_file("uncertainty", piece), _uncertainty_text(uncertainty))
+
+
+def _uncertainty_text(found: PoseUncertainty) -> str:
+    rows = zip(found.timestamps, found.translation, np.rad2deg(found.rotation), strict=True)
+    head = "# timestamp, standard deviation of the place, and of the orientation in degrees: the worst direction\n"
+    return head + "".join(f"{time:.6f} {moved:.6f} {turned:.5f}\n" for time, moved, turned in rows)
 
 
 def piece_file(name: str, piece: int) -> str:

@@ -29,6 +29,7 @@ from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
+from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import default_roles, finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -44,6 +45,7 @@ LEAST_SIDE = 32
 """Pixels: windows of features and of the image pyramid do not fit into less."""
 
 
+@in_double_precision
 def reconstruct(
     frames: str | os.PathLike[str] | Sequence | Iterable[Any],
     roles: Roles | Perception | None = None,

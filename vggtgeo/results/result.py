@@ -25,6 +25,7 @@ from vggtgeo.results.files import write_depth, write_settings, write_trajectorie
 from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise, with_writing
+from vggtgeo.slam.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import Evidence
@@ -87,6 +88,11 @@ class Result:
     def mesh(self) -> Mesh | None:
         """The map's surface, world frame; None where there is no dense depth. It is made when first asked for."""
         return self.saved_mesh if self.record is None else self.record.dense.mesh
+
+    @property
+    def uncertainty(self) -> PoseUncertainty | None:
+        """Standard deviations of the poses of `trajectory`; None without a last adjustment, or read from a folder."""
+        return frame_uncertainty(self.record.slam) if self.record is not None and self.record.slam.keyframes else None
 
     @classmethod
     def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:

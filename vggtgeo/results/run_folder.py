@@ -35,6 +35,8 @@ NAMES = (
     "trajectory-[0-9]*.txt",
     "keyframes.txt",
     "keyframes-[0-9]*.txt",
+    "uncertainty.txt",
+    "uncertainty-[0-9]*.txt",
     "map.ply",
     "mesh.ply",
     "scene.npz",

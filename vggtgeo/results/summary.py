@@ -9,11 +9,14 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.results.files import piece_file
 from vggtgeo.slam.connected import pieces_by_size
+from vggtgeo.slam.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
@@ -56,12 +59,24 @@ def summarise(
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
         "scale": scale_name(slam, verdict),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
+        **stated_uncertainty(slam),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
         "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
         "notes": list(slam.notes),
         **counts,
     }
     return values if report is None else {**values, "truth": report.as_dict()}
+
+
+def stated_uncertainty(slam: Slam) -> dict[str, Any]:
+    """Median and largest standard deviation of the poses of the largest piece; nothing where it is not known."""
+    found = frame_uncertainty(slam) if slam.keyframes else None
+    if found is None or not np.isfinite(found.translation).any():
+        return {}
+    ends = lambda values: {"median": float(np.nanmedian(values)), "largest": float(np.nanmax(values))}
+    unit = "m" if slam.metric else "unit"
+    moved, turned = ends(found.translation), ends(np.rad2deg(found.rotation))
+    return {"pose_sigma": {f"translation_{unit}": moved, "rotation_deg": turned}}
 
 
 def pieces(slam: Slam) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.factors import factor_terms, surface_term
 from vggtgeo.slam.global_shape import LARGEST_DENSE, GlobalShape, global_solver, padded_count, shape_for
+from vggtgeo.slam.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam
@@ -70,3 +71,4 @@ def compile_global(shape: GlobalShape, settings: SlamSettings) -> None:
     terms = (*factor_terms((), {}, shape.room), *([surfaces] if settings.depth_terms.surface_points > 0 else []))
     problem, initial = smallest_problem(shape.size, settings, terms)
     solve_jit(problem, initial, solver=global_solver(problem, settings)).energy.block_until_ready()
+    keyframe_sigma(problem, initial, 1)

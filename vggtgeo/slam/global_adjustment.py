@@ -15,6 +15,7 @@ from vggtgeo.slam.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.factors import factor_terms
 from vggtgeo.slam.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.global_shape import GlobalShape, global_solver, shape_of
+from vggtgeo.slam.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window import solve_jit
@@ -36,7 +37,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.factors, len(slam.pairs), settings)
     fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
     surfaces = _surfaces(slam)
-    given = slam.given_intrinsics
+    given, solved = slam.given_intrinsics, None
     for number in range(settings.refinement.global_rounds):
         adjustment = build(
             slam.keyframes,
@@ -57,14 +58,15 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
-        slam = _taken(slam, adjustment, solution.state)
+        slam, solved = _taken(slam, adjustment, solution.state), (adjustment.problem, solution.state)
         if number == 0 and slam.calibrated and settings.camera.refine_intrinsics != "never":
             again = lambda problem, state, solver=solver: solve_jit(problem, state, solver=solver).state
             found = try_camera(keyframe_pairs(slam, edges), adjustment.problem, solution.state, again)
             before, slam = slam, _taken_camera(slam, adjustment, found, settings)
             if not np.array_equal(before.intrinsics, slam.intrinsics):
                 given, surfaces = slam.intrinsics, _surfaces(slam)
-    return slam
+    sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
+    return replace(slam, pose_sigma=sigma)
 
 
 def _surfaces(slam: Slam) -> list[Surface]:

@@ -68,6 +68,7 @@ class Slam:
     was lost. origins: the first keyframe of each piece of the map; pieces are tied to nothing else.
     metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
     world), as the first keyframes saw them. notes: what the user should know.
+    pose_sigma: of each keyframe after the last adjustment, see `pose_uncertainty.keyframe_sigma`.
     """
 
     intrinsics: np.ndarray
@@ -91,6 +92,7 @@ class Slam:
     reference: tuple[int, RgbdView | None] | None = None
     held: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
+    pose_sigma: np.ndarray | None = None
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)

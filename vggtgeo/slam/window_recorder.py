@@ -13,6 +13,7 @@ from vggtgeo.bundle.residuals import residual_sizes
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 
 _sizes_jit = eqx.filter_jit(residual_sizes)
@@ -42,9 +43,11 @@ class WindowRecorder(Callback):
         self.records: list[WindowRecord] = []
         self._last: object = None
 
+    @in_double_precision
     def on_warm_up(self, problem: Problem, state: State) -> None:
         jax.block_until_ready(_sizes_jit(problem, state).rms)
 
+    @in_double_precision
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         if slam.solved is None or slam.solved is self._last:
             return

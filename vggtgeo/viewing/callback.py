@@ -12,6 +12,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
@@ -34,11 +35,13 @@ class RerunCallback(Callback):
         self._keyframes = self._notes = self._iterations = 0
         stream.log("world", rr.ViewCoordinates.RDF, static=True)
 
+    @in_double_precision
     def on_warm_up(self, problem: Problem, state: State) -> None:
         """Compile for windows of the shape of `problem`."""
         self._recorder.on_warm_up(problem, state)
         _covariances_jit(problem, state).poses.block_until_ready()
 
+    @in_double_precision
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         self.stream.set_time("frame", sequence=frame.index)
         self.stream.set_time("time", duration=frame.timestamp)

@@ -107,7 +107,7 @@ def covariances(
     state: State,
     *,
     reduced_solver: AbstractReducedSolver | None = None,
-    keyframes: Int[np.ndarray, " h"] | list[int] | None = None,
+    keyframes: Int[np.ndarray, " h"] | Int[Array, " h"] | list[int] | None = None,
 ) -> Covariances:
     """Marginal covariances of poses, of the intrinsics, and variances of the inverse depths at a solution.
 

@@ -21,6 +21,9 @@ from vggtgeo.slam.trust.finding import Finding
 
 GAPS = (1, 3, 6)
 MUCH = 0.15
+SURE, FAR_OFF = 20.0, 3.0
+"""Inverse relative standard deviation of a triangulated corner that counts; a factor on the depth that parallax by the
+sensor's own depth leaves room for."""
 LEAST = 30
 """Corners in a run below which nothing is said."""
 MOST_OFF = 0.25
@@ -116,7 +119,8 @@ def _pair(
     depth, there = first.depth[rows].astype(np.float64), second.depth[others].astype(np.float64)
     depth, there = (np.where(z > 0, z, np.nan) for z in (depth, there))
     inverse, information = rigid.triangulate(before, after, relative, intrinsics)
-    sure = (inverse * np.sqrt(information) > 20.0) & np.isfinite(depth)
+    # By the sensor's depth, too: where the camera only turns, noise alone triangulates to something near and sure.
+    sure = (inverse * np.sqrt(information) > SURE) & (np.sqrt(information) / depth > SURE / FAR_OFF)
     carried = rigid.unproject(before, 1 / depth, np.eye(4), intrinsics) @ relative[:3, :3].T + relative[:3, 3]
     both = np.isfinite(carried[:, 2]) & (carried[:, 2] > 0) & np.isfinite(there)
     return np.log(inverse[sure] * depth[sure]), np.log(carried[both, 2] / there[both])

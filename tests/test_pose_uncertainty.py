@@ -1,0 +1,49 @@
+"""What a run says of the errors of its own poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vggtgeo as vg
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.evidence import tangent
+from vggtgeo.slam.pose_uncertainty import keyframe_sigma
+
+
+def test_keyframes_have_the_deviations_of_their_covariances() -> None:
+    """The worst direction of each pose, and never less than independent errors of weight 1 would give; oracle: the
+    covariances, and numpy's eigenvalues.
+    """
+    problem, initial, _ = vg.simulate_window().pack()
+    state = vg.solve(problem, initial).state
+    known = vg.covariances(problem, state)
+    sigma = keyframe_sigma(problem, state, 3)
+    assert sigma is not None
+    factor = max(float(known.variance_factor), 1.0)
+    for column, part in enumerate((slice(0, 3), slice(3, 6))):
+        worst = np.linalg.eigvalsh(np.asarray(known.poses)[:3, part, part])[:, -1]
+        np.testing.assert_allclose(sigma[:, column], np.sqrt(factor * np.maximum(worst, 0.0)), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.long
+def test_true_errors_lie_within_what_is_stated(tmp_path: Path) -> None:
+    """95 % of the poses are within three standard deviations of the truth, relative to the first, and the deviations
+    are not so large that this says nothing. Oracle: the renderer's poses; the file has the same numbers.
+    """
+    result = vg.reconstruct(vg.simulate("room", 40, size=(320, 240), rate=6.0))
+    stated = result.uncertainty
+    assert stated is not None
+    assert result.record is not None
+    assert result.record.truth is not None
+    against_first = lambda poses: rigid.invert(poses[0])[None] @ poses
+    found, true = against_first(result.trajectory.poses), against_first(result.record.truth.poses)
+    off = np.array([tangent(rigid.invert(one) @ other) for one, other in zip(found, true, strict=True)])
+    for error, sigma in ((off[:, :3], stated.translation), (off[:, 3:], stated.rotation)):
+        size = np.linalg.norm(error, axis=1)
+        assert np.mean(size <= 3 * sigma) >= 0.95
+        assert np.median(sigma) < 10 * np.median(size)
+    result.save(tmp_path / "run")
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "run/uncertainty.txt")[:, 1], stated.translation, atol=1e-6)
