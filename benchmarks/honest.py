@@ -8,6 +8,11 @@ standard deviations (honest: at least 95 %), of translation and of rotation, the
 then the median squared Mahalanobis distance of the keyframes' motions (honest: 5.3, chi-square of 6 degrees of freedom)
 and by what the standard deviations would have to be multiplied for that. The truth of the real clips has errors of its
 own (`../shared/data/README.md`): that of icl-office alone is exact.
+
+    python benchmarks/honest.py office room ../shared/data/icl-office --whole
+
+runs whole clips, and simulated scenes by name, to their end, and compares what `uncertainty.txt` states of every frame
+with its error: against the first pose where the truth is exact, and after SE(3) alignment.
 """
 
 from __future__ import annotations
@@ -16,9 +21,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2 as chi_square
 from short_runs import Piece
 
+import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.evidence import tangent
 from vggtgeo.slam.state import Slam
@@ -28,10 +35,21 @@ HEADER = (
     "| motions of keyframes: median distance | sigma times |\n" + "|---" * 10 + "|"
 )
 
+WHOLE = (
+    "| source | frames | stated, mm | error, mm: aligned | to the first pose | stated, deg | turned, deg "
+    "| within 3 sigma: aligned | to the first pose | rotation |\n" + "|---" * 10 + "|"
+)
+
 
 def main() -> None:
     """Run every clip and print the table."""
     options = _options()
+    if options.whole:
+        print(WHOLE)
+        for path in options.clips:
+            source = path if path.exists() else vg.simulate(path.name, 80, rate=6.0)
+            print(_whole_row(path.name, vg.reconstruct(source)), flush=True)
+        return
     print(HEADER)
     for path in options.clips:
         piece = Piece.of(path, options.frames)
@@ -70,6 +88,28 @@ def _row(name: str, slam: Slam, true: np.ndarray, row_of: dict[int, int]) -> str
     return "| " + " | ".join((name, str(len(moved)), *cells)) + " |"
 
 
+def _whole_row(name: str, result: vg.Result) -> str:
+    stated = result.uncertainty
+    assert stated is not None
+    assert result.record is not None
+    assert result.record.truth is not None
+    truth = result.record.truth
+    rows = [int(np.argmin(np.abs(truth.timestamps - time))) for time in result.trajectory.timestamps]
+    found, true = result.trajectory.poses, truth.poses[rows]
+    against_first = [rigid.invert(poses[0])[None] @ poses for poses in (found, true)]
+    off = np.array([tangent(rigid.invert(one) @ other) for one, other in zip(*against_first, strict=True)])
+    first = np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)
+    places, targets = (poses[:, :3, 3] - poses[:, :3, 3].mean(0) for poses in (found, true))
+    turn, _ = Rotation.align_vectors(targets, places)
+    aligned = np.linalg.norm(turn.apply(places) - targets, axis=1)
+    moved, turned = stated.translation, stated.rotation
+    compared = ((aligned, moved), (first[0], moved), (first[1], turned))
+    within = [f"{100 * np.mean(error <= 3 * sigma):.0f} %" for error, sigma in compared]
+    cells = [f"{1e3 * np.median(values):.1f}" for values in (moved, aligned, first[0])]
+    angles = [f"{np.rad2deg(np.median(values)):.3f}" for values in (turned, first[1])]
+    return "| " + " | ".join((name, str(len(moved)), *cells, *angles, *within)) + " |"
+
+
 def _error(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Tangent of a motion's error, translation first; `first` and `second` are true, world -> camera."""
     return tangent(motion @ first @ rigid.invert(second))
@@ -79,6 +119,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--whole", action="store_true")
     return parser.parse_args()
 
 
