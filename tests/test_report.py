@@ -174,3 +174,13 @@ def test_a_cube_is_where_it_should_be() -> None:
     assert (image == (0, 255, 0)).all(-1).sum() > 20 * len(rows)
     inside = map_view.walk_in(PointCloud(points, colours.astype(np.uint8)), path, 300)
     assert abs(np.nonzero((inside == (255, 0, 0)).all(-1))[1].mean() - 150) < 4
+
+
+def test_a_map_that_lies_overhead_is_drawn() -> None:
+    """False depth can put every point above the headroom over the path; they are drawn then, not left out."""
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 0, 3] = np.linspace(0, 1, 5)
+    overhead = np.random.default_rng(1).uniform((-1, -9, 1), (2, -8, 3), (500, 3))  # world y down
+    cloud = PointCloud(overhead, np.full((500, 3), (255, 0, 0), np.uint8))
+    image = map_view.from_above(cloud, Trajectory(np.arange(5) / 10.0, poses), 300)
+    assert (image == (255, 0, 0)).all(-1).any()

@@ -36,6 +36,8 @@ def from_above(cloud: PointCloud, trajectory: Trajectory, width: int = 900) -> U
     axes = _along_the_extent(view_axes(trajectory), cloud.points)
     points, path = cloud.points @ axes.T, trajectory.positions @ axes.T
     kept = points[:, 2] < path[:, 2].max() + _HEADROOM
+    if not kept.any():
+        kept[:] = True  # false depth may put the whole map overhead: that is to be seen, then
     points, colours = points[kept], cloud.colours[kept]
     low, high = _extent(points[:, :2], path[:, :2])
     height = width * 3 // 4
