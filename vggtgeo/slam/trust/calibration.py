@@ -58,9 +58,10 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
     """
     if not estimate.calibrated:
         return []
-    found = _check_middle(estimate.given, opinion, size)
+    middle = _check_middle(estimate.intrinsics, opinion, size)
     if opinion is None:
-        return found
+        return middle
+    found = []
     focal, x, y, radial = (float(value) for value in opinion.value)
     moved = bool(np.any(np.abs(estimate.intrinsics - estimate.given) > MOST_MOVED * estimate.given[0]))
     needed = max(SIGMAS, opinion.quantile(CHANCE))
@@ -73,6 +74,8 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
     if (sure[1] and abs(x) > much * MOST_SHIFT * size[0]) or (sure[2] and abs(y) > much * MOST_SHIFT * size[0]):
         text = f"the images want the principal point {x:.0f}, {y:.0f} px beside where it is taken to be"
         found.append(Finding("calibration", "degraded", text))
+    else:
+        found += middle
     diagonal, focal_length = float(np.hypot(*size)), float(estimate.intrinsics[0])
     warp = abs(radial) * (diagonal / 2 / focal_length) ** 3 * focal_length
     if sure[3] and warp > MOST_WARP * diagonal:
@@ -84,10 +87,10 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
     return found
 
 
-def _check_middle(given: np.ndarray, opinion: CameraOpinion | None, size: tuple[int, int]) -> list[Finding]:
-    """Is the given camera that of images of this size? Few frames say too little of the principal point to tell."""
+def _check_middle(camera: np.ndarray, opinion: CameraOpinion | None, size: tuple[int, int]) -> list[Finding]:
+    """Is the camera that of images of this size? Few frames say too little of the principal point to tell."""
     sides = np.array(size, np.float64)
-    aside = given[2:] - (sides - 1.0) / 2.0
+    aside = camera[2:] - (sides - 1.0) / 2.0
     far = np.abs(aside) > MOST_ASIDE * sides
     if not far.any():
         return []
@@ -97,7 +100,7 @@ def _check_middle(given: np.ndarray, opinion: CameraOpinion | None, size: tuple[
         if sure[far].all():
             return []
     text = (
-        f"the given principal point, {given[2]:.0f}, {given[3]:.0f}, is far from the middle of the images of "
+        f"the principal point, {camera[2]:.0f}, {camera[3]:.0f}, is far from the middle of the images of "
         f"{size[0]} x {size[1]} pixels: were they cut, turned or scaled after the calibration?"
     )
     return [Finding("calibration", "degraded", text)]
