@@ -215,7 +215,12 @@ def test_a_wrong_unit_of_depth_is_told(healthy: Walk, factor: float) -> None:
 
 @pytest.mark.parametrize(
     ("factor", "shift", "text"),
-    [(1.1, 0.0, "focal length"), (0.85, 0.0, "focal length"), (1.0, 40.0, "principal point")],
+    [
+        (1.1, 0.0, "focal length"),
+        (0.85, 0.0, "focal length"),
+        (2.0, 0.0, "focal length"),
+        (1.0, 40.0, "principal point"),
+    ],
 )
 def test_a_wrong_calibration_is_told_with_the_right_one(healthy: Walk, factor: float, shift: float, text: str) -> None:
     """Intrinsics off by 10 % or 40 px are found within 3 % and 6 px; oracle: those the walk was made with."""

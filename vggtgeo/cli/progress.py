@@ -86,6 +86,14 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
         lines.append("scale: doubtful, lengths may be no metres")
     else:
         lines.append(f"scale: metric, by {summary['scale_basis']}")
+    stated = summary.get("pose_sigma", {})
+    if "translation_m" in stated:
+        moved, turned = stated["translation_m"], stated["rotation_deg"]
+        lines.append(
+            f"poses relative to the first, one standard deviation: {100 * moved['median']:.1f} cm and "
+            f"{turned['median']:.2f} deg in the median, {100 * moved['largest']:.1f} cm and {turned['largest']:.2f} "
+            "deg at most (uncertainty.txt)"
+        )
     if "truth" in summary:
         se3, sim3 = (summary["truth"][name]["rmse"] for name in ("ate_se3_m", "ate_sim3_m"))
         free = summary["scale"].startswith("free")

@@ -24,7 +24,9 @@ from scipy.stats import t as student_t
 LEAST_PAIRS = 8
 PARAMETERS = 4
 LEAST_BLOCKS = PARAMETERS + 2
-ITERATIONS = 6
+ITERATIONS, SETTLED = 20, 0.002
+"""At most, and the step, in the longest ones, below which there are no more. Half the focal length is seven of these
+away."""
 HUBER = 1.0
 FARTHEST = 30.0
 """Pixels: residuals beyond are none of this camera's."""
@@ -83,6 +85,8 @@ def camera_of_pairs(pairs: Sequence[CameraPair], intrinsics: np.ndarray) -> Came
         step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
         value = value + step
         poses = [_moved(pose, r.pose_step(step)) for pose, r in zip(poses, reduced, strict=True)]
+        if np.all(np.abs(step) < SETTLED * LONGEST_STEP):
+            break
     inverse = np.linalg.inv(sum(r.normal for r in reduced) + prior)
     blocks = np.zeros((count, PARAMETERS))
     np.add.at(blocks, block, np.array([r.gradient for r in reduced]))
