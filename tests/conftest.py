@@ -98,3 +98,11 @@ def shared_data() -> Path:
 def shared_bench() -> Path:
     """The folder of the benchmark problems and their numpy oracle (`problems.py`), or a skip."""
     return _shared("bench")
+
+
+@pytest.fixture
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of frames that start no window, or hardly one: nothing is compiled beforehand."""
+    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
+    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
+    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)

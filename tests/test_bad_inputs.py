@@ -25,16 +25,9 @@ from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import InputError, InputWarning
 
 PAGE = (ROOT / "docs" / "bad-inputs.md").read_text(encoding="utf-8")
+pytestmark = pytest.mark.usefixtures("uncompiled")
 SECONDS = 1.0
 MEGABYTES = 500
-
-
-@pytest.fixture(autouse=True)
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames without parallax start no window, so nothing need be compiled."""
-    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
-    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
-    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
 
 
 def seen(row: Row, made: Any) -> tuple[str, list[str]]:

@@ -61,15 +61,18 @@ def test_no_child_outlives_its_run(tmp_path: Path) -> None:
     )
     run_limited(_python(code), tmp_path / "log.txt", Limits(0.5, 2.0))
     child = int((tmp_path / "log.txt").read_text())
-    for _ in range(100):
-        try:
-            state = Path(f"/proc/{child}/stat").read_text().split()[2]
-        except OSError:
-            return
-        if state == "Z":
-            return
+    deadline = time.monotonic() + 2
+    while _runs(child) and time.monotonic() < deadline:
         time.sleep(0.02)
-    pytest.fail(f"process {child} still runs")
+    assert not _runs(child)
+
+
+def _runs(process: int) -> bool:
+    """Is there such a process, other than one that has ended and waits to be collected?"""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().split()[2] != "Z"
+    except OSError:
+        return False
 
 
 def test_processors_are_shared_out() -> None:

@@ -14,14 +14,12 @@ from vggtgeo.cli.main import make_app
 from vggtgeo.results import Result
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("kind", ["black", "one picture", "unrelated pictures"])
-def test_a_run_that_never_begins_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_a_run_that_never_begins_says_so(tmp_path: Path, kind: str) -> None:
     """Pictures without parallax give identity poses, which nobody may take for a result: code 3, last line, summary and
     page; oracle: no motion can be had from such pictures.
     """
-    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
-    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
-    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
     rng = np.random.default_rng(0)
     for row in range(6):
         pixels = rng.integers(0, 255, (12, 16, 3)).astype(np.uint8).repeat(20, 0).repeat(20, 1)

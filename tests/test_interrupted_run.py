@@ -23,6 +23,7 @@ FRAMES = 120
 PROGRAM = "from vggtgeo.cli import main; main()"
 
 
+@pytest.mark.usefixtures("uncompiled")
 def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -34,9 +35,6 @@ def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
-    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
-    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
     monkeypatch.setattr("vggtgeo.results.reconstruction.run_frames", interrupted)
     (tmp_path / "trajectory.txt").write_text("of an earlier run")
     result = CliRunner().invoke(make_app(), ["demo", "--scene", "room", "--frames", "3", "-o", str(tmp_path), "--json"])

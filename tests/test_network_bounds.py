@@ -162,14 +162,12 @@ def test_depth_of_another_scene_is_told(kind: str) -> None:
     assert any("neighbouring keyframes disagrees" in reason for reason in verdict.reasons) == (kind == "random")
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("scale", [1.0, 1e30], ids=["right", "1e30"])
-def test_a_run_tells_what_was_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scale: float) -> None:
+def test_a_run_tells_what_was_refused(tmp_path: Path, scale: float) -> None:
     """Networks behind a whole run: with depth of 1e30 m nothing is metric, no coordinate is beyond a room, and the
     verdict names the network. Oracle: the same run with right depth.
     """
-    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
-    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
-    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
     size = (120, 160)
     tiny.dinov3(tmp_path / "dinov3-small.onnx", (112, 160))
     tiny.mlsd(tmp_path / "mlsd.onnx")

@@ -17,6 +17,7 @@ from vggtgeo.cli.main import make_app
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.settings_table import changed
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
 FRAMES = 5
 TABLES = changed(SETTINGS)
 DATA = ("keyframes.txt", "map.ply", "trajectory.txt")
@@ -48,14 +49,6 @@ class _Log(vg.Callback):
 
     def on_finish(self, slam: object, cloud: object) -> None:
         self._note("finish")
-
-
-@pytest.fixture(autouse=True)
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What these few frames do not need is not compiled beforehand."""
-    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
-    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
-    monkeypatch.setattr(vg.Callback, "on_warm_up", lambda self: None)
 
 
 @pytest.fixture(scope="module")

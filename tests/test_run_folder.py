@@ -27,16 +27,11 @@ from vggtgeo.results.files import write_depth
 from vggtgeo.results.run_folder import RESERVE, check_finished, taken
 from vggtgeo.slam.keyframe import Keyframe
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of another kind")
+pytestmark = [
+    pytest.mark.skipif(os.name != "posix", reason="signals of another kind"),
+    pytest.mark.usefixtures("uncompiled"),
+]
 FRAMES = 6
-
-
-@pytest.fixture(autouse=True)
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames without parallax start no window, so nothing need be compiled."""
-    monkeypatch.setattr("vggtgeo.results.reconstruction.warm_up", lambda settings, metric: ())
-    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
-    monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)
 
 
 @pytest.fixture(autouse=True)

@@ -264,6 +264,27 @@ def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
     assert not any("cut, turned or scaled" in text for text in confirmed), "the images know their camera"
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "centre"),
+    [
+        (640, 480, (318.6, 255.3)),
+        (640, 480, (325.1, 249.7)),
+        (640, 480, (320.1, 247.6)),
+        (752, 480, (367.215, 248.375)),
+        (1241, 376, (607.1928, 185.2157)),
+        (1226, 370, (601.8873, 183.1104)),
+        (640, 480, (319.5, 239.5)),
+    ],
+    ids=["TUM freiburg1", "freiburg2", "freiburg3", "EuRoC cam0", "KITTI 00", "KITTI 04", "ICL-NUIM"],
+)
+def test_published_calibrations_are_no_other_images(
+    healthy: Walk, width: int, height: int, centre: tuple[float, float]
+) -> None:
+    """No camera that is known to be right is called that of cut images; oracle: the data sets' own calibrations."""
+    estimate = replace(healthy.estimate, intrinsics=np.array([*K[:2], *centre]))
+    assert check_camera(estimate, None, (width, height)) == []
+
+
 def test_distortion_that_was_not_told_is_named() -> None:
     """k1 = -0.2 in the images is found within 0.05, and called distortion; oracle: the lens of the walk."""
 

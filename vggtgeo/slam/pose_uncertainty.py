@@ -47,7 +47,7 @@ def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
     sigma = slam.pose_sigma[[record.reference for record in records]].reshape(-1, 2)
     tracked = [(r.evidence.sigma_translation, r.evidence.sigma_rotation) for r in records]
     # The pose of a keyframe's own frame is the keyframe's: only other frames add the error of their tracking.
-    apart = [record.arrival is None and not np.array_equal(record.relative, np.eye(4)) for record in records]
+    apart = [not np.array_equal(record.relative, np.eye(4)) for record in records]
     added = np.where(np.array(apart, bool)[:, None], np.array(tracked).reshape(-1, 2), 0.0)
     moved, turned = np.sqrt(sigma**2 + added**2).T
     if slam.metric and records:
