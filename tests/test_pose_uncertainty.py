@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import vggtgeo as vg
+from vggtgeo.cli.progress import print_result
 from vggtgeo.geometry import rigid
 from vggtgeo.slam import pose_uncertainty
 from vggtgeo.slam.evidence import tangent
@@ -32,7 +35,8 @@ def test_keyframes_have_the_deviations_of_their_covariances() -> None:
 @pytest.mark.long
 def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """95 % of the poses are within three standard deviations of the truth, relative to the first, and the deviations
-    are not so large that this says nothing. Oracle: the renderer's poses; the file has the same numbers.
+    are not so large that this says nothing. Oracle: the renderer's poses; the folder and what is printed have the same
+    numbers.
     """
     monkeypatch.setattr(pose_uncertainty, "DEPTH_SCALE", 0.0)  # the renderer's depth has no factor of its own
     result = vg.reconstruct(vg.simulate("room", 40, size=(320, 240), rate=6.0))
@@ -47,5 +51,12 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
         size = np.linalg.norm(error, axis=1)
         assert np.mean(size <= 3 * sigma) >= 0.95
         assert np.median(sigma) < 10 * np.median(size)
-    result.save(tmp_path / "run")
-    np.testing.assert_allclose(np.loadtxt(tmp_path / "run/uncertainty.txt")[:, 1], stated.translation, atol=1e-6)
+    summary = result.save(tmp_path / "run")
+    again = vg.Result.load(tmp_path / "run").uncertainty
+    assert again is not None
+    for read, written in zip(again, stated, strict=True):
+        np.testing.assert_allclose(read, written, atol=1e-6)
+    page = io.StringIO()
+    print_result(Console(file=page), result, summary, tmp_path / "run")
+    said = f"one standard deviation: {100 * np.median(stated.translation):.1f} cm and "
+    assert said + f"{np.rad2deg(np.median(stated.rotation)):.2f} deg" in page.getvalue()

@@ -47,13 +47,23 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
         keyframe_trajectory(slam, piece).save_tum(folder / piece_file("keyframes", piece))
         uncertainty = frame_uncertainty(slam, piece)
         if uncertainty is not None:
-            write_text(folder / piece_file("uncertainty", piece), _uncertainty_text(uncertainty))
+            write_uncertainty(folder / piece_file("uncertainty", piece), uncertainty)
 
 
-def _uncertainty_text(found: PoseUncertainty) -> str:
+def write_uncertainty(path: Path, found: PoseUncertainty) -> None:
+    """One line a pose: time, standard deviation of the place, and of the orientation in degrees; `nan` is unknown."""
     rows = zip(found.timestamps, found.translation, np.rad2deg(found.rotation), strict=True)
     head = "# timestamp, standard deviation of the place, and of the orientation in degrees: the worst direction\n"
-    return head + "".join(f"{time:.6f} {moved:.6f} {turned:.5f}\n" for time, moved, turned in rows)
+    write_text(path, head + "".join(f"{time:.9f} {moved:.6f} {turned:.5f}\n" for time, moved, turned in rows))
+
+
+def read_uncertainty(path: Path) -> PoseUncertainty:
+    """What `write_uncertainty` wrote; InputError where it is something else."""
+    try:
+        rows = np.loadtxt(path, ndmin=2).reshape(-1, 3)
+    except (OSError, ValueError) as error:
+        raise InputError(f"`{path}` is no list of standard deviations ({error}); `vggtgeo run` writes it") from None
+    return PoseUncertainty(rows[:, 0], rows[:, 1], np.deg2rad(rows[:, 2]))
 
 
 def piece_file(name: str, piece: int) -> str:

@@ -21,7 +21,13 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
 from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
-from vggtgeo.results.files import write_depth, write_settings, write_trajectories
+from vggtgeo.results.files import (
+    read_uncertainty,
+    write_depth,
+    write_settings,
+    write_trajectories,
+    write_uncertainty,
+)
 from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise, with_writing
@@ -65,6 +71,7 @@ class Result:
         summary: counts, times and settings, as `summary.json` has them.
         record: what it was made of; None for a result that was read from a folder.
         saved_mesh: the surface that was read from a folder, if there was one.
+        saved_uncertainty: the deviations that were read from a folder, if there were any.
 
     Example:
         >>> import vggtgeo as vg
@@ -83,6 +90,7 @@ class Result:
     summary: Mapping[str, Any] = field(default_factory=dict)
     record: RunRecord | None = None
     saved_mesh: Mesh | None = None
+    saved_uncertainty: PoseUncertainty | None = None
 
     @property
     def mesh(self) -> Mesh | None:
@@ -91,8 +99,10 @@ class Result:
 
     @property
     def uncertainty(self) -> PoseUncertainty | None:
-        """Standard deviations of the poses of `trajectory`; None without a last adjustment, or read from a folder."""
-        return frame_uncertainty(self.record.slam) if self.record is not None and self.record.slam.keyframes else None
+        """Standard deviations of the poses of `trajectory`; None without a last adjustment."""
+        if self.record is None:
+            return self.saved_uncertainty
+        return frame_uncertainty(self.record.slam) if self.record.slam.keyframes else None
 
     @classmethod
     def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
@@ -139,6 +149,7 @@ class Result:
             verdict,
             summary,
             saved_mesh=Mesh.load_ply(place / "mesh.ply") if (place / "mesh.ply").is_file() else None,
+            saved_uncertainty=read_uncertainty(stated) if (stated := place / "uncertainty.txt").is_file() else None,
         )
 
     def save(
@@ -189,6 +200,8 @@ class Result:
         else:
             self.trajectory.save_tum(place / "trajectory.txt")
             self.keyframes.save_tum(place / "keyframes.txt")
+            if self.saved_uncertainty is not None:
+                write_uncertainty(place / "uncertainty.txt", self.saved_uncertainty)
         self.cloud.save_ply(place / "map.ply")
         if self.mesh is not None:
             self.mesh.save_ply(place / "mesh.ply")
