@@ -235,7 +235,7 @@ def test_a_distortion_is_found(model: type[vg.AbstractCamera], truth: np.ndarray
     assert len(eqx.filter_jit(vg.covariances)(problem, solution.state).to_dict()["intrinsics_sigma_px"]) == 8
 
 
-class SquarePixels(vg.CameraTerm):
+class EqualFocalLengths(vg.CameraTerm):
     """The same tie as a stiff term."""
 
     def residual(self, parameters):
@@ -249,7 +249,7 @@ def test_square_pixels_are_an_exact_tie() -> None:
     given = (window.observations, window.start)
     guess, depth = 1.05 * window.intrinsics[1:], window.observations.depth_mean
     found = solve(*vg.pack(*given, guess, depth, camera=vg.SquarePinhole)[:2]).state.intrinsics
-    tie = SquarePixels(weight=jnp.full(1, 1e8))
+    tie = EqualFocalLengths(weight=jnp.full(1, 1e8))
     tied = solve(*vg.pack(*given, np.append(guess[0], guess), depth, terms=[tie])[:2]).state.intrinsics
     np.testing.assert_allclose(np.append(found[0], found), tied, rtol=1e-6)
     assert abs(float(found[0]) - window.intrinsics[0]) < 0.5 * abs(guess[0] - window.intrinsics[0])

@@ -9,7 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vggtgeo.geometry.cameras import AbstractCamera, KannalaBrandt, Pinhole, RadialTangential
+from vggtgeo.geometry.cameras import (
+    AbstractCamera,
+    KannalaBrandt,
+    Pinhole,
+    RadialTangential,
+    SquareKannalaBrandt,
+    SquarePinhole,
+    SquarePixels,
+    SquareRadialTangential,
+)
 
 FOCAL = (310.0, 290.0, 321.5, 238.25)
 MATRIX = np.array([[FOCAL[0], 0, FOCAL[2]], [0, FOCAL[1], FOCAL[3]], [0, 0, 1.0]])
@@ -83,6 +92,22 @@ def test_derivatives_are_finite_differences(name: str) -> None:
                 expected = (np.asarray(ahead[order]) - np.asarray(behind[order])) / (2 * step)
                 error = np.abs(found[..., column] - expected).max() / (1e-3 + np.abs(expected).max())
                 assert error < 1e-5, (function, order, column, error)
+
+
+@pytest.mark.parametrize("square", [SquarePinhole, SquareRadialTangential, SquareKannalaBrandt])
+def test_square_pixels_are_one_focal_length(square: type[SquarePixels]) -> None:
+    # Proves the models with `fx = fy`, both ways, and that their focal length is both of the model's. Oracle: the model
+    # itself with one number twice, and the sum of its two derivatives.
+    given = next(jnp.asarray(values) for kind, values in CAMERAS.values() if kind is square.model)[1:]
+    whole = jnp.concatenate([given[:1], given])
+    assert len(square.names) == len(given) == len(square.model.names) - 1
+    for at, call in ((jnp.asarray([0.2, -0.1, 1.0]), "project"), (jnp.asarray([350.0, 200.0]), "unproject")):
+        tied = lambda parameters: getattr(square(parameters), call)(at)
+        free = lambda parameters: getattr(square.model(parameters), call)(at)
+        np.testing.assert_array_equal(tied(given), free(whole))
+        by_tied, by_free = jax.jacfwd(tied)(given), jax.jacfwd(free)(whole)
+        np.testing.assert_allclose(by_tied[:, 0], by_free[:, 0] + by_free[:, 1], rtol=1e-12)
+        np.testing.assert_allclose(by_tied[:, 1:], by_free[:, 2:], rtol=1e-12, atol=1e-15)
 
 
 def test_without_distortion_they_are_what_they_generalise() -> None:

@@ -68,7 +68,10 @@ if TYPE_CHECKING:
     from vggtgeo.geometry.cameras import KannalaBrandt as KannalaBrandt
     from vggtgeo.geometry.cameras import Pinhole as Pinhole
     from vggtgeo.geometry.cameras import RadialTangential as RadialTangential
+    from vggtgeo.geometry.cameras import SquareKannalaBrandt as SquareKannalaBrandt
     from vggtgeo.geometry.cameras import SquarePinhole as SquarePinhole
+    from vggtgeo.geometry.cameras import SquarePixels as SquarePixels
+    from vggtgeo.geometry.cameras import SquareRadialTangential as SquareRadialTangential
     from vggtgeo.geometry.trajectory import Trajectory as Trajectory
     from vggtgeo.io.errors import InputError as InputError
     from vggtgeo.learning.window_dataset import RunWindows as RunWindows
@@ -130,7 +133,10 @@ _HOME = {
     "bundle.terms.slot": ("SlotTerm",),
     "bundle.terms.term": ("AbstractTerm", "shared_field"),
     "bundle.terms.view": ("View",),
-    "geometry.cameras": ("AbstractCamera", "KannalaBrandt", "Pinhole", "RadialTangential", "SquarePinhole"),
+    "geometry.cameras": (
+        *("AbstractCamera", "KannalaBrandt", "Pinhole", "RadialTangential"),
+        *("SquareKannalaBrandt", "SquarePinhole", "SquarePixels", "SquareRadialTangential"),
+    ),
     "bundle.marginalisation": ("marginalise", "no_prior", "reorder"),
     "bundle.analysis.observability": ("observability",),
     "bundle.analysis.observability_report": ("Observability",),

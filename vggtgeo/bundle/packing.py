@@ -77,7 +77,8 @@ def pack(
         intrinsics_sigma: standard deviation of the intrinsics' prior in pixels; None = no prior.
         fixed_pose: bool `[n]`; None holds the first pose.
         fixed_intrinsics: intrinsics that are held: one bool for all, one for each of a camera, or of their own shape.
-        camera: its model: `Pinhole`, `SquarePinhole` (`fx = fy`), `RadialTangential`, `KannalaBrandt`, or your own.
+        camera: its model: `Pinhole`, `RadialTangential`, `KannalaBrandt`, each of them with `fx = fy` tied
+            (`SquarePinhole`, ...), or your own.
         camera_of: int `[n]`: which of several cameras, a row of `intrinsics`, took each keyframe; None: one took all.
         kernel: robust kernel; None = Cauchy with delta 1.5 px, the best of `benchmarks/robustness.py`.
         terms: what else is known: terms on poses, pairs or the camera, the prior of a marginalisation, and, as

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -65,25 +65,6 @@ class Pinhole(AbstractCamera):
 
     def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
         return _ray((pixel - self.parameters[2:]) / self.parameters[:2])
-
-
-class SquarePinhole(AbstractCamera):
-    """The pinhole with square pixels: one focal length, exactly `fx = fy = f`.
-
-    Example:
-        >>> import jax.numpy as jnp, vggtgeo as vg
-        >>> vg.SquarePinhole(jnp.array([500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.2, 1.0])).tolist()
-        [370.0, 340.0]
-
-    """
-
-    names = ("f", "cx", "cy")
-
-    def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
-        return self.parameters[0] * _flat(point) + self.parameters[1:]
-
-    def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-        return _ray((pixel - self.parameters[1:]) / self.parameters[0])
 
 
 class RadialTangential(AbstractCamera):
@@ -159,6 +140,70 @@ class KannalaBrandt(AbstractCamera):
         k1, k2, k3, k4 = self.parameters[4:]
         t2 = angle * angle
         return 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+
+
+class SquarePixels(AbstractCamera):
+    """A model whose pixels are square: one focal length, exactly `fx = fy = f`, and the rest of `model`'s parameters.
+
+    Example: of a model of one's own, as of this package's fisheye.
+        >>> class SquareFisheye(vg.SquarePixels):
+        ...     model = vg.KannalaBrandt
+        >>> SquareFisheye.names
+        ('f', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
+
+    """
+
+    model: ClassVar[type[AbstractCamera]]
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.names = ("f", *cls.model.names[2:])
+
+    def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
+        return self._whole().project(point)
+
+    def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+        return self._whole().unproject(pixel)
+
+    def _whole(self) -> AbstractCamera:
+        return self.model(jnp.concatenate([self.parameters[:1], self.parameters]))
+
+
+class SquarePinhole(SquarePixels):
+    """The pinhole with square pixels.
+
+    Example:
+        >>> import jax.numpy as jnp, vggtgeo as vg
+        >>> vg.SquarePinhole(jnp.array([500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.2, 1.0])).tolist()
+        [370.0, 340.0]
+
+    """
+
+    model = Pinhole
+
+
+class SquareRadialTangential(SquarePixels):
+    """`RadialTangential` with square pixels.
+
+    Example:
+        >>> vg.SquareRadialTangential.names
+        ('f', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2')
+
+    """
+
+    model = RadialTangential
+
+
+class SquareKannalaBrandt(SquarePixels):
+    """`KannalaBrandt` with square pixels.
+
+    Example:
+        >>> vg.SquareKannalaBrandt.names
+        ('f', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
+
+    """
+
+    model = KannalaBrandt
 
 
 class Cameras(eqx.Module):
