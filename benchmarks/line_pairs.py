@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import cv2
 import jax
 import numpy as np
 from vggtgeo.models.roles import Features, LineFeatures
@@ -102,7 +101,6 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=6)
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)  # as the program does
-    cv2.setRNGSeed(0)
     print("| clip | frames apart | by | pairs | right | median | 90th |\n" + "|---" * 7 + "|")
     believed: dict[str, list[bool]] = defaultdict(list)
     for clip in arguments.clips:

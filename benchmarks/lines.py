@@ -23,7 +23,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import jax
 import numpy as np
 from vggtgeo.models.classical import NoDepth, SiftMatcher
@@ -138,7 +137,6 @@ def poor_pieces(sequence: Sequence, frames: int, matcher: SiftMatcher) -> list[t
 
 def line(piece: Piece, variant: str, roles: Roles) -> str:
     """One run, as a line of the table."""
-    cv2.setRNGSeed(0)
     settings = SlamSettings(line=VARIANTS[variant])
     clock = Clock()
     states = run(piece.sequence, roles, settings, start=piece.start, end=piece.end, clock=clock)

@@ -1,4 +1,4 @@
-"""Does the result depend on the seed? The same piece of a clip with ten seeds of OpenCV's random choices.
+"""Does the result depend on the seed? The same piece of a clip with ten seeds of the samples of robust estimators.
 
     python benchmarks/seeds.py ../shared/data/redkitchen ../shared/data/building-walk --frames 60
 

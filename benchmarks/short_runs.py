@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import jax
 import numpy as np
 
@@ -45,5 +44,5 @@ class Piece:
 
     def run(self, seed: int = 0) -> Slam:
         """The state after the last frame, before the last adjustment."""
-        cv2.setRNGSeed(seed)
-        return list(run_frames(iter(self.frames), self.camera, self.roles, SETTINGS, Clock()))[-1]
+        roles = self.roles.seeded(seed)
+        return list(run_frames(iter(self.frames), self.camera, roles, SETTINGS, Clock()))[-1]

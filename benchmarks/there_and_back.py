@@ -14,7 +14,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from short_runs import SETTINGS, Piece
 
@@ -43,15 +42,15 @@ def main() -> None:
     retimed = [replace(frame, index=row, timestamp=row / 10) for row, frame in enumerate(played)]
     if options.rgb_only:
         retimed = [replace(frame, depth=None) for frame in retimed]
-    cv2.setRNGSeed(options.seed)
+    roles = piece.roles.seeded(options.seed)
     began, slam = time.perf_counter(), None
-    for slam in run_frames(iter(retimed), piece.camera, piece.roles, SETTINGS, Clock()):
+    for slam in run_frames(iter(retimed), piece.camera, roles, SETTINGS, Clock()):
         if len(slam.frames) == len(there):
             _print("there", slam, truth)
     assert slam is not None
     seconds = time.perf_counter() - began
     _print("there and back, before the last adjustment", slam, truth)
-    slam = finish(slam, piece.roles, SETTINGS)
+    slam = finish(slam, roles, SETTINGS)
     _print("at the end", slam, truth)
     print(f"{1e3 * seconds / len(retimed):.0f} ms a frame\n" + "\n".join(slam.notes))
 

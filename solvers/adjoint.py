@@ -74,8 +74,9 @@ class ArrowAdjoint(optx.AbstractAdjoint):
     """Chord steps before differentiating, at most: they end when the gradient no longer shrinks."""
     not_stationary: Literal["keep", "nan", "error"] = "keep"
     """What to do with a derivative at a point that the polish did not bring to rest: keep it (`gradient_residual` of
-    the solution says how far it is off), make it NaN, or raise an error. To differentiate the iterations themselves
-    take `optimistix.RecursiveCheckpointAdjoint()` instead of this class."""
+    the solution says how far it is off), make it NaN, or raise an error. The same is done where the derivative's own
+    linear system was not solved: minimum residuals (of `ConjugateGradients`) end after `exact_iterations`. To
+    differentiate the iterations themselves take `optimistix.RecursiveCheckpointAdjoint()` instead of this class."""
 
     def __check_init__(self) -> None:
         if self.not_stationary not in ("keep", "nan", "error"):
@@ -160,7 +161,12 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
         pushed = jax.jvp(lambda size: stationarity(moving, step(size)), (zero,), (one,))[1]
         return ravel_pytree(pushed)[0]
 
-    solve = lambda _, vector: ravel_pytree(model.solve(unflatten(vector)))[0]
+    def solve(_: Any, vector: Array) -> Array:
+        step, ended = model.checked(unflatten(vector))
+        step = _times(step, jnp.where(~ended & (options.not_stationary == "nan"), jnp.nan, 1.0))
+        found: Array = ravel_pytree(step)[0]
+        return eqx.error_if(found, ~ended, _NOT_SOLVED) if options.not_stationary == "error" else found
+
     solved = unflatten(jax.lax.custom_linear_solve(operator, -flat, solve, symmetric=True))
 
     def found(moving: Any, step: ArrowVector) -> Any:
@@ -181,6 +187,11 @@ _NOT_STATIONARY = (
     "The point is no optimum, so it has no derivative as one: the solve did not converge, and the polish did not bring "
     "it to rest. Raise `max_iterations`, or differentiate the iterations with "
     "`adjoint=optimistix.RecursiveCheckpointAdjoint()`."
+)
+
+_NOT_SOLVED = (
+    "The linear system of the derivative was not solved: minimum residuals ended before. Raise `exact_iterations` of "
+    "`ConjugateGradients`, give it a better preconditioner, or take another `reduced_solver`."
 )
 
 

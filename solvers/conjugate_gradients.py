@@ -114,6 +114,10 @@ class IterativeFactor(AbstractFactor):
     def solve(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> Float[Array, " c"]:
         return self.solved(system, rhs).solution
 
+    def checked(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
+        found = self.solved(system, rhs)
+        return found.solution, found.converged
+
     def solved(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> MinresSolved:
         """The same, and how it was found."""
         gauge, zero = free_gauge(system), jnp.zeros((), rhs.dtype)
@@ -124,7 +128,8 @@ class IterativeFactor(AbstractFactor):
 
         inverse = self.solver.preconditioner.inverse(system, self.preconditioner, zero + _LIFT)
         rhs = jnp.where(system.free, rhs, 0.0)
-        return minres(apply, inverse, rhs, self.solver.exact_rtol, self.solver.exact_iterations)
+        rtol = max(self.solver.exact_rtol, 10 * float(jnp.finfo(rhs.dtype).eps))
+        return minres(apply, inverse, rhs, rtol, self.solver.exact_iterations)
 
 
 _LIFT = 1e-8

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
     ArrowVector,
@@ -31,11 +31,15 @@ class ExactModel(eqx.Module):
 
         `S x = v_c - W V^-1 v_d`, `z = V^-1 (v_d - W' x)`, with a stiffness added along flat gauge directions.
         """
+        return self.checked(vector)[0]
+
+    def checked(self, vector: ArrowVector) -> tuple[ArrowVector, Bool[Array, ""]]:
+        """The same, and whether it was found: an iteration may end before."""
         inverse = inverse_landmark_hessian(self.system)
         rest = vector.dense - carry_to_nodes(self.system, inverse * vector.landmarks)
-        dense = self.factor.solve(self.system, rest)
+        dense, found = self.factor.checked(self.system, rest)
         dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
-        return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0)))
+        return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0))), found
 
     def largest(self, gradient: ArrowVector) -> Float[Array, ""]:
         """Largest entry of a gradient, in units of the root of its own curvature."""

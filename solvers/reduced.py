@@ -28,6 +28,10 @@ class AbstractFactor(eqx.Module):
     def solve(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> Float[Array, " c"]:
         """`S^-1 rhs` of the system that was factorised; zero for held coordinates, whatever `rhs` says of them."""
 
+    def checked(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
+        """The same, and whether it was found: an iteration may end before."""
+        return self.solve(system, rhs), jnp.asarray(True)
+
 
 class AbstractReducedSolver(eqx.Module, Generic[Prepared]):
     """Prepares what does not depend on the damping once, then solves for any damping.

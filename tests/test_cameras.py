@@ -102,8 +102,8 @@ def test_square_pixels_are_one_focal_length(square: type[SquarePixels]) -> None:
     whole = jnp.concatenate([given[:1], given])
     assert len(square.names) == len(given) == len(square.model.names) - 1
     for at, call in ((jnp.asarray([0.2, -0.1, 1.0]), "project"), (jnp.asarray([350.0, 200.0]), "unproject")):
-        tied = lambda parameters: getattr(square(parameters), call)(at)
-        free = lambda parameters: getattr(square.model(parameters), call)(at)
+        tied = lambda parameters, at=at, call=call: getattr(square(parameters), call)(at)
+        free = lambda parameters, at=at, call=call: getattr(square.model(parameters), call)(at)
         np.testing.assert_array_equal(tied(given), free(whole))
         by_tied, by_free = jax.jacfwd(tied)(given), jax.jacfwd(free)(whole)
         np.testing.assert_allclose(by_tied[:, 0], by_free[:, 0] + by_free[:, 1], rtol=1e-12)

@@ -128,10 +128,12 @@ def test_padding_is_harmless_and_held() -> None:
 
 
 def test_dtype_goes_through_everything() -> None:
-    # Proves that one argument decides the precision of the whole problem.
-    problem, state, _ = SCENE.pack(dtype=np.float32)
+    # Proves that one argument decides the precision of the whole problem, numbers of a kernel that were given as Python
+    # has them too: a problem that was read from a file is no other type, and nothing is compiled twice.
+    problem, state, _ = SCENE.pack(dtype=np.float32, kernel=vg.Huber(1.5))
     arrays = [leaf for leaf in jax.tree.leaves((problem, state)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    assert {array.dtype for array in arrays if array.ndim} == {np.dtype(np.float32)}
+    assert {array.dtype for array in arrays} == {np.dtype(np.float32)}
+    assert not any(array.weak_type for array in arrays)
 
 
 def bad(**changes: object) -> Scene:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, reduce
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.block_band import BandMatrix, BandVector
@@ -106,6 +107,20 @@ def test_exact_hessians_are_solved(name: str, definite: bool, solved: State) -> 
     assert worst(solve_exactly(solver, system, near, vector), expected) < tolerance
 
 
+@pytest.mark.parametrize(("iterations", "ended"), [(2, False), (2000, True)])
+def test_a_solve_that_ends_too_early_says_so(iterations: int, ended: bool, solved: State) -> None:
+    # Proves that minimum residuals without convergence are known. Oracle: the residual of the dense matrix.
+    system = linearised(PROBLEM, solved)
+    solver = ConjugateGradients(BandPreconditioner(2), exact_iterations=iterations)
+    rng = np.random.default_rng(0)
+    vector = ArrowVector(jnp.asarray(rng.normal(size=system.free.shape)), jnp.zeros_like(system.cross[:, -1]))
+    step, told = eqx.filter_jit(lambda s, v: exact_model(s, solver).checked(v))(system, vector)
+    reduced = jax.jit(reduce)(system)
+    off = np.where(system.free, (reduced.hessian - reduced.schur) @ step.dense - vector.dense, 0.0)
+    assert bool(told) == ended
+    assert (np.abs(off).max() < 1e-6) == ended
+
+
 @eqx.filter_jit
 def inverted(system: ArrowSystem, solver: AbstractReducedSolver, hosts: jax.Array) -> ArrowCovariance:
     return covariance(system, solver, hosts)
@@ -166,6 +181,23 @@ def test_gradients_in_reverse_mode(name: str, solved: State, by_dense: Tree) -> 
     solver, tolerance = SOLVERS[name]
     found = eqx.filter_jit(jax.grad(loss))(MOVING, solver, solved)
     assert worst(found, by_dense) < tolerance
+
+
+@pytest.mark.long
+def test_a_derivative_whose_system_was_not_solved_can_be_refused(solved: State) -> None:
+    # Proves that a derivative is NaN where it is asked for and its linear system was not solved, though the point is an
+    # optimum. Oracle: two iterations cannot be enough, see above.
+    solver = ConjugateGradients(BandPreconditioner(2), exact_iterations=2)
+    iteration = SchurLevenbergMarquardt(rtol=1e-12, max_iterations=1, reduced_solver=solver)
+
+    def value(mean: jax.Array) -> tuple[jax.Array, jax.Array]:
+        problem = eqx.tree_at(lambda p: p.depth.mean, PROBLEM, mean)
+        found = solve(problem, solved, solver=iteration, adjoint=ArrowAdjoint(not_stationary="nan"))
+        return jnp.sum(found.state.inverse_depth), found.gradient_residual
+
+    gradient, residual = jax.jit(jax.grad(value, has_aux=True))(PROBLEM.depth.mean)
+    assert float(residual) < STATIONARY
+    assert bool(jnp.isnan(gradient).any())
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from vggtgeo.models.classical.orb import OrbMatcher
 from vggtgeo.models.classical.place import place_vector
 from vggtgeo.models.classical.pnp import ConstantVelocity, PnpGeometry
 from vggtgeo.models.classical.pose_refinement import pose_information
+from vggtgeo.models.classical.sample_order import SampleOrder, in_order
 from vggtgeo.models.classical.sift import SiftMatcher
 from vggtgeo.models.classical.structure_tensor import StructureTensor
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
@@ -29,11 +30,13 @@ __all__ = [
     "PatchAlignment",
     "PatchFlow",
     "PnpGeometry",
+    "SampleOrder",
     "SensorDepth",
     "SiftMatcher",
     "StructureTensor",
     "TwoViewStart",
     "can_search",
+    "in_order",
     "line_coefficients",
     "nearest_frame",
     "place_vector",

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from vggtgeo.models import pinhole
 from vggtgeo.models.classical.pose_refinement import refine_pose, residuals
+from vggtgeo.models.classical.sample_order import SampleOrder
 from vggtgeo.models.classical.two_view import TwoViewStart
 from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery, StartGuess
 
@@ -30,6 +31,7 @@ class PnpGeometry:
     max_iterations: int = 1000
     sure: float = 0.9
     two_view: TwoViewStart = field(default_factory=TwoViewStart)
+    order: SampleOrder = field(default_factory=SampleOrder)
 
     def __post_init__(self) -> None:
         if not self.threshold > 0:
@@ -77,10 +79,11 @@ class PnpGeometry:
         return max(starts, key=lambda start: self._support(start, query)) if starts else None
 
     def _sample(self, query: PoseQuery) -> np.ndarray | None:
+        order = self.order.of(len(query.points))
         try:
             found, rotation, translation, _ = cv2.solvePnPRansac(
-                query.points.astype(np.float64),
-                query.pixels.astype(np.float64),
+                query.points[order].astype(np.float64),
+                query.pixels[order].astype(np.float64),
                 pinhole.matrix(query.intrinsics),
                 None,
                 flags=cv2.USAC_MAGSAC,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_array
+from vggtgeo.models.classical.sample_order import SampleOrder
 from vggtgeo.models.roles import GeometryResult, StartGuess
 
 
@@ -26,6 +27,7 @@ class TwoViewStart:
     parallax: float = float(np.deg2rad(2.0))
     confidence: float = 0.9999
     max_iterations: int = 5000
+    order: SampleOrder = field(default_factory=SampleOrder)
 
     def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
         """Motion and structure from matches float [n, 2] each; see `InitialGeometry.start`."""
@@ -51,10 +53,11 @@ class TwoViewStart:
     def _essential(
         self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray
     ) -> tuple[np.ndarray | None, np.ndarray]:
+        order = self.order.of(len(pixels_i))
         try:
             essential, mask = cv2.findEssentialMat(
-                np.ascontiguousarray(pixels_i, dtype=np.float64),
-                np.ascontiguousarray(pixels_j, dtype=np.float64),
+                np.ascontiguousarray(pixels_i[order], dtype=np.float64),
+                np.ascontiguousarray(pixels_j[order], dtype=np.float64),
                 pinhole.matrix(intrinsics),
                 cv2.USAC_MAGSAC,
                 self.confidence,
@@ -65,7 +68,7 @@ class TwoViewStart:
             return None, np.zeros(len(pixels_i), dtype=bool)
         if essential is None or essential.shape != (3, 3) or not np.isfinite(essential).all():
             return None, np.zeros(len(pixels_i), dtype=bool)
-        return essential, mask.ravel().astype(bool)
+        return essential, self.order.undone(mask.ravel().astype(bool))
 
     def _only_turned(self, rays_i: np.ndarray, rays_j: np.ndarray, intrinsics: np.ndarray) -> bool:
         """Whether a rotation alone maps half of the rays of i onto those of j to within the threshold."""

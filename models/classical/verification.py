@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
 import numpy as np
 from vggtgeo.models import pinhole
+from vggtgeo.models.classical.sample_order import SampleOrder
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class EpipolarVerifier:
     confidence: float = 0.999
     max_iterations: int = 2000
     least: int = 12
+    order: SampleOrder = field(default_factory=SampleOrder)
 
     def __post_init__(self) -> None:
         if not self.threshold > 0:
@@ -39,8 +41,11 @@ class EpipolarVerifier:
         """Bool [m]: which of the matches float [m, 2] -> float [m, 2] agree. All False when there are too few."""
         if len(pixels_i) < self.least:
             return np.zeros(len(pixels_i), dtype=bool)
-        first = np.ascontiguousarray(pixels_i, dtype=np.float64)
-        second = np.ascontiguousarray(pixels_j, dtype=np.float64)
+        order = self.order.of(len(pixels_i))
+        first, second = (np.ascontiguousarray(pixels[order], np.float64) for pixels in (pixels_i, pixels_j))
+        return self.order.undone(self._inliers(first, second))
+
+    def _inliers(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         epipolar = self._epipolar(first, second)
         # A well determined epipolar geometry needs no second opinion, and the homography costs as much again.
         if np.count_nonzero(epipolar) >= 0.7 * len(first):

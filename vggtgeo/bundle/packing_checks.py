@@ -70,7 +70,16 @@ def check_fixed(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.broadcast_to(found, shape)
 
 
-def check_values(observations: Observations) -> None:
+def check_observations(observations: Observations, poses: np.ndarray) -> None:
+    """What was measured, and the poses that it was measured from."""
+    _check_shapes(observations, poses)
+    _check_indices(observations, len(poses))
+    _check_edges(observations.edges)
+    _check_values(observations)
+    _check_poses(poses)
+
+
+def _check_values(observations: Observations) -> None:
     """Weights that are weights, normals that are normals, depths that are depths."""
     for name in ("point_weight", "line_weight", "depth_weight"):
         weight = getattr(observations, name)
@@ -101,7 +110,7 @@ def check_weight(name: str, weight: Any) -> None:
     _refuse(name, given, ~(np.isfinite(given) & (given >= 0)), "finite and not negative")
 
 
-def check_edges(edges: np.ndarray) -> None:
+def _check_edges(edges: np.ndarray) -> None:
     """No edge to itself, none twice."""
     loops = np.nonzero(edges[:, 0] == edges[:, 1])[0]
     if len(loops):
@@ -122,7 +131,7 @@ def _refuse(name: str, values: Any, wrong: np.ndarray, must: str) -> None:
         raise InputError(f"`{name}[{first}]` is {np.asarray(values)[first]}; it must be {must}")
 
 
-def check_indices(observations: Observations, keyframes: int) -> None:
+def _check_indices(observations: Observations, keyframes: int) -> None:
     """Indices in range, each match once, landmarks hosted where their edges start."""
     edges, landmarks = len(observations.edges), len(observations.host)
     limits = [
@@ -164,7 +173,7 @@ def check_matches(names: tuple[str, str], edge: np.ndarray, landmark: np.ndarray
         )
 
 
-def check_shapes(observations: Observations, poses: np.ndarray) -> None:
+def _check_shapes(observations: Observations, poses: np.ndarray) -> None:
     """Arrays of the lengths that belong together."""
     edges, landmarks = len(observations.edges), len(observations.host)
     points, lines = len(observations.point_edge), len(observations.line_edge)
@@ -221,7 +230,7 @@ def check_intrinsics_prior(mean: np.ndarray, sigma: Any, shape: tuple[int, ...])
         raise InputError(f"`intrinsics_sigma` has shape {np.shape(sigma)}; expected one number, or {shape}")
 
 
-def check_poses(poses: np.ndarray) -> None:
+def _check_poses(poses: np.ndarray) -> None:
     """Finite, with quaternions of unit length."""
     _refuse("poses", poses, ~np.isfinite(poses).all(1), "finite")
     lengths = np.linalg.norm(poses[:, :4], axis=1)

@@ -80,7 +80,7 @@ DenseOption = Annotated[
 SaveDepthOption = Annotated[
     bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
 ]
-SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]
+SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the samples that robust estimators draw.")]
 RateOption = Annotated[
     float | None,
     typer.Option("--fps", help="Frames a second of a video or a folder of images, in place of what is assumed."),

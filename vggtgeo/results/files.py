@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import tomli_w
 
-from vggtgeo.io.errors import InputWarning
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_open, write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.connected import pieces_by_size

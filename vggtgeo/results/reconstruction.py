@@ -7,11 +7,9 @@ import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import cv2
 
 from vggtgeo.datasets import Frame, Sequence, SequenceView, open_sequence
 from vggtgeo.datasets.frame import check_selection
@@ -77,7 +75,7 @@ def reconstruct(
         start: first frame.
         end: frame to stop before.
         stride: take every n-th frame.
-        seed: of OpenCV's random choices, a global setting of that package.
+        seed: of the samples that robust estimators draw; a run is repeatable for each.
         dense: whose depth the map is made of: auto, mvs, sensor, network or none (`vggtgeo/mapping/dense.py`).
         title: of the report; by default the name of the sequence.
         callbacks: called with every frame.
@@ -95,12 +93,11 @@ def reconstruct(
 
     """
     clock, began = Clock(), time.perf_counter()
-    cv2.setRNGSeed(seed)
     settings = settings or SlamSettings()
     with interruption() as stop, collected_warnings() as collected:
         source = _opened(frames, camera)
         source.check(start, end, stride)
-        perception = _perception(roles, source.has_depth)
+        perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric)
         windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
         hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
@@ -220,10 +217,9 @@ def _truth(sequence: Sequence) -> Trajectory | None:
         return None
 
 
-def _perception(roles: Roles | Perception | None, has_depth: bool) -> Perception:
-    if isinstance(roles, Perception):
-        return roles
-    return Perception(roles or default_roles(has_depth), {})
+def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:
+    found = roles if isinstance(roles, Perception) else Perception(roles or default_roles(has_depth), {})
+    return replace(found, roles=found.roles.seeded(seed)) if seed else found
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,11 @@ from vggtgeo.models.classical import (
     NoDepth,
     PatchFlow,
     PnpGeometry,
+    SampleOrder,
     SensorDepth,
     SiftMatcher,
     StructureTensor,
+    in_order,
 )
 from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector, LineMatcher, MetricDepth, PointMatcher
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
@@ -56,6 +58,10 @@ class Roles:
     flow: PatchFlow | None = field(default_factory=PatchFlow)
     """Follows a keyframe's key points into frames that `alignment` then refines, so that most frames need no
     descriptors; None describes and matches every frame."""
+
+    def seeded(self, seed: int) -> Roles:
+        """The same roles, whose robust estimators draw other samples; 0: as they draw them by themselves."""
+        return in_order(self, SampleOrder(seed))
 
     def tracking_depth(self, sensor_depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
         """What of a frame's own depth is used to track it, metres and relative standard deviation, float32 [H, W].
