@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 import vggtgeo as vg
 from vggtgeo.cli.progress import print_result
@@ -38,7 +39,8 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     are not so large that this says nothing. Oracle: the renderer's poses; the folder and what is printed have the same
     numbers.
     """
-    monkeypatch.setattr(pose_uncertainty, "DEPTH_SCALE", 0.0)  # the renderer's depth has no factor of its own
+    monkeypatch.setattr(pose_uncertainty, "DEPTH_SCALE", 0.0)  # the renderer's depth has no factor of its own,
+    monkeypatch.setattr(pose_uncertainty, "MOMENT", 0.0)  # and its images are of one moment
     result = vg.reconstruct(vg.simulate("room", 40, size=(320, 240), rate=6.0))
     stated = result.uncertainty
     assert stated is not None
@@ -51,6 +53,18 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
         size = np.linalg.norm(error, axis=1)
         assert np.mean(size <= 3 * sigma) >= 0.95
         assert np.median(sigma) < 10 * np.median(size)
+    # What an image's moment leaves open grows with the speed of turning.
+    monkeypatch.setattr(pose_uncertainty, "MOMENT", 0.01)
+    moving = result.uncertainty
+    assert moving is not None
+    poses, times = result.record.truth.poses, stated.timestamps
+    rate = Rotation.from_matrix((rigid.invert(poses[:-2]) @ poses[2:])[:, :3, :3]).magnitude() / (
+        times[2:] - times[:-2]
+    )
+    added = np.sqrt(moving.rotation**2 - stated.rotation**2)[1:-1]
+    np.testing.assert_allclose(added, 0.01 * rate, atol=1e-4)
+    assert np.all(moving.translation > stated.translation)
+    monkeypatch.setattr(pose_uncertainty, "MOMENT", 0.0)
     summary = result.save(tmp_path / "run")
     again = vg.Result.load(tmp_path / "run").uncertainty
     assert again is not None

@@ -235,18 +235,30 @@ def test_a_wrong_calibration_is_told_with_the_right_one(healthy: Walk, factor: f
     assert _camera(repaired, healthy.evidence) == [], "a run that ends with the right camera is in order"
 
 
-def test_turns_alone_say_nothing_of_the_depth() -> None:
-    """A camera that only turns, tracked to a third of a millimetre, has no word on the depth, though one corner in ten
-    slipped by some 30 pixels, which is parallax to such a motion; oracle: the walk's own depth, which is right.
+@pytest.mark.parametrize("noise", [3e-4, 2e-2])
+def test_turns_alone_say_nothing_of_the_depth(noise: float) -> None:
+    """A camera that only turns, tracked to a third of a millimetre or to two centimetres, has no word on the depth,
+    though one corner in ten slipped by some 30 pixels, which is parallax to such a motion; oracle: the walk's own
+    depth, which is right.
     """
     turning, rng = walk(step=0.0, sway=0.0), np.random.default_rng(3)
     poses = turning.estimate.poses.copy()
-    poses[:, :3, 3] += 3e-4 * rng.standard_normal((len(poses), 3))
+    poses[:, :3, 3] += noise * rng.standard_normal((len(poses), 3))
     slips = lambda pixels: 30.0 * rng.standard_normal(pixels.shape) * (rng.random((len(pixels), 1)) < 0.1)
     evidence = [
         replace(frame, pixels=(frame.pixels + slips(frame.pixels)).astype(np.float32)) for frame in turning.evidence
     ]
     assert _depth(turning.with_poses(poses), evidence) == []
+
+
+def test_poses_that_are_a_degree_off_say_little_of_the_depth() -> None:
+    """Where turns are wrong by a degree, so is what they make of parallax, and good depth is not blamed for it; oracle:
+    the walk's own depth, which is right.
+    """
+    slow, rng = walk(step=0.04), np.random.default_rng(3)
+    wrong = np.tile(np.eye(4), (len(slow.estimate.poses), 1, 1))
+    wrong[:, :3, :3] = Rotation.from_rotvec(0.015 * rng.standard_normal((len(wrong), 3))).as_matrix()
+    assert _depth(slow.with_poses(wrong @ slow.estimate.poses), slow.evidence) == []
 
 
 def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
