@@ -268,11 +268,11 @@ def test_minimum_residuals_at_a_saddle() -> None:
 
 def test_what_is_too_large_is_refused() -> None:
     # Proves the sentences for a map whose dense matrix nobody wants. Oracle: their text.
-    window, _ = simulate_loop(310, points=1, reach=1)
+    window, _ = simulate_loop(610, points=1, reach=1)
     problem, initial, _ = window.pack()
     with pytest.raises(ValueError, match="give `reduced_solver=choose_reduced_solver"):
         covariances(problem, initial)
     with pytest.raises(ValueError, match="give `keyframes`, at most 32"):
         covariances(problem, initial, reduced_solver=ITERATIVE)
-    with pytest.raises(ValueError, match="310 keyframes would take 9 dense spectra"):
+    with pytest.raises(ValueError, match="610 keyframes would take 9 dense spectra"):
         observability(problem, initial)

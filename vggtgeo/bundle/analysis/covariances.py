@@ -29,8 +29,8 @@ from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
-DENSE_KEYFRAMES = 300
-"""Most keyframes whose information is inverted as a dense matrix: 26 MB, some seconds."""
+DENSE_KEYFRAMES = 600
+"""Most keyframes whose information is inverted as a dense matrix: 104 MB, some ten seconds (355 take 2.5)."""
 ITERATIVE_KEYFRAMES = 32
 """Most keyframes whose covariances are solved for column by column: some 60 systems each."""
 
@@ -111,15 +111,16 @@ def covariances(
 ) -> Covariances:
     """Marginal covariances of poses, of the intrinsics, and variances of the inverse depths at a solution.
 
-    Pure: works under `jit` and `vmap`. Cost: one linearisation and, with a dense solver, one symmetric eigenvalue
-    problem of size `6 n + 4`; with a band, a block elimination that is linear in the keyframes; with conjugate
-    gradients, a solve for each coordinate of every keyframe asked for and of its neighbours.
+    Pure: works under `jit` and `vmap`. Cost: one linearisation and, with a dense solver, one Cholesky factor and inverse
+    of size `6 n + 4` (eigenvectors, where something is undetermined); with a band, a block elimination that is linear in
+    the keyframes; with conjugate gradients, a solve for each coordinate of every keyframe asked for and of its
+    neighbours.
 
     Args:
         problem: the problem that was solved.
         state: its solution (`solve(...).state`): the information is that of the linearisation there.
         reduced_solver: whose linear algebra inverts the information, as `choose_reduced_solver` gives it; None: dense
-            for up to 300 keyframes.
+            for up to 600 keyframes.
         keyframes: which ones, `h` indices; None = all, `h = n`. The intrinsics and the variance factor are always those
             of the whole.
 
