@@ -98,6 +98,17 @@ def test_lines_bring_a_wrong_start_to_the_true_motion() -> None:
     assert chi2.ppf(0.5, 6) / 2 < middle < chi2.ppf(0.5, 6) * 2, f"median squared distance {middle:.1f}, expected 5.3"
 
 
+def test_lines_behind_the_camera_say_nothing() -> None:
+    """From a start that sees all segments from behind there is no motion by them. Oracle: they lie 2 to 4 m ahead."""
+    rng = np.random.default_rng(0)
+    points = _segments(10, rng)
+    behind = rigid.exponential(np.array([0.0, 0.0, -9.0, 0.0, 0.0, 0.0]))
+    sure = 1e6 * np.eye(6)
+    assert (
+        align_lines(_keyframe(points, rng, 0.02), _seen(points, MOTION, rng), _Same(), behind, sure, INTRINSICS) is None
+    )
+
+
 def test_what_parallel_lines_do_not_say_is_missing() -> None:
     """Lines along one direction leave the motion along it unknown; the start is kept there. Oracle: the direction."""
     along = np.array([0.6, 0.0, 0.8])

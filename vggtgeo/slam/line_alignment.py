@@ -110,7 +110,7 @@ def align_lines(
 ) -> AlignedLines | None:
     """The motion keyframe -> frame by their segments, from `start` float64 [4, 4] with information `known` [6, 6].
 
-    None where fewer than three segments are matched.
+    None where fewer than three segments are matched, or none of them lies before the camera in the end.
     """
     segments = SpaceSegments.of(source, intrinsics)
     if len(segments.index) < LEAST_LINES or len(seen) < LEAST_LINES:
@@ -141,6 +141,8 @@ def align_lines(
             break
     assert rows is not None
     weight = _weights(rows.residual)
+    if not weight.any():
+        return None
     agreed = int(np.count_nonzero((np.abs(rows.residual) < 3.0).all(1)))
     information = _without_chance(_normal(rows.jacobian, weight), _normal(rows.sliding, weight))
     return AlignedLines(motion, information, agreed, _visible(segments, motion, intrinsics, source))

@@ -112,9 +112,9 @@ def covariances(
     """Marginal covariances of poses, of the intrinsics, and variances of the inverse depths at a solution.
 
     Pure: works under `jit` and `vmap`. Cost: one linearisation and, with a dense solver, one Cholesky factor and its
-    inverse, of size `6 n + 4` (eigenvectors, where something is undetermined); with a band, a block elimination that is
-    linear in the keyframes; with conjugate gradients, a solve for each coordinate of every keyframe asked for and of its
-    neighbours.
+    inverse, of size `6 n + 4` (eigenvectors, where something is undetermined); with a band, a block elimination that
+    is linear in the keyframes; with conjugate gradients, a solve for each coordinate of every keyframe asked for and of
+    its neighbours.
 
     Args:
         problem: the problem that was solved.
