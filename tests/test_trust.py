@@ -276,6 +276,22 @@ def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
     assert not any("cut, turned or scaled" in text for text in confirmed), "the images know their camera"
 
 
+def test_a_focal_length_that_few_pairs_fit_better_is_no_want(healthy: Walk) -> None:
+    """A camera that is 20 % off is told, as nearly all pairs fit the right one better; what half of them fit better is
+    chance, however sure the mean. Oracle: the intrinsics that the walk was made with.
+    """
+    wrong = replace(healthy.estimate, intrinsics=healthy.estimate.intrinsics * [1.2, 1.2, 1.0, 1.0])
+    opinion = camera_opinion(wrong, healthy.evidence)
+    assert opinion is not None
+    assert opinion.better > 0.9
+    told = lambda opinion: any("focal length" in f.text for f in check_camera(wrong, opinion, SIZE))
+    assert told(opinion)
+    assert not told(replace(opinion, better=0.55))
+    right = camera_opinion(healthy.estimate, healthy.evidence)
+    assert right is not None
+    assert right.better < 2 / 3
+
+
 @pytest.mark.parametrize(
     ("width", "height", "centre"),
     [

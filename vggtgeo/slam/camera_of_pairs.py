@@ -27,6 +27,7 @@ LEAST_BLOCKS = PARAMETERS + 2
 ITERATIONS, SETTLED = 20, 0.002
 """At most, and the step, in the longest ones, below which there are no more. Half the focal length is seven of these
 away."""
+POSE_ITERATIONS = 4
 HUBER = 1.0
 FARTHEST = 30.0
 """Pixels: residuals beyond are none of this camera's."""
@@ -42,12 +43,14 @@ CAMERA_STEPS = (1e-5, 1e-2, 1e-2, 1e-5)
 class CameraOpinion:
     """What pairs say of the camera: log factor on the focal lengths, shift of the principal point in pixels (x, y),
     radial coefficient k1; float64 [4], zero means: as it was taken to be. covariance: float64 [4, 4] of these, from
-    `blocks` independent ones.
+    `blocks` independent ones. better: share of the pairs that this camera fits better than the one they began with,
+    each pose free.
     """
 
     value: np.ndarray
     covariance: np.ndarray
     blocks: int
+    better: float = 1.0
 
     @property
     def sigma(self) -> np.ndarray:
@@ -92,7 +95,24 @@ def camera_of_pairs(pairs: Sequence[CameraPair], intrinsics: np.ndarray) -> Came
     np.add.at(blocks, block, np.array([r.gradient for r in reduced]))
     # Few blocks fit themselves: the usual correction of the sandwich.
     scale = count / (count - PARAMETERS)
-    return CameraOpinion(value, scale * (inverse @ blocks.T @ blocks @ inverse), count)
+    began = _costs(pairs, [pair.relative for pair in pairs], np.zeros(4), intrinsics)
+    better = float(np.mean(_costs(pairs, poses, value, intrinsics) < began))
+    return CameraOpinion(value, scale * (inverse @ blocks.T @ blocks @ inverse), count, better)
+
+
+def _costs(
+    pairs: Sequence[CameraPair], poses: Sequence[np.ndarray], value: np.ndarray, intrinsics: np.ndarray
+) -> np.ndarray:
+    """Robust cost of each pair with a camera, its pose brought to rest."""
+    costs = []
+    for pair, start in zip(pairs, poses, strict=True):
+        pose = start
+        for _ in range(POSE_ITERATIONS):
+            pose = _moved(pose, _reduce(pair, pose, value, intrinsics).pose_step(np.zeros(4)))
+        off = np.linalg.norm(_predict(pair.before, pair.depth, pose, value, intrinsics) - pair.after, axis=1)
+        off = np.where(np.isfinite(off), np.minimum(off, FARTHEST), FARTHEST)
+        costs.append(np.where(off < HUBER, off**2 / 2, HUBER * (off - HUBER / 2)).sum())
+    return np.array(costs)
 
 
 def _predict(

@@ -230,7 +230,8 @@ def _missed(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: Slam
 
 
 def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
-    """The frame by an old keyframe that stands where it does, if there is one: the map grows with space, not with time.
+    """The frame by an old keyframe that stands where it does, if there is one that shows it as well as the present one:
+    the map grows with space, not with time.
 
     What the two keyframes know of each other by this frame ties them.
     """
@@ -243,7 +244,7 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
             again = None  # drift may have put another keyframe there
     if again is None:
         again = revisit(slam, sight, found.pose, roles)
-    if again is None or _needs_keyframe(again, settings):
+    if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
         return slam, found
     near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
