@@ -34,7 +34,9 @@ LEAST = 30
 MOST_OFF = 0.25
 """Share of triangulated corners that may be off."""
 HEALTHY_OFF = 0.15
-MOST_SURFACES_OFF = 0.10
+MOST_SURFACES_OFF = 0.15
+"""Share of |y| > 0.15 that is too much. It is 0.00 to 0.02 on the HoloLens clips and 0.09 on icl-office, whose corners
+lie on the edges of furniture; with 3 % of noise in the depth 0.18 and 0.33, with a frozen depth image 0.16."""
 HEALTHY_SURFACES_OFF = 0.04
 MOST_SCALE = 0.08
 """Largest median of `x`. The poses of a metric run come from the same depth, so that a sane run has 0.00 to 0.02."""
