@@ -178,9 +178,7 @@ def _seen(
     )
 
 
-def _intrinsics_prior(
-    mean: np.ndarray, sigma: np.ndarray | float | None, shape: tuple[int, ...], dtype: DTypeLike
-) -> IntrinsicsPrior:
+def _intrinsics_prior(mean: np.ndarray, sigma: Any, shape: tuple[int, ...], dtype: DTypeLike) -> IntrinsicsPrior:
     check_intrinsics_prior(mean, sigma, shape)
     weight = np.zeros(mean.shape) if sigma is None else 1 / np.square(np.broadcast_to(sigma, mean.shape))
     return IntrinsicsPrior(
