@@ -3,7 +3,7 @@
 The matrix is balanced by `diag(H)` (an eigenvalue is then the share of information that is left after everything else
 is estimated too). Directions below `rank_tolerance` are undetermined; the others have the pseudo-inverse, by
 eigenvectors. Where the Cholesky factor's inverse `C` shows that there are none (`1 / |C|` is no more than the smallest
-eigenvalue), it is taken: a tenth of the time. Along a flat gauge direction `a` the covariance is that of the solution
+eigenvalue), it is taken, which takes less time. Along a flat gauge direction `a` the covariance is that of the solution
 held there, `a' x = 0`: `C - C a (a' C a)^-1 a' C`. See Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999,
 section 9.
 """
