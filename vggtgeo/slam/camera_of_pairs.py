@@ -16,9 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
-import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import t as student_t
 
 LEAST_PAIRS = 8
@@ -79,67 +80,78 @@ def camera_of_pairs(pairs: Sequence[CameraPair], intrinsics: np.ndarray) -> Came
     count = len(kinds)
     if len(pairs) < 2 * LEAST_PAIRS or count < LEAST_BLOCKS:
         return None
-    value, poses = np.zeros(4), [pair.relative for pair in pairs]
+    points, began = _Points.of(pairs), np.array([pair.relative for pair in pairs])
+    value, poses = np.zeros(4), began
     prior = np.diag(1 / PRIOR**2)
-    reduced: list[_Reduced] = []
     for _ in range(ITERATIONS):
-        reduced = [_reduce(pair, pose, value, intrinsics) for pair, pose in zip(pairs, poses, strict=True)]
-        step = -np.linalg.solve(sum(r.normal for r in reduced) + prior, sum(r.gradient for r in reduced))
-        step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+        reduced = _reduce(points, poses, value, intrinsics)
+        inverse = np.linalg.inv(reduced.normal.sum(0) + prior)
+        step = np.clip(-inverse @ reduced.gradient.sum(0), -LONGEST_STEP, LONGEST_STEP)
         value = value + step
-        poses = [_moved(pose, r.pose_step(step)) for pose, r in zip(poses, reduced, strict=True)]
+        poses = _moved(poses, reduced.pose_steps(step))
         if np.all(np.abs(step) < SETTLED * LONGEST_STEP):
             break
-    inverse = np.linalg.inv(sum(r.normal for r in reduced) + prior)
     blocks = np.zeros((count, PARAMETERS))
-    np.add.at(blocks, block, np.array([r.gradient for r in reduced]))
+    np.add.at(blocks, block, reduced.gradient)
     # Few blocks fit themselves: the usual correction of the sandwich.
     scale = count / (count - PARAMETERS)
-    began = _costs(pairs, [pair.relative for pair in pairs], np.zeros(4), intrinsics)
-    better = float(np.mean(_costs(pairs, poses, value, intrinsics) < began))
-    return CameraOpinion(value, scale * (inverse @ blocks.T @ blocks @ inverse), count, better)
+    better = _costs(points, poses, value, intrinsics) < _costs(points, began, np.zeros(4), intrinsics)
+    return CameraOpinion(value, scale * (inverse @ blocks.T @ blocks @ inverse), count, float(np.mean(better)))
 
 
-def _costs(
-    pairs: Sequence[CameraPair], poses: Sequence[np.ndarray], value: np.ndarray, intrinsics: np.ndarray
-) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """The matches of all pairs in a row. before, after: float64 [n, 2]. depth: [n]. pair: int [n], ascending."""
+
+    before: np.ndarray
+    after: np.ndarray
+    depth: np.ndarray
+    pair: np.ndarray
+
+    @classmethod
+    def of(cls, pairs: Sequence[CameraPair]) -> _Points:
+        before, after = np.concatenate([pair.before for pair in pairs]), np.concatenate([pair.after for pair in pairs])
+        number = np.repeat(np.arange(len(pairs)), [len(pair.depth) for pair in pairs])
+        return cls(before, after, np.concatenate([pair.depth for pair in pairs]), number)
+
+    def residuals(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+        """Predicted minus seen pixels float64 [n, 2]; NaN behind a camera. poses: float64 [pairs, 4, 4]."""
+        focal = intrinsics[:2] * np.exp(value[0])
+        centre = intrinsics[2:] + value[1:3]
+        bent = (self.before - centre) / focal
+        x = bent
+        for _ in range(4):  # the inverse of the lens by fixed-point iteration, as OpenCV does it
+            x = bent / (1 + value[3] * (x**2).sum(1, keepdims=True))
+        local = np.column_stack([x, np.ones(len(x))]) * self.depth[:, None]
+        points = np.einsum("nij,nj->ni", poses[self.pair, :3, :3], local) + poses[self.pair, :3, 3]
+        z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
+        y = points[:, :2] / z[:, None]
+        return np.asarray(y * (1 + value[3] * (y**2).sum(1, keepdims=True)) * focal + centre - self.after)
+
+
+def _costs(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Robust cost of each pair with a camera, its pose brought to rest."""
-    costs = []
-    for pair, start in zip(pairs, poses, strict=True):
-        pose = start
-        for _ in range(POSE_ITERATIONS):
-            pose = _moved(pose, _reduce(pair, pose, value, intrinsics).pose_step(np.zeros(4)))
-        off = np.linalg.norm(_predict(pair.before, pair.depth, pose, value, intrinsics) - pair.after, axis=1)
-        off = np.where(np.isfinite(off), np.minimum(off, FARTHEST), FARTHEST)
-        costs.append(np.where(off < HUBER, off**2 / 2, HUBER * (off - HUBER / 2)).sum())
-    return np.array(costs)
+    for _ in range(POSE_ITERATIONS):
+        poses = _moved(poses, _reduce(points, poses, value, intrinsics).pose_steps(np.zeros(4)))
+    off = np.linalg.norm(points.residuals(poses, value, intrinsics), axis=1)
+    off = np.where(np.isfinite(off), np.minimum(off, FARTHEST), FARTHEST)
+    cost = np.where(off < HUBER, off**2 / 2, HUBER * (off - HUBER / 2))
+    return np.bincount(points.pair, cost, len(poses))
 
 
-def _predict(
-    before: np.ndarray, depth: np.ndarray, pose: np.ndarray, value: np.ndarray, intrinsics: np.ndarray
-) -> np.ndarray:
-    focal = intrinsics[:2] * np.exp(value[0])
-    centre = intrinsics[2:] + value[1:3]
-    bent = (before - centre) / focal
-    x = bent
-    for _ in range(4):  # the inverse of the lens by fixed-point iteration, as OpenCV does it
-        x = bent / (1 + value[3] * (x**2).sum(1, keepdims=True))
-    points = np.column_stack([x, np.ones(len(x))]) * depth[:, None] @ pose[:3, :3].T + pose[:3, 3]
-    z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
-    y = points[:, :2] / z[:, None]
-    return np.asarray(y * (1 + value[3] * (y**2).sum(1, keepdims=True)) * focal + centre)
-
-
-def _moved(pose: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-    step = np.eye(4)
-    step[:3, :3] = cv2.Rodrigues(tangent[3:])[0]
-    step[:3, 3] = tangent[:3]
-    return step @ pose
+def _moved(poses: np.ndarray, tangents: np.ndarray) -> np.ndarray:
+    """Each of float64 [pairs, 4, 4] by its tangent [pairs, 6], translation first."""
+    steps = np.tile(np.eye(4), (len(tangents), 1, 1))
+    steps[:, :3, :3] = Rotation.from_rotvec(tangents[:, 3:]).as_matrix()
+    steps[:, :3, 3] = tangents[:, :3]
+    return steps @ poses
 
 
 @dataclass(frozen=True, eq=False)
 class _Reduced:
-    """Normal matrix [4, 4] and gradient [4] over the camera, the pose eliminated; and what brings the pose back."""
+    """Of each pair: normal matrix [pairs, 4, 4] and gradient [pairs, 4] over the camera, the pose eliminated; and what
+    brings the pose back.
+    """
 
     normal: np.ndarray
     gradient: np.ndarray
@@ -147,27 +159,31 @@ class _Reduced:
     cross: np.ndarray
     own: np.ndarray
 
-    def pose_step(self, step: np.ndarray) -> np.ndarray:
-        """The pose's step that belongs to a step of the camera, tangent [6]."""
-        return np.asarray(-self.inverse @ (self.own + self.cross @ step))
+    def pose_steps(self, step: np.ndarray) -> np.ndarray:
+        """The step of each pose that belongs to a step of the camera, tangents [pairs, 6]."""
+        return -np.einsum("pij,pj->pi", self.inverse, self.own + self.cross @ step)
 
 
-def _reduce(pair: CameraPair, pose: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Reduced:
-    def at(tangent: np.ndarray, camera: np.ndarray) -> np.ndarray:
-        return (_predict(pair.before, pair.depth, _moved(pose, tangent), camera, intrinsics) - pair.after).ravel()
-
-    zero = np.zeros(6)
-    residual = at(zero, value)
-    columns = [(at(h * row, value) - residual) / h for h, row in zip(POSE_STEPS, np.eye(6), strict=True)]
-    columns += [(at(zero, value + h * row) - residual) / h for h, row in zip(CAMERA_STEPS, np.eye(4), strict=True)]
-    jacobian = np.column_stack(columns)
-    sizes = np.repeat(np.linalg.norm(residual.reshape(-1, 2), axis=1), 2)
-    good = np.isfinite(residual) & np.isfinite(jacobian).all(1) & (sizes < FARTHEST)
-    jacobian, residual = jacobian[good], residual[good]
-    weight = np.minimum(HUBER / np.maximum(sizes[good], 1e-9), 1.0)
-    hessian = jacobian.T @ (weight[:, None] * jacobian)
-    gradient = jacobian.T @ (weight * residual)
-    inverse = np.linalg.inv(hessian[:6, :6] + 1e-6 * np.eye(6))
-    cross = hessian[:6, 6:]
-    normal = hessian[6:, 6:] - cross.T @ inverse @ cross
-    return _Reduced(normal, gradient[6:] - cross.T @ inverse @ gradient[:6], inverse, cross, gradient[:6])
+def _reduce(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Reduced:
+    residual = points.residuals(poses, value, intrinsics)
+    columns = []
+    for size, row in zip(POSE_STEPS, np.eye(6), strict=True):
+        beside = _moved(poses, np.tile(size * row, (len(poses), 1)))
+        columns.append((points.residuals(beside, value, intrinsics) - residual) / size)
+    for size, row in zip(CAMERA_STEPS, np.eye(4), strict=True):
+        columns.append((points.residuals(poses, value + size * row, intrinsics) - residual) / size)
+    rows = np.stack([*columns, residual], 2)  # [n, 2, 11]
+    size = np.linalg.norm(residual, axis=1)
+    good = np.isfinite(rows).all((1, 2)) & (size < FARTHEST)
+    weight = np.where(good, np.minimum(HUBER / np.maximum(size, 1e-9), 1.0), 0.0)
+    rows = np.where(good[:, None, None], rows, 0.0) * np.sqrt(weight)[:, None, None]
+    ends = np.searchsorted(points.pair, np.arange(len(poses) + 1))
+    flat = [rows[start:end].reshape(-1, 11) for start, end in pairwise(ends)]
+    squares = np.array([own.T @ own for own in flat])  # Hessian and gradient, [pairs, 11, 11]
+    hessian, gradient = squares[:, :10, :10], squares[:, :10, 10]
+    inverse = np.linalg.inv(hessian[:, :6, :6] + 1e-6 * np.eye(6))
+    cross, own = hessian[:, :6, 6:], gradient[:, :6]
+    back = np.swapaxes(cross, 1, 2) @ inverse
+    return _Reduced(
+        hessian[:, 6:, 6:] - back @ cross, gradient[:, 6:] - np.einsum("pij,pj->pi", back, own), inverse, cross, own
+    )

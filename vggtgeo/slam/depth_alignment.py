@@ -155,7 +155,7 @@ def _normals(points: np.ndarray) -> np.ndarray:
     normals = np.full_like(points, np.nan)
     right = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
-    normal = np.cross(down, right)
+    normal = rigid.cross(down, right)
     with np.errstate(invalid="ignore", divide="ignore"):
         z = points[1:-1, 1:-1, 2]
         smooth = (np.abs(right[..., 2]) < 0.1 * z) & (np.abs(down[..., 2]) < 0.1 * z)

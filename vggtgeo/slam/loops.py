@@ -4,13 +4,12 @@ and, whatever the drift, by what they look like; verified by geometry.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.models.classical import pose_information
+from vggtgeo.models.classical import can_search, pose_information
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
 from vggtgeo.slam.connected import piece_of
 from vggtgeo.slam.covisibility import Pair, overlap, some_points
@@ -19,6 +18,7 @@ from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.straightening import Loop, straightened
+from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking import PIXEL_SIGMA
 from vggtgeo.slam.units import ratio_of_units
 
@@ -37,7 +37,7 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     """
     label, known = piece_of(slam), {pair.key for pair in slam.pairs}
     proposed = list(dict.fromkeys([*_by_estimate(slam, settings, known), *_by_appearance(slam, settings, known)]))
-    found = list(_verified(slam, proposed, label, roles, settings))
+    found = _verified(slam, proposed, label, roles, settings)
     before, (straight, believed) = slam, straightened(slam, found)
     slam = replace(straight, pairs=(*slam.pairs, *(loop.pair for loop in believed)))
     if straight is before:
@@ -49,13 +49,16 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
 
 def _verified(
     slam: Slam, proposed: list[tuple[int, int]], label: np.ndarray, roles: Roles, settings: SlamSettings
-) -> Iterator[Loop]:
+) -> list[Loop]:
     """Those of the proposed pairs that geometry confirms. Pieces of free scale have units of their own."""
-    for first, second in proposed:
-        if slam.metric or label[first] == label[second]:
-            loop = verify(slam.keyframes[first], slam.keyframes[second], roles, settings, slam.intrinsics)
-            if loop is not None:
-                yield loop
+    comparable = [(first, second) for first, second in proposed if slam.metric or label[first] == label[second]]
+
+    def verified(pair: tuple[int, int]) -> Loop | None:
+        first, second = (slam.keyframes[number] for number in pair)
+        return verify(first, second, roles, settings, slam.intrinsics)
+
+    loops = map_in_threads(verified, comparable, alone=not can_search(slam.keyframes[0].features))
+    return [loop for loop in loops if loop is not None]
 
 
 def _by_estimate(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]) -> list[tuple[int, int]]:

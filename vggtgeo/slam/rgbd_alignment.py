@@ -26,6 +26,9 @@ FARTHEST = 0.15
 LEAST_COSINE = 0.7
 LEAST_SAMPLES = 60
 NAN = float("nan")
+SETTLED = 1e-4
+"""Metres and radians: a smaller step ends the finest level, ten times it a coarser one. A pose is known to a millimetre
+at best; with a tenth of this, poses of redkitchen and corridor-office differ by 0.1 mm, for twice the iterations."""
 TUKEY = 4.685
 """Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
 
@@ -73,7 +76,7 @@ class RgbdAlignment:
                     return None
                 change = _solve(*self._normal_equations(edges, surface))
                 motion = rigid.exponential(change) @ motion
-                if np.abs(change).max() < (1e-5 if level == 0 else 1e-4):
+                if np.abs(change).max() < (SETTLED if level == 0 else 10 * SETTLED):
                     break
         return self._judged(source, target, motion)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 
 WIDTH = 300
@@ -137,7 +138,7 @@ def _normals(points: np.ndarray) -> np.ndarray:
         return normals
     right = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
-    normal = np.cross(down, right)
+    normal = rigid.cross(down, right)
     z = points[1:-1, 1:-1, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
         smooth = (np.abs(right[..., 2]) < 0.1 * z) & (np.abs(down[..., 2]) < 0.1 * z)

@@ -14,11 +14,14 @@ MOST_THREADS = 4
 """More wait for Python's lock: the pieces here are some milliseconds long."""
 
 
-def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """`[function(item) for item in items]`, in that order; `function` is pure, so that threads change no result."""
+def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item], alone: bool = False) -> list[_Result]:
+    """`[function(item) for item in items]`, in that order; `function` is pure, so that threads change no result.
+
+    alone: one after the other; a network takes all cores, or the GPU, for one item.
+    """
     todo = list(items)
     workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, len(todo))
-    if workers < 2:
+    if alone or workers < 2:
         return [function(item) for item in todo]
     with ThreadPoolExecutor(min(workers, MOST_THREADS), thread_name_prefix="work") as pool:
         return list(pool.map(function, todo))

@@ -124,9 +124,7 @@ def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, 
     """
     slam = make_room(slam, settings, tied_to)
     match = lambda number: match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics)
-    # A network takes all cores, or the GPU, for one pair.
-    alone = not can_search(keyframe.features)
-    matched = [match(number) for number in slam.window] if alone else map_in_threads(match, slam.window)
+    matched = map_in_threads(match, slam.window, alone=not can_search(keyframe.features))
     pairs = tuple(pair for pair in matched if pair is not None)
     inside = (*slam.window, keyframe.number)
     kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in slam.keyframes)

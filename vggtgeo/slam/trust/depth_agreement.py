@@ -140,7 +140,7 @@ def _across(before: np.ndarray, after: np.ndarray, relative: np.ndarray, intrins
     """Standard deviation of the corners from their epipolar lines, pixels; robust, 0 without corners."""
     if not len(before):
         return 0.0
-    plane = np.cross(relative[:3, 3], pinhole.rays(before, intrinsics) @ relative[:3, :3].T)
+    plane = rigid.cross(relative[:3, 3], pinhole.rays(before, intrinsics) @ relative[:3, :3].T)
     normal = plane[:, :2] / np.asarray(intrinsics, np.float64)[:2]
     off = (plane * pinhole.rays(after, intrinsics)).sum(1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-18)
     return 1.48 * float(np.median(np.abs(off)))
