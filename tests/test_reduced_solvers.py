@@ -30,7 +30,7 @@ from vggtgeo.bundle.node_order import longest, narrow_order
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
-from vggtgeo.bundle.solver_choice import choose_reduced_solver
+from vggtgeo.bundle.solver_choice import MUCH_DENSE, choose_reduced_solver, default_solver
 
 KEYFRAMES, REACH = 9, 2
 LOOPS = ((0, 8), (1, 6), (2, 7))
@@ -249,3 +249,15 @@ def test_the_choice_follows_the_graph() -> None:
     scattered = np.random.default_rng(1).integers(0, 200, (600, 2))
     scattered = np.unique(scattered[scattered[:, 0] != scattered[:, 1]], axis=0)
     assert choose_reduced_solver(many(200, scattered)) == ConjugateGradients()
+
+
+def test_a_solve_without_a_word_follows_the_graph() -> None:
+    # Proves which linear solver `solve` takes by itself, and that a dense one of many keyframes in `jit` is told.
+    # Oracle: a chain, whose band is known, and the text of the warning.
+    i = np.arange(MUCH_DENSE + 1)
+    chain = many(len(i), np.stack([i[:-1], i[1:]], 1))
+    assert default_solver(chain).reduced_solver == BandCholesky(1)
+    taken = []
+    with pytest.warns(UserWarning, match="of 301 keyframes inside `jit` takes a dense linear solver"):
+        jax.make_jaxpr(lambda problem: taken.append(default_solver(problem)))(chain)
+    assert taken[0].reduced_solver == DenseCholesky()

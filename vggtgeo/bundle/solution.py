@@ -15,6 +15,7 @@ from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.linearise import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solver_choice import default_solver
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.adjoint import ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import (
@@ -112,7 +113,8 @@ def solve(
     Args:
         problem: observations and priors, `vggtgeo.pack` makes one from flat lists.
         initial: starting state, world -> camera poses, pixels, 1/m; lines of two ends start straight along them.
-        solver: iteration and linear algebra; default `SchurLevenbergMarquardt()`.
+        solver: iteration and linear algebra; default `SchurLevenbergMarquardt()` with the linear solver that
+            `choose_reduced_solver` finds for the graph. Inside `jit` it cannot look: give it for a large problem.
         adjoint: how to differentiate; default `ArrowAdjoint()`. `optimistix.RecursiveCheckpointAdjoint()` with
             `SchurLevenbergMarquardt(differentiable_loop=True)` differentiates through the iterates instead.
         graduation: wider kernels to go through first, for a redescending kernel and a start that outliers dominate;
@@ -131,7 +133,7 @@ def solve(
 
     """
     check_observed(problem)
-    solver = SchurLevenbergMarquardt() if solver is None else solver
+    solver = default_solver(problem) if solver is None else solver
     adjoint = ArrowAdjoint() if adjoint is None else adjoint
     initial = BundleAdjustment(problem).straightened(initial)
     if graduation is not None:

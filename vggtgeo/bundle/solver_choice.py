@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -10,12 +13,15 @@ from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.terms.node import PairTerm
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_LIMIT = 40
 """Keyframes up to which a dense factor costs no more than the linearisation before it."""
 BAND_LIMIT = 24
 """Longest reach of a band: a group of `2 * 24` keyframes has 288 coordinates."""
+MUCH_DENSE = 300
+"""Keyframes whose dense factor takes a second or so: more of them inside `jit` are worth a warning."""
 ORDERED_LIMIT = 12
 """Longest reach for which no other order is looked for, and the longest of a band that only preconditions."""
 SHORT_SHARE = 0.5
@@ -53,6 +59,22 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
     if len(short) < SHORT_SHARE * len(lengths):
         return ConjugateGradients(BlockJacobi())
     return ConjugateGradients(BandPreconditioner(int(short.max(initial=1))))
+
+
+def default_solver(problem: Problem) -> SchurLevenbergMarquardt:
+    """What `solve` takes without a word: the linear solver that suits the graph, or inside `jit`, where the graph
+    cannot be looked at, the dense one, with a warning where that is slow.
+    """
+    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(problem)):
+        return SchurLevenbergMarquardt(reduced_solver=choose_reduced_solver(problem))
+    if problem.num_keyframes > MUCH_DENSE and not problem.dense_terms:
+        warnings.warn(
+            f"`solve` of {problem.num_keyframes} keyframes inside `jit` takes a dense linear solver, for the graph "
+            "cannot be looked at there: choose one outside, `solver=SchurLevenbergMarquardt(reduced_solver="
+            "choose_reduced_solver(problem))`",
+            stacklevel=3,
+        )
+    return SchurLevenbergMarquardt()
 
 
 def coupled_pairs(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
