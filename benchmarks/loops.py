@@ -1,7 +1,7 @@
 """Cost of a closed loop of RGB-D keyframes with surfaces: adjustment, derivative and covariances against its length.
 
     taskset -c 1 .venv/bin/python benchmarks/loops.py [--keyframes 125 250 500 1000] [--solvers chosen jacobi]
-        [--parts solve gradient covariances] [--out runs/loops]
+        [--parts solve gradient covariances observability] [--out runs/loops]
 
 The loop is that of `vggtgeo/simulation/loop.py`: points, depth priors, aligned surfaces, edges around the loop, and a
 guess that drifts, so that the loop does not close. Each cell is a process of its own, in float64, on one core:
@@ -11,6 +11,7 @@ guess that drifts, so that the loop does not close. Each cell is a process of it
 - gradient: `jax.value_and_grad` of a loss of the solution by every float leaf; what it takes beyond the solve, in
   iterations of the solve.
 - covariances: of every pose and landmark, with the same linear algebra, and the error that they expect.
+- observability: at the truth; above 300 keyframes by sparse solvers.
 
 Time is the median of three runs after the first. Memory is the largest that the process had. The slope is that of a
 straight line through the logarithms of time and edges: 1 is linear. Prints Markdown and writes it to `loops.md`.
@@ -36,18 +37,18 @@ from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.reduced import AbstractReducedSolver
 
 import vggtgeo as vg
+from vggtgeo.bundle.analysis.observability import DENSE_KEYFRAMES
 from vggtgeo.simulation.loop import simulate_loop
 
 SOLVERS: dict[str, Callable[[vg.Problem], AbstractReducedSolver]] = {
     "chosen": vg.choose_reduced_solver,
     "jacobi": lambda problem: ConjugateGradients(),
 }
-PARTS = ("solve", "gradient", "covariances")
+PARTS = ("solve", "gradient", "covariances", "observability")
 HEADER = (
     "| keyframes | edges | surfaces | linear solver | iterations | ms an iteration | error before, mm | after, mm "
-    "| expected, mm | backward, iterations | covariances, s | memory GB: solve | gradient | covariances |\n"
-    + "|---" * 14
-    + "|"
+    "| expected, mm | backward, iterations | covariances, s | observability, s "
+    "| memory GB: solve | gradient | covariances | observability |\n" + "|---" * 16 + "|"
 )
 
 
@@ -65,7 +66,8 @@ def main() -> None:
             rows.append(_row(keyframes, name, options.parts))
             print(_markdown(rows[-1]), flush=True)
     (options.out / "loops.json").write_text(json.dumps(rows, indent=1))
-    slopes = [f"Slope of {name}: {_slope(rows, name):.2f}." for name in options.solvers if len(options.keyframes) > 1]
+    several = len(options.keyframes) > 1 and "solve" in options.parts
+    slopes = [f"Slope of {name}: {_slope(rows, name):.2f}." for name in options.solvers if several]
     print("\n" + "\n".join(slopes))
     (options.out / "loops.md").write_text("\n".join([HEADER, *map(_markdown, rows), "", *slopes]) + "\n")
 
@@ -98,8 +100,8 @@ def _measure(keyframes: int, name: str, part: str) -> dict[str, Any]:
     reduced = SOLVERS[name](problem)
     solver = vg.SchurLevenbergMarquardt(reduced_solver=reduced)
     solve = lambda problem, state: vg.solve(problem, state, solver=solver)
-    measured = {"solve": _solve, "gradient": _gradient, "covariances": _covariances}[part]
-    found = measured(problem, initial, solve, reduced)
+    measured = {"solve": _solve, "gradient": _gradient, "covariances": _covariances, "observability": _observability}
+    found = measured[part](problem, window.truth() if part == "observability" else initial, solve, reduced)
     if "state" in found:
         state = found.pop("state")
         found["error_mm"] = [1e3 * float(np.sqrt(np.mean(window.errors(s) ** 2))) for s in (initial, state)]
@@ -143,9 +145,18 @@ def _covariances(problem: vg.Problem, initial: vg.State, solve: Any, reduced: Ab
     return {"covariances_s": milliseconds / 1e3, "asked": len(found.poses), "expected_mm": 1e3 * float(expected)}
 
 
+def _observability(problem: vg.Problem, state: vg.State, _: Any, __: AbstractReducedSolver) -> dict[str, Any]:
+    observe = jax.jit(vg.observability) if problem.num_keyframes <= DENSE_KEYFRAMES else vg.observability
+    milliseconds, found = _timed_run(observe, problem, state)
+    return {"observability_s": milliseconds / 1e3, "eigenvalues": found.to_dict()["eigenvalues"][:6]}
+
+
 def _timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Milliseconds of a run, and what it returned."""
-    run = jax.jit(function)
+    """Milliseconds of a compiled run, and what it returned."""
+    return _timed_run(jax.jit(function), *arguments)
+
+
+def _timed_run(run: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
     found, times = jax.block_until_ready(run(*arguments)), []
     for _ in range(3):
         start = time.perf_counter()
@@ -166,6 +177,7 @@ def _markdown(row: dict[str, Any]) -> str:
     cells += [f"{row['solve_ms'] / row['iterations']:.1f}" if "solve_ms" in row else "-"]
     cells += [f"{error:.1f}" for error in row.get("error_mm", [np.nan] * 2)]
     cells += [number("expected_mm", 1), number("backward", 1), number("covariances_s", 2)]
+    cells += [number("observability_s", 2)]
     cells += [number(f"{part}_gb", 2) for part in PARTS]
     return "| " + " | ".join(cells) + " |"
 

@@ -68,15 +68,15 @@ def observability_figure(found: Observability) -> NotebookFigure:
     figure = NotebookFigure(figsize=(10.0, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[2, 3])
-    free = int(np.sum(found.free))
+    shown = min(int(np.sum(found.free)), found.whole.values.shape[-1])
     floor = 0.1 * float(np.finfo(found.whole.values.dtype).eps)
     rows = [("all", found.whole.values[0], _INK)]
     rows += [(f"without {kind}", found.without.values[k], _colour(k)) for k, kind in enumerate(found.terms)]
     for name, values, colour in rows:
         style = {"lw": 2.2, "zorder": 3} if name == "all" else {"lw": 1.2}
-        left.semilogy(np.maximum(np.asarray(values)[:free], floor), ".-", ms=4, color=colour, label=name, **style)
+        left.semilogy(np.maximum(np.asarray(values)[:shown], floor), ".-", ms=4, color=colour, label=name, **style)
     left.axhline(WEAK, color="#c0392b", lw=0.9, ls="--")
-    left.annotate("weak below", (free - 1, WEAK), (0, 3), textcoords="offset points", ha="right", fontsize=8)
+    left.annotate("weak below", (shown - 1, WEAK), (0, 3), textcoords="offset points", ha="right", fontsize=8)
     left.set(xlabel="direction, the weakest first", ylabel="eigenvalue, balanced")
     left.set_title("How well it is determined", loc="left", fontsize=10)
     left.legend(frameon=False, fontsize=8)

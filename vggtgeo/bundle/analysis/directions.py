@@ -27,15 +27,16 @@ _INTRINSICS = {
 
 
 def direction_names(keyframes: int, parameters: tuple[str, ...] = Pinhole.names) -> tuple[str, ...]:
-    """Names of the rows of `named_directions`, for cameras with these parameters: the global ones first."""
+    """Names of the rows of `common_directions`, for cameras with these parameters, then of each keyframe's motions."""
     words = [name.partition(" ") for name in parameters]
     camera = tuple(f"{_INTRINSICS.get(name, f'distortion {name}')}{gap}{which}" for name, gap, which in words)
     each = tuple(f"keyframe {i}: {motion}" for i in range(keyframes) for motion in MOTIONS)
     return ("scale", *MOTIONS, *camera, *each)
 
 
-def named_directions(problem: Problem, state: State) -> Float[Array, "m c"]:
-    """One row a name, in the coordinates of the dense state: 1 m, 1 rad, 1 pixel, or 100 % of scale or focal length.
+def common_directions(problem: Problem, state: State) -> Float[Array, "g c"]:
+    """One row a global name (the first `g = 7 + q`), in the coordinates of the dense state: 1 m, 1 rad, 1 pixel, or
+    100 % of scale or focal length. The other names are the keyframes' own coordinates, in their order.
 
     Held coordinates are not masked. The aspect ratio changes `fx` by 100 % and `fy` by -100 %.
     """
@@ -44,8 +45,7 @@ def named_directions(problem: Problem, state: State) -> Float[Array, "m c"]:
     common = jnp.concatenate([common, jnp.zeros((len(common), tail), common.dtype)], 1)
     shared = _of_cameras(problem.parameter_names, state.parameters.astype(common.dtype))
     shared = jnp.concatenate([jnp.zeros((tail, lie.TANGENT * keyframes), common.dtype), shared], 1)
-    single = jnp.eye(lie.TANGENT * keyframes, problem.num_camera, dtype=common.dtype)
-    return jnp.concatenate([common, shared, single])
+    return jnp.concatenate([common, shared])
 
 
 def _of_cameras(names: tuple[str, ...], values: Float[Array, " q"]) -> Float[Array, "q q"]:

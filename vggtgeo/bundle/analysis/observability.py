@@ -11,42 +11,59 @@ about the scale, but both together do. So what a term is worth along a direction
 
 Spectra are those of `D^-1/2 S D^-1/2` with `D = diag(H)` of all factors: metres, radians and pixels become one unit,
 and an eigenvalue is the share of a direction's information that is left once everything else is estimated too. A
-direction is *weak* below `observability_report.WEAK` and *undetermined* below the rounding error `10 c eps`. Cost: one
-linearisation a term, and for `k` terms `2 k + 1` Schur complements and symmetric eigenvalue problems of size `c`.
+direction is *weak* below `observability_report.WEAK` and *undetermined* below the rounding error `10 c eps` (`c` at
+most 1,800).
+
+Cost: one linearisation a term, and for `k` terms `2 k + 1` Schur complements and symmetric eigenvalue problems of size
+`c`. Above `DENSE_KEYFRAMES` the Schur complements are sparse and only their smallest eigenvalues are found
+(`weakest.py`): time and memory then grow with the edges.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.analysis.directions import named_directions
+from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import Observability, Spectra
+from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
-from vggtgeo.solvers.arrow import ArrowSystem, NodeFactors, dense_gradient, reduce
+from vggtgeo.geometry import lie
+from vggtgeo.solvers.arrow import ArrowSystem, Blocks, NodeFactors, Reduced, dense_gradient, reduce
+from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
 from vggtgeo.solvers.local_inverse import balance
 from vggtgeo.solvers.segments import join_segments
 
 DENSE_KEYFRAMES = 300
-"""Most keyframes whose spectra are computed: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
+"""Most keyframes whose spectra are computed whole: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
+KEPT = 24
+"""Smallest eigenvalues found of a larger map: the loss of three keyframes, or of a piece of the map, leaves 18 or 7."""
 
 
 def observability(problem: Problem, state: State) -> Observability:
-    """What the factors of `problem` determine at `state`, by kind. Pure: works under `jit` and `vmap`.
+    """What the factors of `problem` determine at `state`, by kind.
+
+    Pure: works under `jit` and `vmap` for up to 300 keyframes. Larger maps go through scipy's sparse solvers, outside
+    `jit`: only their 24 weakest directions are found, all else is the same (1,000 keyframes with 8,000 edges and five
+    terms: 4 s on one core, once compiled).
 
     Args:
         problem: observations and priors; the kernel's weights at `state` count, so outliers say little.
         state: where to linearise, best a solution.
 
     Raises:
-        ValueError: more keyframes than a dense spectrum is for; `covariances` takes any number.
+        ValueError: more than 300 keyframes, and inside `jit` or `vmap`, in single precision, with NaN, or with a term
+            that couples all keyframes, as a marginalisation prior does.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.jit(vg.observability)(problem, solution.state)
@@ -54,42 +71,90 @@ def observability(problem: Problem, state: State) -> Observability:
         True
 
     """
-    if problem.num_keyframes > DENSE_KEYFRAMES:
-        raise ValueError(
-            f"`observability` of {problem.num_keyframes} keyframes would take {2 * len(problem.terms) + 1} dense "
-            f"spectra of {problem.num_camera} coordinates; above {DENSE_KEYFRAMES} keyframes look at a part of the "
-            "map, or at `covariances(problem, state, reduced_solver=choose_reduced_solver(problem))`: it is infinite "
-            "where nothing determines a coordinate"
-        )
-    ready = prepared(problem)
-    systems = [linearise(replace(ready.with_terms((term,)), fraction=None), state) for term in ready.terms]
-    count = len(systems)
-    everything = _combine(systems, jnp.ones(count, state.inverse_depth.dtype), problem.fraction)
-    scale = balance(everything, dense_gradient(everything)[1])
-    free = everything.free
-    directions = jnp.where(free, named_directions(problem, state), 0.0)
-    selections = jnp.concatenate([jnp.ones((1, count)), jnp.eye(count), 1 - jnp.eye(count)]).astype(scale.dtype)
-
-    def spectrum(keep: Float[Array, " k"]) -> Spectra:
-        reduced = reduce(_combine(systems, keep, problem.fraction))
-        return _spectrum(reduced.hessian - reduced.schur, free, scale, directions)
-
-    spectra = jax.lax.map(spectrum, selections)
+    large = problem.num_keyframes > DENSE_KEYFRAMES
+    if large:
+        _check_large(problem, state)
+    systems, everything, coordinates = (_linearise_jit if large else _linearise_each)(problem, state)
+    count, directions = len(systems), coordinates.common
+    selections = jnp.concatenate([jnp.ones((1, count)), jnp.eye(count), 1 - jnp.eye(count)])
+    selections = selections.astype(directions.dtype)
+    if large:
+        layout = sparse_layout(everything)
+        blocks = (_blocks_jit(systems, keep, problem.fraction, layout) for keep in selections)
+        found = [_sparse_spectrum(own, layout, coordinates) for own in blocks]
+        spectra = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    else:
+        combined = lambda keep: reduce(_combine(systems, keep, problem.fraction))
+        spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), selections)
     part = lambda start, end: jax.tree.map(lambda leaf: leaf[start:end], spectra)
-    balanced = directions * scale
+    balanced = directions * coordinates.scale
     size = jnp.linalg.norm(balanced, axis=1, keepdims=True)
     return Observability(
         whole=part(0, 1),
         alone=part(1, 1 + count),
         without=part(1 + count, None),
-        named=balanced / jnp.where(size > 0, size, 1.0),
-        free=free,
+        common=balanced / jnp.where(size > 0, size, 1.0),
+        free=coordinates.free,
         landmark_information=sum(system.landmark_hessian for system in systems) * state.inverse_depth**2,
         landmark_used=_used(problem),
         terms=tuple(term.name for term in problem.terms),
         keyframes=problem.num_keyframes,
         parameters=problem.parameter_names,
     )
+
+
+def _check_large(problem: Problem, state: State) -> None:
+    """Refuse what the sparse way cannot do."""
+    asked = f"`observability` of {problem.num_keyframes} keyframes"
+    limit = f"look at a part of the map of at most {DENSE_KEYFRAMES} keyframes"
+    if problem.dense_terms:
+        names = ", ".join(f"`{term.name}`" for term in problem.dense_terms)
+        raise ValueError(
+            f"{asked} with the term {names}, which couples all of them; expected terms on edges, pairs and single "
+            f"keyframes: leave it out by `problem.without_term`, or {limit}"
+        )
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((problem, state))):
+        raise ValueError(
+            f"{asked} inside `jit` or `vmap`; expected arrays with values, since its sparse solver is not of JAX: call "
+            f"it outside, or {limit}"
+        )
+    if state.inverse_depth.dtype != jnp.float64:
+        raise ValueError(
+            f"{asked} with a `state` in {state.inverse_depth.dtype}, whose rounding errors hide what so large a map "
+            "leaves open; expected float64: set `jax_enable_x64` and pack again"
+        )
+
+
+class _Coordinates(NamedTuple):
+    """How every information is looked at."""
+
+    free: Bool[Array, " c"]
+    scale: Float[Array, " c"]
+    """`D^1/2`."""
+    common: Float[Array, "g c"]
+    """The common directions, zero where held."""
+    poses: int
+    """How many of the coordinates belong to keyframes."""
+
+
+def _linearise_each(problem: Problem, state: State) -> tuple[list[ArrowSystem], ArrowSystem, _Coordinates]:
+    """One system a term, landmarks of segments not joined yet; that of all terms, and its coordinates."""
+    ready = prepared(problem)
+    systems = [linearise(replace(ready.with_terms((term,)), fraction=None), state) for term in ready.terms]
+    everything = _combine(systems, jnp.ones(len(systems), state.inverse_depth.dtype), problem.fraction)
+    scale, free = balance(everything, dense_gradient(everything)[1]), everything.free
+    directions = jnp.where(free, common_directions(problem, state), 0.0)
+    return systems, everything, _Coordinates(free, scale, directions, lie.TANGENT * problem.num_keyframes)
+
+
+_linearise_jit = eqx.filter_jit(_linearise_each)
+
+
+@eqx.filter_jit
+def _blocks_jit(
+    systems: list[ArrowSystem], keep: Float[Array, " k"], fraction: Float[Array, "n g q"] | None, layout: SparseLayout
+) -> Blocks:
+    return reduced_blocks(_combine(systems, keep, fraction), layout)
 
 
 def _combine(
@@ -117,23 +182,49 @@ def _combine(
     return system if fraction is None else join_segments(system, fraction)
 
 
-def _spectrum(
-    information: Float[Array, "c c"],
-    free: Bool[Array, " c"],
-    scale: Float[Array, " c"],
-    directions: Float[Array, "m c"],
-) -> Spectra:
+def _spectrum(reduced: Reduced, coordinates: _Coordinates) -> Spectra:
+    information, free, scale = reduced.hessian - reduced.schur, coordinates.free, coordinates.scale
     both = free[:, None] & free[None, :]
     balanced = jnp.where(both, (information + information.T) / 2, 0.0) / scale[:, None] / scale[None, :]
     # No free direction reaches the trace: so the held ones come last, and apart.
     beyond = 2 * len(scale)
     values, vectors = jnp.linalg.eigh(balanced + jnp.diag(jnp.where(free, 0.0, beyond).astype(scale.dtype)))
     held = jnp.arange(len(scale)) >= jnp.sum(free)
+    along = jnp.einsum("gc,cd,gd->g", coordinates.common, information, coordinates.common)
     return Spectra(
         values=jnp.where(held, jnp.inf, values),
         vectors=vectors,
-        along=jnp.maximum(jnp.einsum("mc,cd,md->m", directions, information, directions), 0.0),
+        along=_along_all(along, jnp.diagonal(information), coordinates),
     )
+
+
+def _sparse_spectrum(blocks: Blocks, layout: SparseLayout, coordinates: _Coordinates) -> Spectra:
+    """The same of sparse blocks, for the weakest directions only."""
+    information, common = sparse_matrix(blocks, layout), np.asarray(coordinates.common)
+    if not np.all(np.isfinite(information.data)):
+        raise ValueError(
+            "the information at `state` has entries that are NaN or infinite; expected finite poses, intrinsics and "
+            "inverse depths: give the state of a solution that converged"
+        )
+    free = np.nonzero(coordinates.free)[0]
+    scaled = sp.diags_array(1 / np.asarray(coordinates.scale)[free])
+    values, found = weakest(scaled @ information[free][:, free] @ scaled, KEPT)
+    vectors = np.zeros((len(coordinates.free), len(values)))
+    vectors[free] = found
+    along = np.sum(common * (information @ common.T).T, 1)
+    return Spectra(
+        values=jnp.asarray(values),
+        vectors=jnp.asarray(vectors),
+        along=_along_all(jnp.asarray(along), jnp.asarray(information.diagonal()), coordinates),
+    )
+
+
+def _along_all(
+    common: Float[Array, " g"], diagonal: Float[Array, " c"], coordinates: _Coordinates
+) -> Float[Array, " m"]:
+    """`d' S d` of all named directions: a coordinate of a keyframe has its entry of the diagonal."""
+    single = jnp.where(coordinates.free, diagonal, 0.0)[: coordinates.poses]
+    return jnp.maximum(jnp.concatenate([common, single]), 0.0)
 
 
 def _used(problem: Problem) -> Bool[Array, "n s"]:

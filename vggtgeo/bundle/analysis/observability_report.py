@@ -10,17 +10,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.analysis.directions import direction_names
+from vggtgeo.geometry import lie
 from vggtgeo.solvers.local_inverse import rank_tolerance
 
 WEAK = 1e-6
 """Eigenvalue below which a direction is weak: its standard deviation is a thousand times what it were if all else were
-known. Well-posed windows lie above 1e-4 (tests/test_observability.py)."""
+known. Well-posed windows lie above 1e-4 (tests/test_observability.py); the longer a chain, the weaker its bending: a
+sound loop of 80 keyframes has 9e-5, of 400 6e-7, of 1,000 2e-8."""
 ALIGNED = 0.9
 """Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""
 NEW = 0.1
 """Squared part of a named direction that must lie outside what was named before it."""
 WEAK_LANDMARK = 1.0
 """`V d^2` below which a landmark counts as undetermined: known to no better than 100 % of its inverse depth."""
+ROUNDING_SIZE = 1800
+"""Coordinates up to which rounding errors of the eigenvalues are taken to grow: 300 keyframes."""
 SHOWN = 12
 """Weak directions spelled out in a report; the rest are counted."""
 
@@ -28,9 +32,10 @@ SHOWN = 12
 class Spectra(eqx.Module):
     """Eigenvalues of balanced information matrices, one a selection of factors."""
 
-    values: Float[Array, "*k c"]
-    """Ascending; infinite for held coordinates, which come last."""
-    vectors: Float[Array, "*k c c"]
+    values: Float[Array, "*k v"]
+    """Ascending: all `v = c`, infinite for held coordinates, which come last. Above 300 keyframes the `v = 24` smallest
+    of the free ones."""
+    vectors: Float[Array, "*k c v"]
     """Columns, in balanced coordinates `D^1/2 x`."""
     along: Float[Array, "*k m"]
     """`d' S d` for each named direction: per m^2, rad^2, pixel^2, or per 100 % of scale or focal length."""
@@ -54,8 +59,9 @@ class Observability(eqx.Module):
     """Each term alone."""
     without: Spectra
     """All terms but each one."""
-    named: Float[Array, "m c"]
-    """The named directions in balanced coordinates, unit length; zero where held. Names: `direction_names()`."""
+    common: Float[Array, "g c"]
+    """The global ones of the named directions in balanced coordinates, unit length; zero where held. The others are the
+    keyframes' coordinates themselves. Names: `direction_names()`."""
     free: Bool[Array, " c"]
     landmark_information: Float[Array, "n s"]
     """`V d^2`: 1 / (relative variance of the inverse depth if poses and intrinsics were known)."""
@@ -68,7 +74,7 @@ class Observability(eqx.Module):
     """Names of the cameras' parameters."""
 
     def direction_names(self) -> tuple[str, ...]:
-        """Names of the rows of `named`."""
+        """Names of the directions of `along`: the rows of `common`, then six a keyframe."""
         return direction_names(self.keyframes, self.parameters)
 
     def report(self) -> str:
@@ -78,7 +84,8 @@ class Observability(eqx.Module):
     def to_dict(self) -> dict[str, Any]:
         """The findings as plain values (outside `jit`, for one problem): counts, eigenvalues, names of the weak
         directions with all factors and without each kind, and the share of the information about each named direction
-        that would be lost without each kind.
+        that would be lost without each kind. Above 300 keyframes only the 24 smallest eigenvalues are listed; where all
+        of them are weak, there may be more weak directions.
         """
         return as_dict(self)
 
@@ -114,30 +121,49 @@ class WeakDirection:
 
 
 def weak_directions(found: Observability, without: str | None = None) -> list[WeakDirection]:
-    """Directions weaker than `WEAK` by all terms, or by all but one (a name of `found.terms`), the best named first.
+    """Directions weaker than `WEAK` by all terms, or by all but one (a name of `found.terms`): the undetermined ones
+    first, of each kind the best named first.
 
     A weak subspace has no eigenvectors of its own, so it is taken apart by names: the first name of
     `direction_names` (the global motions come first) that lies in it is taken out of it, then the next that also lies
-    in it and says something new, and so on; what is left in the end goes by the nearest name.
+    in it and says something new, and so on; what is left in the end goes by the nearest name. What is undetermined is
+    taken apart by itself: in a large map, mixed with what is merely weak, it would not show.
     """
     spectra, row = (found.whole, 0) if without is None else (found.without, _index_of(found, without))
     values, vectors = np.asarray(spectra.values[row], float), np.asarray(spectra.vectors[row], float)
-    floor = undetermined_below(len(values), spectra.values.dtype)
-    weak = values < max(WEAK, floor)
-    names, named = found.direction_names(), np.asarray(found.named, float)
-    basis, sizes = vectors[:, weak], np.maximum(values[weak], 0.0)
-    within, rest = np.sum((named @ basis) ** 2, 1), np.eye(basis.shape[1])
+    floor = undetermined_below(len(found.free), spectra.values.dtype)
+    lost, weak = values < floor, (values >= floor) & (values < WEAK)
+    return [
+        *_taken_apart(found, vectors[:, lost], values[lost], determined=False),
+        *_taken_apart(found, vectors[:, weak], values[weak], determined=True),
+    ]
+
+
+def _taken_apart(
+    found: Observability, basis: Float[np.ndarray, "c w"], values: Float[np.ndarray, " w"], determined: bool
+) -> list[WeakDirection]:
+    """One named direction for each dimension of a subspace of eigenvectors."""
+    names, parts = found.direction_names(), _named_parts(found, basis)
+    within, rest = np.sum(parts**2, 1), np.eye(parts.shape[1])
     result = []
-    for _ in range(basis.shape[1]):
-        new = np.sum((named @ basis @ rest) ** 2, 1)
+    for _ in range(parts.shape[1]):
+        new = np.sum((parts @ rest) ** 2, 1)
         aligned = np.nonzero((within >= ALIGNED) & (new >= NEW))[0]
         best = int(aligned[0]) if len(aligned) else int(np.argmax(new))
-        part = rest @ rest.T @ basis.T @ named[best]
+        part = rest @ rest.T @ parts[best]
         part /= np.linalg.norm(part)
-        value = float(part**2 @ sizes)
-        result.append(WeakDirection(names[best], value, float(within[best]), value >= floor))
+        result.append(
+            WeakDirection(names[best], float(part**2 @ np.maximum(values, 0.0)), float(within[best]), determined)
+        )
         rest = rest @ _complement(rest.T @ part)
     return result
+
+
+def _named_parts(found: Observability, basis: Float[np.ndarray, "c w"]) -> Float[np.ndarray, "m w"]:
+    """The named directions in a subspace's own coordinates."""
+    poses = lie.TANGENT * found.keyframes
+    single = np.where(np.asarray(found.free)[:poses, None], basis[:poses], 0.0)
+    return np.concatenate([np.asarray(found.common, float) @ basis, single])
 
 
 def undetermined_landmarks(found: Observability) -> tuple[int, int]:
@@ -154,13 +180,13 @@ def report(found: Observability) -> str:
     lines = [
         f"Observability of {found.keyframes} keyframes: {free} coordinates free, {size - free} held",
         f"weakest eigenvalues: {'  '.join(f'{max(value, 0):.1e}' for value in values[:6])}",
-        f"weak directions: {_spell(weak_directions(found), free)}",
+        f"weak directions: {_spell(weak_directions(found), found)}",
         f"inverse depths in use: {used}, undetermined even with all else known: {lost}",
     ]
     for kind in found.terms:
         weak = weak_directions(found, kind)
-        more = len(weak) > len(weak_directions(found))
-        lines.append(f"weak without {kind}: {_spell(weak, free) if more else 'no more than with all'}")
+        more = _counts(weak) != _counts(weak_directions(found)) or _more_unknown(weak, found)
+        lines.append(f"weak without {kind}: {_spell(weak, found) if more else 'no more than with all'}")
     return "\n".join([*lines, "", *_table(found)])
 
 
@@ -187,20 +213,26 @@ def lost_shares(found: Observability) -> dict[str, dict[str, float]]:
     along, without = np.asarray(found.whole.along[0], float), np.asarray(found.without.along, float)
     shares = 1 - without / np.where(along > 0, along, 1.0)
     shares = np.where(along > 0, np.clip(shares, 0.0, 1.0), 0.0)
-    present = np.nonzero(np.any(np.asarray(found.named) != 0, 1))[0]
+    single = np.asarray(found.free)[: lie.TANGENT * found.keyframes]
+    present = np.nonzero(np.concatenate([np.any(np.asarray(found.common) != 0, 1), single]))[0]
     return {names[i]: dict(zip(found.terms, map(float, shares[:, i]), strict=True)) for i in present}
 
 
 def _table(found: Observability) -> list[str]:
-    """Information along each free named direction, and the share of it that would be lost without each kind."""
+    """Information along each free named direction, and the share of it that would be lost without each kind; of a large
+    map only along the global ones.
+    """
     names = found.direction_names()
     along = dict(zip(names, np.asarray(found.whole.along[0], float), strict=True))
-    width = max(len(name) for name in names)
+    partial = found.whole.values.shape[-1] < len(found.free)
+    listed = set(names[: len(found.common)] if partial else names)
+    width = max(map(len, listed))
     lines = [
         f"{'information along':{width}}  {'all':>9}   lost without {'  '.join(f'{kind:>7}' for kind in found.terms)}"
     ]
     for name, shares in lost_shares(found).items():
-        lines.append(f"{name:{width}}  {along[name]:9.2e}   {'':12} {_cells(shares)}")
+        if name in listed:
+            lines.append(f"{name:{width}}  {along[name]:9.2e}   {'':12} {_cells(shares)}")
     return lines
 
 
@@ -208,13 +240,27 @@ def _cells(shares: dict[str, float]) -> str:
     return "  ".join(f"{share:{max(len(kind), 7)}.0%}" for kind, share in shares.items())
 
 
-def _spell(weak: list[WeakDirection], free: int) -> str:
+def _spell(weak: list[WeakDirection], found: Observability) -> str:
+    free = int(np.sum(found.free))
     if not weak:
         return "none"
-    if len(weak) == free and not any(direction.determined for direction in weak):
+    lost, more_unknown = not any(direction.determined for direction in weak), _more_unknown(weak, found)
+    if len(weak) == free and lost:
         return f"everything ({free} directions undetermined)"
+    if lost and more_unknown:  # some of a subspace: they have no names of their own
+        return f"at least {len(weak)} directions undetermined"
     more = [f"and {len(weak) - SHOWN} more"] if len(weak) > SHOWN else []
+    more += [f"perhaps others: only the {len(weak)} weakest were computed"] if more_unknown else []
     return "; ".join([*(str(direction) for direction in weak[:SHOWN]), *more])
+
+
+def _counts(weak: list[WeakDirection]) -> tuple[int, int]:
+    return len(weak), sum(direction.determined for direction in weak)
+
+
+def _more_unknown(weak: list[WeakDirection], found: Observability) -> bool:
+    """Whether all that was computed is weak, and not all was."""
+    return len(weak) == found.whole.values.shape[-1] < int(np.sum(found.free))
 
 
 def _complement(vector: np.ndarray) -> np.ndarray:
@@ -229,5 +275,9 @@ def _index_of(found: Observability, kind: str) -> int:
 
 
 def undetermined_below(size: int, dtype: np.dtype) -> float:
-    """Eigenvalue below which a direction counts as undetermined."""
-    return rank_tolerance(size, dtype)
+    """Eigenvalue below which a direction counts as undetermined, for a map of `size` coordinates.
+
+    The tolerance grows with the size only as far as rows of the matrix do, which are sparse in a large map. It matters
+    there: an open chain of 3,000 keyframes has an eigenvalue of 6e-12 that is determined, and null ones of 3e-17.
+    """
+    return rank_tolerance(min(size, ROUNDING_SIZE), dtype)

@@ -1,0 +1,73 @@
+"""A Schur complement of any graph as sparse blocks: those of an edge or a common host, and no others.
+
+A host's landmarks couple it with its neighbours and these with each other, so a node has as many blocks in its row as
+there are nodes at most two edges away. Assembly costs what the edges and the hosts cost, whatever the size of the map.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, Int
+from vggtgeo.solvers.arrow import (
+    AbstractLayout,
+    ArrowSystem,
+    Blocks,
+    add_prior_blocks,
+    assemble_edges,
+    assemble_hosts,
+    host_products,
+)
+
+
+class SparseLayout(AbstractLayout):
+    """The blocks that a graph may fill, row by row, `[p, b, b]`; others are left."""
+
+    place: Int[Array, " p"]
+    """`row * nodes + column` of each block, ascending."""
+    nodes: int = eqx.field(static=True)
+
+    @property
+    def row(self) -> Int[Array, " p"]:
+        return self.place // self.nodes
+
+    @property
+    def column(self) -> Int[Array, " p"]:
+        return self.place % self.nodes
+
+    def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
+        return jnp.zeros((len(self.place), block, block), dtype)
+
+    def add(
+        self, stored: Array, row: Int[Array, "*t"], column: Int[Array, "*t"], value: Float[Array, "*t b b"]
+    ) -> Array:
+        at = jnp.searchsorted(self.place, row * self.nodes + column)
+        kept = (row < self.nodes) & (column < self.nodes)
+        return stored.at[jnp.where(kept, at, len(stored))].add(value, mode="drop")
+
+
+def sparse_layout(system: ArrowSystem) -> SparseLayout:
+    """The layout that holds all that `system` couples; outside `jit`. Needs integers that hold the square of `n`."""
+    nodes = len(system.graph.of_host)
+    around = np.concatenate([np.asarray(system.graph.neighbours()), np.arange(nodes)[:, None]], 1)
+    pairs = [tuple(np.broadcast_arrays(around[:, :, None], around[:, None, :]))]
+    if system.factors is not None:
+        first, second = np.asarray(system.factors.first), np.asarray(system.factors.second)
+        pairs += [(first, second), (second, first)]
+    row, column = (np.concatenate([own[side].reshape(-1) for own in pairs]).astype(np.int64) for side in (0, 1))
+    present = (row < nodes) & (column < nodes)
+    return SparseLayout(jnp.asarray(np.unique(row[present] * nodes + column[present])), nodes)
+
+
+def reduced_blocks(system: ArrowSystem, layout: SparseLayout) -> Blocks:
+    """The Schur complement `H - W V^-1 W'`, with the reduced gradient as the last shared coordinate.
+
+    The prior must be one on the shared coordinates: one that couples all nodes has no sparse blocks.
+    """
+    hessian = add_prior_blocks(assemble_edges(system, layout), system, layout)
+    schur = assemble_hosts(system, host_products(system), layout)
+    reduced: Blocks = jax.tree.map(lambda whole, taken: whole - taken, hessian, schur)
+    return reduced
