@@ -276,6 +276,23 @@ def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
     assert not any("cut, turned or scaled" in text for text in confirmed), "the images know their camera"
 
 
+def test_a_zoom_halfway_is_told() -> None:
+    """Pictures that are enlarged by 1.3 in the second half of a long walk are told as a zoom, though half of the pairs
+    fit the given camera. Oracle: the enlargement, and the frames that it was made in.
+    """
+    here = walk(240)
+    half, centre = len(here.evidence) // 2, K[2:].astype(np.float32)
+    zoomed = [
+        replace(frame, pixels=centre + np.float32(1.3) * (frame.pixels - centre)) if row >= half else frame
+        for row, frame in enumerate(here.evidence)
+    ]
+    opinion = camera_opinion(here.estimate, zoomed)
+    assert opinion is not None
+    assert opinion.better < 2 / 3
+    assert opinion.better_half > 0.9
+    assert any("was there a zoom" in f.text for f in check_camera(here.estimate, opinion, SIZE)), opinion
+
+
 def test_a_focal_length_that_few_pairs_fit_better_is_no_want(healthy: Walk) -> None:
     """A camera that is 20 % off is told, as nearly all pairs fit the right one better; what half of them fit better is
     chance, however sure the mean. Oracle: the intrinsics that the walk was made with.
@@ -286,7 +303,7 @@ def test_a_focal_length_that_few_pairs_fit_better_is_no_want(healthy: Walk) -> N
     assert opinion.better > 0.9
     told = lambda opinion: any("focal length" in f.text for f in check_camera(wrong, opinion, SIZE))
     assert told(opinion)
-    assert not told(replace(opinion, better=0.55))
+    assert not told(replace(opinion, better=0.55, better_half=0.75))
     right = camera_opinion(healthy.estimate, healthy.evidence)
     assert right is not None
     assert right.better < 2 / 3

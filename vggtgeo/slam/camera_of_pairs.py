@@ -45,13 +45,14 @@ class CameraOpinion:
     """What pairs say of the camera: log factor on the focal lengths, shift of the principal point in pixels (x, y),
     radial coefficient k1; float64 [4], zero means: as it was taken to be. covariance: float64 [4, 4] of these, from
     `blocks` independent ones. better: share of the pairs that this camera fits better than the one they began with,
-    each pose free.
+    each pose free; better_half: the same in that half of the time where it is largest.
     """
 
     value: np.ndarray
     covariance: np.ndarray
     blocks: int
     better: float = 1.0
+    better_half: float = 1.0
 
     @property
     def sigma(self) -> np.ndarray:
@@ -80,39 +81,57 @@ def camera_of_pairs(pairs: Sequence[CameraPair], intrinsics: np.ndarray) -> Came
     count = len(kinds)
     if len(pairs) < 2 * LEAST_PAIRS or count < LEAST_BLOCKS:
         return None
-    points, began = _Points.of(pairs), np.array([pair.relative for pair in pairs])
-    value, poses = np.zeros(4), began
-    prior = np.diag(1 / PRIOR**2)
+    points = _Points.of(pairs)
+    value, poses, reduced = _solved(points, intrinsics)
+    inverse = np.linalg.inv(reduced.normal.sum(0) + np.diag(1 / PRIOR**2))
+    blocks = np.zeros((count, PARAMETERS))
+    np.add.at(blocks, block, reduced.gradient)
+    # Few blocks fit themselves: the usual correction of the sandwich.
+    covariance = count / (count - PARAMETERS) * (inverse @ blocks.T @ blocks @ inverse)
+    better = _costs(points, poses, value, intrinsics) < _costs(points, points.given, np.zeros(4), intrinsics)
+    return CameraOpinion(value, covariance, count, float(np.mean(better)), _in_best_half(better, block))
+
+
+def _in_best_half(better: np.ndarray, block: np.ndarray) -> float:
+    """The largest share of `better` bool [n] in half of the blocks of time, in a row; block: int [n], from 0."""
+    found, pairs = (np.bincount(block, weights) for weights in (better, None))
+    half = (len(pairs) + 1) // 2
+    inside = lambda values: np.convolve(values, np.ones(half), "valid")
+    return float(np.max(inside(found) / inside(pairs)))
+
+
+def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray, _Reduced]:
+    """The camera, the poses, and the last step's equations."""
+    value, poses = np.zeros(4), points.given
     for _ in range(ITERATIONS):
         reduced = _reduce(points, poses, value, intrinsics)
-        inverse = np.linalg.inv(reduced.normal.sum(0) + prior)
-        step = np.clip(-inverse @ reduced.gradient.sum(0), -LONGEST_STEP, LONGEST_STEP)
+        normal = reduced.normal.sum(0) + np.diag(1 / PRIOR**2)
+        step = np.clip(-np.linalg.solve(normal, reduced.gradient.sum(0)), -LONGEST_STEP, LONGEST_STEP)
         value = value + step
         poses = _moved(poses, reduced.pose_steps(step))
         if np.all(np.abs(step) < SETTLED * LONGEST_STEP):
             break
-    blocks = np.zeros((count, PARAMETERS))
-    np.add.at(blocks, block, reduced.gradient)
-    # Few blocks fit themselves: the usual correction of the sandwich.
-    scale = count / (count - PARAMETERS)
-    better = _costs(points, poses, value, intrinsics) < _costs(points, began, np.zeros(4), intrinsics)
-    return CameraOpinion(value, scale * (inverse @ blocks.T @ blocks @ inverse), count, float(np.mean(better)))
+    return value, poses, reduced
 
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """The matches of all pairs in a row. before, after: float64 [n, 2]. depth: [n]. pair: int [n], ascending."""
+    """The matches of all pairs in a row. before, after: float64 [n, 2]. depth: [n]. pair: int [n], ascending. given:
+    float64 [pairs, 4, 4], their poses.
+    """
 
     before: np.ndarray
     after: np.ndarray
     depth: np.ndarray
     pair: np.ndarray
+    given: np.ndarray
 
     @classmethod
     def of(cls, pairs: Sequence[CameraPair]) -> _Points:
         before, after = np.concatenate([pair.before for pair in pairs]), np.concatenate([pair.after for pair in pairs])
         number = np.repeat(np.arange(len(pairs)), [len(pair.depth) for pair in pairs])
-        return cls(before, after, np.concatenate([pair.depth for pair in pairs]), number)
+        given = np.array([pair.relative for pair in pairs])
+        return cls(before, after, np.concatenate([pair.depth for pair in pairs]), number, given)
 
     def residuals(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
         """Predicted minus seen pixels float64 [n, 2]; NaN behind a camera. poses: float64 [pairs, 4, 4]."""
