@@ -22,6 +22,7 @@ from vggtgeo.slam.trust.depth_agreement import check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import EvidenceRecorder, FrameEvidence, common
+from vggtgeo.slam.trust.extent import check_extent
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude, spans
 from vggtgeo.slam.trust.input import check_input
 from vggtgeo.slam.trust.judge import judge
@@ -274,6 +275,20 @@ def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
     assert opinion is not None
     confirmed = check(healthy.estimate, opinion, (3 * width // 4, 3 * height // 4))
     assert not any("cut, turned or scaled" in text for text in confirmed), "the images know their camera"
+
+
+def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) -> None:
+    """Of free scale, places that are known to a third of their spread are told, and those known to a hundredth are not;
+    with metres it is no matter of scale. Oracle: the spread of the walk's own path.
+    """
+    free = replace(healthy.estimate, metric=False)
+    spread = float(np.sqrt(free.centres.var(0).sum()))
+    sigma = np.where(np.arange(len(free)) % 3, np.nan, spread / 3)
+    assert [f.check for f in check_extent(free, sigma)] == ["extent"]
+    assert "33 % of their spread" in check_extent(free, sigma)[0].text
+    assert check_extent(free, sigma / 33) == []
+    assert check_extent(free, None) == []
+    assert check_extent(healthy.estimate, sigma) == []
 
 
 def test_a_zoom_halfway_is_told() -> None:

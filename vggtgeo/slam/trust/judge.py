@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from vggtgeo.slam.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.blind import check_blind
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
@@ -13,6 +14,7 @@ from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence
+from vggtgeo.slam.trust.extent import check_extent
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
@@ -31,7 +33,9 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     estimate = Estimate.of(slam)
     by_frame = {noted.frame: noted for noted in evidence}
     aligned = [by_frame[frame] for frame in estimate.frames if frame in by_frame]
+    known = frame_uncertainty(slam) if slam.keyframes else None
     found = [*input_findings, *check_record(estimate), *check_speed(estimate)]
+    found += check_extent(estimate, None if known is None else known.translation)
     if estimate.started and estimate.metric:
         found += check_surfaces(slam.keyframes, estimate.intrinsics)
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
