@@ -278,7 +278,7 @@ def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
 
 
 def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) -> None:
-    """Of free scale, places that are known to a third of their spread are told, and those known to a hundredth are not;
+    """Of free scale, places that are known to a third of their spread are told, and those known to a ninth are not;
     with metres it is no matter of scale. Oracle: the spread of the walk's own path.
     """
     free = replace(healthy.estimate, metric=False)
@@ -286,7 +286,7 @@ def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) 
     sigma = np.where(np.arange(len(free)) % 3, np.nan, spread / 3)
     assert [f.check for f in check_extent(free, sigma)] == ["extent"]
     assert "33 % of their spread" in check_extent(free, sigma)[0].text
-    assert check_extent(free, sigma / 33) == []
+    assert check_extent(free, sigma / 3) == []
     assert check_extent(free, None) == []
     assert check_extent(healthy.estimate, sigma) == []
 
