@@ -103,14 +103,15 @@ def _in_best_half(better: np.ndarray, block: np.ndarray) -> float:
 def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray, _Reduced]:
     """The camera, the poses, and the last step's equations."""
     value, poses = np.zeros(4), points.given
+    reduced = _reduce(points, poses, value, intrinsics)
     for _ in range(ITERATIONS):
-        reduced = _reduce(points, poses, value, intrinsics)
         normal = reduced.normal.sum(0) + np.diag(1 / PRIOR**2)
         step = np.clip(-np.linalg.solve(normal, reduced.gradient.sum(0)), -LONGEST_STEP, LONGEST_STEP)
         value = value + step
         poses = _moved(poses, reduced.pose_steps(step))
         if np.all(np.abs(step) < SETTLED * LONGEST_STEP):
             break
+        reduced = _reduce(points, poses, value, intrinsics)
     return value, poses, reduced
 
 
