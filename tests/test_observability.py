@@ -211,6 +211,7 @@ def sparse(monkeypatch: pytest.MonkeyPatch) -> Observe:
     return observe
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("missing", OPEN)
 def test_a_large_map_is_seen_as_a_small_one(
     observed: Observe, sparse: Observe, loop: tuple[Problem, State], missing: str
@@ -240,6 +241,7 @@ def test_a_large_map_is_seen_as_a_small_one(
         assert name not in shares or shares[name] == pytest.approx(others[name], abs=1e-6)
 
 
+@pytest.mark.long
 def test_the_report_of_a_large_map(sparse: Observe, loop: tuple[Problem, State]) -> None:
     # Proves that the text says where more may be weak than was computed, leaves out the table of single keyframes,
     # and that numbers and picture hold what was computed.
