@@ -277,6 +277,24 @@ def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
     assert not any("cut, turned or scaled" in text for text in confirmed), "the images know their camera"
 
 
+def test_a_few_corners_with_depth_say_nothing_of_it(healthy: Walk) -> None:
+    """Where a sensor sees nearly nothing, the few depths that two frames share are those of its border: off by half in
+    every other frame they are not held against it, and many are. Oracle: how many corners were left their depth.
+    """
+
+    def seen(count: int) -> list[FrameEvidence]:
+        kept = lambda frame: np.where(np.arange(len(frame.ids)) < count, frame.depth, np.nan)
+        factors = (1.0, 1.5)
+        return [
+            replace(frame, depth=(factors[row % 2] * kept(frame)).astype(np.float32))
+            for row, frame in enumerate(healthy.evidence)
+        ]
+
+    told = lambda evidence: "depth and depth" in [f.check for f in _depth(healthy.estimate, evidence)]
+    assert told(seen(len(healthy.evidence[0].ids)))
+    assert not told(seen(6))
+
+
 def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) -> None:
     """Of free scale, places that are known to a third of their spread are told, and those known to a ninth are not;
     with metres it is no matter of scale. Oracle: the spread of the walk's own path.

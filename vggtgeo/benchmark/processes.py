@@ -49,7 +49,7 @@ class Ending:
     def message(self) -> str:
         """The ending in words."""
         if self.status == "timeout":
-            return f"took longer than {self.seconds:.0f} s"
+            return f"took too long: ended after {self.seconds:.1f} s"
         if self.status == "memory":
             return f"took more than its share of memory: {self.peak_gb:.1f} GB"
         if self.code < 0:
