@@ -22,6 +22,7 @@ from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.loops import close_loops
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import RgbdView
@@ -57,7 +58,8 @@ def run(
         clock: adds up seconds by stage.
 
     Yields:
-        The state: poses are world -> camera, lengths metres where `metric`. `vggtgeo.finish` adjusts the last one as a
+        The state: poses are world -> camera, lengths metres where `metric`. The newest keyframe's window is adjusted
+        beside tracking, and its result is in the state a few frames later. `vggtgeo.finish` adjusts the last one as a
         whole, `vggtgeo.Result.of` makes trajectory and map of one.
 
     Example:
@@ -105,7 +107,7 @@ def finish(
         Slam(1 frame, 1 keyframe, tracking)
 
     """
-    roles, settings = roles or default_roles(slam.metric), settings or SlamSettings()
+    slam, roles, settings = settled(slam), roles or default_roles(slam.metric), settings or SlamSettings()
     if not settings.refinement.global_adjustment or len(slam.keyframes) < 3:
         return slam
     clock = clock or Clock()
