@@ -5,8 +5,9 @@ BIN     := $(VENV)/bin
 READY   := $(VENV)/.ready
 OUT     ?= runs/demo
 WORKERS ?= 2
+COUNT   ?= 2000
 
-.PHONY: help venv demo test test-long test-slow lint types format lock clean
+.PHONY: help venv demo test test-long test-slow fuzz lint types format lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,6 +32,10 @@ test-long: $(READY)  ## run the tests that compile for long: derivatives, whole 
 
 test-slow: $(READY)  ## run the slow tests: real clips, long sequences
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+fuzz: $(READY)  ## try COUNT=2000 random problems, geometries and damaged files of each kind, others than the tests do
+	VGGTGEO_FUZZ=$(COUNT) $(BIN)/python -m pytest -m "not slow" $(or $(ARGS),tests/test_properties.py \
+		tests/test_geometry_properties.py tests/test_mutated_files.py)
 
 lint: $(READY)  ## check format, style and types
 	$(BIN)/ruff format --check .

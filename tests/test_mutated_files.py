@@ -1,12 +1,11 @@
 """Every parser on files that were damaged at random: it reads them, or says in a sentence why not; nothing else.
 
-`VGGTGEO_FUZZ=20000 make test ARGS=tests/test_mutated_files.py` runs so many of each kind; a finding becomes a row of
+`make fuzz COUNT=20000 ARGS=tests/test_mutated_files.py` runs so many of each kind; a finding becomes a row of
 docs/bad-inputs.md.
 """
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import numpy as np
 import pytest
 import tiny_sequences as tiny
 import tomli_w
+from campaign import COUNT
 
 from vggtgeo.bundle.problem_file import load_problem
 from vggtgeo.cli.settings_file import _read as read_settings
@@ -31,7 +31,6 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.results import Result
 
-COUNT = int(os.environ.get("VGGTGEO_FUZZ", "0"))
 WORDS = (b"nan", b"inf", b"-1", b"1e400", b"99999999999999999999", b"\0", b"\xff\xfe", b"\n", b",", b"[", b"{", b'"')
 
 
