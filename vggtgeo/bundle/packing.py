@@ -113,8 +113,8 @@ def pack(
     check_positive("inverse_depth", inverse_depth, len(observations.host))
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
     check_terms(terms, observations, len(poses))
-    start = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
-    check_precision({**vars(observations), **start, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
+    guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
+    check_precision({**vars(observations), **guess, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
     size, graph, index = _layout(observations, len(poses), size)
     padding = size.keyframes - len(poses)
     fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
