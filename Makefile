@@ -5,8 +5,11 @@ BIN     := $(VENV)/bin
 READY   := $(VENV)/.ready
 OUT     ?= runs/demo
 WORKERS ?= 2
+COUNT   ?= 2000
+TIME    ?= 60
+LOWEST  := .cache/lowest
 
-.PHONY: help venv demo test test-long test-slow lint types format lock clean
+.PHONY: help venv demo test test-long test-slow test-lowest fuzz fuzz-parsers audit sbom lint types format lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,6 +34,30 @@ test-long: $(READY)  ## run the tests that compile for long: derivatives, whole 
 
 test-slow: $(READY)  ## run the slow tests: real clips, long sequences
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+fuzz: $(READY)  ## try COUNT=2000 random problems, geometries and damaged files of each kind, others than the tests do
+	VGGTGEO_FUZZ=$(COUNT) $(BIN)/python -m pytest -m "not slow" $(or $(ARGS),tests/test_properties.py \
+		tests/test_geometry_properties.py tests/test_mutated_files.py)
+
+fuzz-parsers: $(READY)  ## fuzz each parser for TIME=60 seconds, guided by coverage (Linux); ARGS='"EuRoC camera" problem' for some
+	$(BIN)/python -m pip install --quiet "atheris>=3"
+	$(BIN)/python tests/fuzz_parsers.py --seconds $(TIME) $(ARGS)
+
+# Newer packages below ours warn of what older ones of ours do: those warnings are not what is asked here.
+test-lowest: $(READY)  ## test the core with the lowest versions that pyproject.toml allows, in an environment of its own
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv venv --quiet --clear --python $(PYTHON) $(LOWEST)
+	$(BIN)/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct --editable ".[dev]"
+	$(LOWEST)/bin/python -m pytest -o filterwarnings=ignore $(or $(ARGS),tests/test_packing.py tests/test_solve.py \
+		tests/test_properties.py tests/test_report.py tests/test_point_cloud.py tests/test_plots.py tests/test_settings_file.py)
+
+audit: $(READY)  ## ask a public database for known vulnerabilities of what requirements.lock holds (network)
+	$(BIN)/python -m pip install --quiet "pip-audit>=2.7"
+	$(BIN)/pip-audit --requirement requirements.lock --require-hashes --disable-pip
+
+sbom: $(READY)  ## write sbom.json, a bill of materials (CycloneDX) of requirements.lock; asks nobody
+	$(BIN)/python -m pip install --quiet "cyclonedx-bom>=5"
+	$(BIN)/cyclonedx-py requirements --output-file sbom.json requirements.lock
 
 lint: $(READY)  ## check format, style and types
 	$(BIN)/ruff format --check .

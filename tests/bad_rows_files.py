@@ -270,6 +270,7 @@ PROBLEMS = rows(
         ("intrinsics with NaN", bad.problem(k_init=bad.put(0, np.nan))),
         ("a negative focal length", bad.problem(k_init=bad.put(0, -500.0))),
         ("a prior's deviation that is zero", bad.problem(k_prior_sigma=bad.put(0, 0.0))),
+        ("a prior's deviation whose square is zero", bad.problem(k_prior_sigma=bad.put(0, 1e-200))),
         ("a depth that is negative", bad.problem(d_init=bad.put(0, -1.0))),
         ("a depth that is NaN", bad.problem(d_init=bad.put(0, np.nan))),
         ("a depth prior that is NaN", bad.problem(d_prior=bad.put(0, np.nan))),

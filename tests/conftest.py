@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Most of the tests' time is compilation of what then runs on tiny arrays. Compiling `solve` takes 8.7 s with XLA's own
@@ -98,6 +99,14 @@ def shared_data() -> Path:
 def shared_bench() -> Path:
     """The folder of the benchmark problems and their numpy oracle (`problems.py`), or a skip."""
     return _shared("bench")
+
+
+@pytest.fixture(scope="session")
+def healthy() -> Any:
+    """A synthetic walk that no check of the verdict has anything to say of."""
+    from witness import walk  # after the hook above
+
+    return walk()
 
 
 @pytest.fixture

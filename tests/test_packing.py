@@ -180,6 +180,24 @@ def test_wrong_lists_are_refused_by_name() -> None:
             scene.pack()
 
 
+def test_numbers_beyond_the_precision_are_refused_by_name() -> None:
+    # Proves that single precision makes no infinity of a finite number, and no zero of a positive one, which used to
+    # end in a warning of numpy and an energy that is not finite; double precision takes both. Oracle: the message.
+    seen = SCENE.observations
+    far, sharp, turned = seen.point_target.copy(), seen.depth_sigma.copy(), SCENE.start_poses.copy()
+    far[3, 1], sharp[2], turned[1, 5] = 1e39, 1e-50, -1e60
+    cases = [
+        (bad(point_target=far), r"`point_target\[3, 1\]` is 1e\+39; float32 holds numbers from 1.2e-38 to 3.4e\+38"),
+        (bad(depth_sigma=sharp), r"`depth_sigma\[2\]` is 1e-50; float32"),
+        (bad(alpha=1e50), "`alpha` is 1e\\+50; float32"),
+        (replace(SCENE, start_poses=turned), r"`poses\[1, 5\]` is -1e\+60; float32"),
+    ]
+    for scene, message in cases:
+        scene.pack()
+        with pytest.raises(InputError, match=message):
+            scene.pack(dtype=np.float32)
+
+
 @pytest.mark.parametrize("name", ["keyframes", "points", "lines", "degree", "edges"])
 def test_a_size_that_is_too_small_is_refused(name: str) -> None:
     # Proves that nothing is cut off silently: the error names the size and what is needed.
@@ -195,6 +213,9 @@ def test_a_size_that_is_too_small_is_refused(name: str) -> None:
         ({"intrinsics_mean": np.ones(3)}, r"`intrinsics_mean` is \[1. 1. 1.\]; expected 4 finite numbers"),
         ({"intrinsics_mean": np.full(4, np.nan)}, "expected 4 finite numbers"),
         ({"intrinsics_sigma": np.nan}, "`intrinsics_sigma` is nan; it must be positive"),
+        ({"intrinsics_sigma": 1e-200}, r"`intrinsics_sigma` is 1e-200; 1 / sigma\^2 is beyond the numbers of float64"),
+        ({"intrinsics_sigma": 1e-30, "dtype": np.float32}, "is 1e-30; .* of float32: give a larger one, or hold the"),
+        ({"kernel": Huber(jnp.asarray(1e-50)), "dtype": np.float32}, "`kernel.delta` is 1e-50; float32 holds numbers"),
         ({"fixed_intrinsics": 1}, "`fixed_intrinsics` is 1; expected True, False, or 4 of them"),
         ({"fixed_intrinsics": [True, False]}, "expected True, False, or 4 of them"),
         ({"kernel": "huber"}, "`kernel` is 'huber'; expected a kernel object"),

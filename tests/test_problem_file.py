@@ -1,6 +1,7 @@
 """Problem and solution files: what is written is what is read, and the energy is the one the layout defines."""
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -11,7 +12,7 @@ from scenes import INTRINSICS, Scene, make_scene
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import energy
-from vggtgeo.bundle.problem_file import LAYOUT, load_problem, save_solution
+from vggtgeo.bundle.problem_file import LAYOUT, load_problem, save_problem, save_solution
 from vggtgeo.io.errors import InputError
 
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05, seed=7)
@@ -87,6 +88,23 @@ def test_what_is_no_problem_file(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(InputError, match=name):
             load_problem(write(tmp_path, **{name: value}))
+
+
+def test_numbers_beyond_single_precision_are_refused(tmp_path: Path) -> None:
+    # Proves that either layout, read in single precision, is refused by name where a number does not fit, without a
+    # warning of numpy. Oracle: the message; double precision reads it.
+    far = np.array(SCENE.start_poses)
+    far[1, 4] = 1e60
+    for changes in ({"huber": np.float64(1e-50)}, {"T_init": far}):
+        file = write(tmp_path, **changes)
+        load_problem(file)
+        with pytest.raises(InputError, match=r"problem.npz`: `(huber|poses\[1, 4\])` is .*; float32 holds numbers"):
+            load_problem(file, np.float32)
+    saved = tmp_path / "saved.npz"
+    save_problem(saved, *replace(SCENE, start_poses=far).pack())
+    load_problem(saved)
+    with pytest.raises(InputError, match="`state/poses` has values that are not finite"):
+        load_problem(saved, np.float32)
 
 
 def test_a_solution_is_written_in_the_file_s_order(tmp_path: Path) -> None:

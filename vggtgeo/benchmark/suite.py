@@ -244,7 +244,7 @@ def read_suite(text: str, name: str, where: str) -> Suite:
     """The suite in the TOML `text`."""
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # numbers of too many digits and too many brackets are neither
         raise InputError(f"{where} is no TOML: {error}") from None
     kinds: tuple[tuple[str, type[CheckedTable]], ...] = (
         ("sequence", SequenceTable),

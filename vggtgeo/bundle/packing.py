@@ -32,6 +32,7 @@ from vggtgeo.bundle.packing_checks import (
     check_size,
 )
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex, assign_slots, pad_edges, sort_edges
+from vggtgeo.bundle.precision import check_precision, weight_of
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.term_checks import check_terms
 from vggtgeo.bundle.term_padding import padded, placed
@@ -43,6 +44,9 @@ from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
+
+POSITIVE = ("depth_mean", "depth_sigma", "inverse_depth", "kernel.delta")
+"""What must not be zero in the precision of the problem."""
 
 
 def pack(
@@ -102,16 +106,18 @@ def pack(
     dtype = jnp.result_type(float) if dtype is None else dtype
     observations, poses = _as_arrays(observations), as_poses(poses)
     intrinsics, inverse_depth = as_numbers("intrinsics", intrinsics), as_numbers("inverse_depth", inverse_depth)
+    mean = intrinsics if intrinsics_mean is None else as_numbers("intrinsics_mean", intrinsics_mean)
     camera_of = None if camera_of is None else as_numbers("camera_of", camera_of)
     check_kernel("kernel", kernel)
     check_observations(observations, poses)
     check_positive("inverse_depth", inverse_depth, len(observations.host))
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
     check_terms(terms, observations, len(poses))
+    guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
+    check_precision({**vars(observations), **guess, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
     size, graph, index = _layout(observations, len(poses), size)
     padding = size.keyframes - len(poses)
     fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
-    mean = intrinsics if intrinsics_mean is None else as_numbers("intrinsics_mean", intrinsics_mean)
     prior = _intrinsics_prior(mean, intrinsics_sigma, intrinsics.shape, dtype)
     seen = _seen(observations, index, size, kernel or Cauchy(jnp.asarray(1.5, dtype)), dtype)
     problem = Problem(
@@ -180,7 +186,7 @@ def _seen(
 
 def _intrinsics_prior(mean: np.ndarray, sigma: Any, shape: tuple[int, ...], dtype: DTypeLike) -> IntrinsicsPrior:
     check_intrinsics_prior(mean, sigma, shape)
-    weight = np.zeros(mean.shape) if sigma is None else 1 / np.square(np.broadcast_to(sigma, mean.shape))
+    weight = np.zeros(mean.shape) if sigma is None else np.broadcast_to(weight_of(sigma, dtype), mean.shape)
     return IntrinsicsPrior(
         index=jnp.arange(mean.size), mean=jnp.asarray(mean.ravel(), dtype), weight=jnp.asarray(weight.ravel(), dtype)
     )

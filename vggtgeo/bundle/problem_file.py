@@ -15,6 +15,7 @@ from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.observed import check_tied
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
+from vggtgeo.bundle.precision import check_precision
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.saved_modules import check_problem, describe, restore
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
@@ -94,9 +95,10 @@ def load_problem(
     )
     if not arrays["huber"] > 0:
         raise InputError(f"array `huber` of `{path}` is {arrays['huber']}; it must be positive")
-    kernel = Huber(jnp.asarray(float(arrays["huber"]), dtype))
     start = arrays["T_init"], arrays["k_init"], arrays["d_init"]
     try:
+        check_precision({"huber": arrays["huber"]}, dtype, positive=("huber",))
+        kernel = Huber(jnp.asarray(float(arrays["huber"]), dtype))
         packed = pack(observations, *start, intrinsics_sigma=arrays["k_prior_sigma"], kernel=kernel, dtype=dtype)
         check_tied(observations, len(arrays["T_init"]))
     except InputError as error:

@@ -67,7 +67,8 @@ def restore(
         if content not in arrays:
             raise InputError(f"the array `{content}` is missing")
         values = arrays[content]
-        return jnp.asarray(values, dtype if np.issubdtype(values.dtype, np.floating) else None)
+        with np.errstate(over="ignore"):  # what single precision cannot hold becomes infinite, and is refused as such
+            return jnp.asarray(values, dtype if np.issubdtype(values.dtype, np.floating) else None)
     if kind == "value":
         return content
     if kind in ("list", "tuple"):

@@ -17,6 +17,8 @@ from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
+_MOST_DIGITS = 20
+"""Of a time in nanoseconds, with room; Python refuses to read numbers of thousands."""
 _TRUTH = ("state_groundtruth_estimate0", "leica0", "vicon0")
 
 
@@ -61,7 +63,7 @@ class Euroc(FolderSequence):
         if rows.shape[1] < 8:
             raise InputError(f"`{file}` has {rows.shape[1]} columns; expected a time, a position and a quaternion")
         body = poses_of(rows[:, 1:4], rows[:, [5, 6, 7, 4]])  # w first in the file
-        extrinsics = np.reshape(yaml_numbers(self.folder / "cam0" / "sensor.yaml", "data"), (4, 4))
+        extrinsics = np.reshape(yaml_numbers(self.folder / "cam0" / "sensor.yaml", "data", 16), (4, 4))
         return trajectory_of(rows[:, 0] * 1e-9, body @ extrinsics, file)
 
 
@@ -76,7 +78,7 @@ def _images(file: Path) -> list[tuple[float, str]]:
         if not text:
             continue
         time, _, name = text.partition(",")
-        if not time.strip().isdigit():
+        if not time.strip().isdecimal() or len(time) > _MOST_DIGITS:
             raise InputError(f"`{file}`, line {number}: found {text[:60]!r}; expected `nanoseconds,file`")
         entries.append((int(time) * 1e-9, name.strip() or f"{time.strip()}.png"))
     return entries

@@ -26,6 +26,8 @@ def defect(content: bytes) -> str:
         return "is empty"
     if content.startswith(b"\x89PNG") and content.rfind(b"IEND") < 0:
         return "is cut off: the PNG has no end"
+    if content.startswith(b"\x89PNG") and not _chunks_fit(content):
+        return "is damaged: a part of the PNG declares more bytes than the file has"
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9") < _start_of_scan(content):
         return "is cut off: the JPEG has no end"
     if _lacks_scans(content):
@@ -74,6 +76,19 @@ def declared_size(content: bytes) -> tuple[int, int]:
             height, width = struct.unpack(">HH", part[1:5])
             return width, height
     return 0, 0
+
+
+def _chunks_fit(content: bytes) -> bool:
+    """Whether each chunk of a PNG up to its end lies in the file: the decoder takes memory for what one declares."""
+    position = 8
+    while position + 8 <= len(content):
+        length, kind = struct.unpack_from(">I4s", content, position)
+        if position + 12 + length > len(content):
+            return False
+        if kind == b"IEND":
+            return True
+        position += 12 + length
+    return False
 
 
 def _segments(content: bytes) -> list[tuple[int, bytes]]:

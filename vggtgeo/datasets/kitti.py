@@ -14,7 +14,7 @@ from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import natural_key
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
-from vggtgeo.datasets.pose_files import read_matrices, trajectory_of
+from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_intrinsics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -71,14 +71,23 @@ def _times(folder: Path, place: Path, count: int) -> list[float]:
     if seconds.is_file():
         times = read_matrices(seconds, 1)[:, 0].tolist()
     elif (stamps := place.parent / "timestamps.txt").is_file():
-        lines = [line.strip() for line in stamps.read_text(encoding="utf-8").splitlines() if line.strip()]
-        moments = [datetime.fromisoformat(line[:26]) for line in lines]
-        times = [(moment - moments[0]).total_seconds() for moment in moments]
+        times = _moments(stamps)
     else:
         return [index / RATE for index in range(count)]
     if len(times) < count:
         raise InputError(f"`{folder}` has {count} images and {len(times)} times")
     return times
+
+
+def _moments(file: Path) -> list[float]:
+    """Seconds since the first line's time."""
+    text = file.read_text(encoding="utf-8", errors="replace")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    try:
+        moments = [datetime.fromisoformat(line[:26]) for line in lines]
+        return [(moment - moments[0]).total_seconds() for moment in moments]
+    except (ValueError, TypeError) as error:  # a time with a zone, and one without, have no difference
+        raise InputError(f"`{file}`: {error}; expected lines `2011-09-26 13:02:25.594360389`") from None
 
 
 def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, float]:
@@ -88,11 +97,11 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
         folder / "calib_cam_to_cam.txt",
         folder.resolve().parent / "calib_cam_to_cam.txt",
     ):
-        lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+        lines = file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
         for line in lines:
             key, _, rest = line.partition(":")
             if key.strip() in _LINES[name]:
-                values = [float(word) for word in rest.split()]
+                values = numbers_of(rest.split(), f"`{file}`: `{key}`")
                 if len(values) != 12:
                     raise InputError(f"`{file}`: `{key}` has {len(values)} numbers; expected 12")
                 intrinsics = check_intrinsics((values[0], values[5], values[2], values[6]))

@@ -10,6 +10,7 @@ from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import ImageFolder
+from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
@@ -77,6 +78,8 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
     if kind == "live" or (kind is None and is_live(os.fspath(path))):
         return LiveCamera.open(os.fspath(path))
     sequence = _open_place(Path(path).expanduser(), kind)
+    if sequence.camera.known:
+        check_plausible(f"the camera of `{os.fspath(path)}`", sequence.camera)
     return sequence if rate is None else with_rate(sequence, rate)
 
 

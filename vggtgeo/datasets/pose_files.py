@@ -58,29 +58,44 @@ def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where:
 
 
 def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
-    """Matrices of positions [n, 3] and quaternions [n, 4], x y z w."""
+    """Matrices of positions [n, 3] and quaternions [n, 4], x y z w; NaN where a quaternion is no rotation."""
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    turned = (length > 0) & np.isfinite(length)
+    rotations = Rotation.from_quat(np.where(turned, quaternions, [0.0, 0.0, 0.0, 1.0])).as_matrix()
+    poses[:, :3, :3] = np.where(turned[..., None], rotations, np.nan)
     poses[:, :3, 3] = positions
     return poses
 
 
-def yaml_numbers(file: Path, key: str) -> list[float]:
-    """The list of numbers after `key:` in a YAML file as the benchmarks write them: `key: [1, 2, 3]`."""
+def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
+    """The list of numbers after `key:` in a YAML file as the benchmarks write them: `key: [1, 2, 3]`.
+
+    InputError where it is not there, or has not `count` of them (None: any count will do).
+    """
     found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", _text(file), re.MULTILINE)
     if found is None:
         raise InputError(f"`{file}` has no list `{key}: [...]`")
+    words = found.group(1).replace(",", " ").split()
+    if count is not None and len(words) != count:
+        raise InputError(f"`{file}`: `{key}` has {len(words)} numbers; expected {count}")
+    return numbers_of(words, f"`{file}`: `{key}`")
+
+
+def numbers_of(words: Sequence[str], what: str) -> list[float]:
+    """Words as numbers; what: they are, for the InputError where one is none."""
     try:
-        return [float(word) for word in found.group(1).replace(",", " ").split()]
+        return [float(word) for word in words]
     except ValueError:
-        raise InputError(f"`{file}`: `{key}` is {found.group(1)!r}; expected numbers") from None
+        raise InputError(f"{what} is {' '.join(words)[:60]!r}; expected numbers") from None
 
 
 def read_json(file: Path) -> Any:
     """The content of a JSON file; InputError where it is none."""
     try:
         return json.loads(_text(file))
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:  # numbers of too many digits and too many brackets are neither
         raise InputError(f"`{file}` is no JSON: {error}") from None
 
 

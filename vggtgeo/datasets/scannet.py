@@ -12,9 +12,10 @@ from typing import Self
 import cv2
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
+from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_intrinsics
 from vggtgeo.geometry.trajectory import Trajectory
@@ -46,6 +47,8 @@ class ScanNet(FolderSequence):
         )
         colour, depth = (_intrinsics(folder / "intrinsic" / f"intrinsic_{name}.txt") for name in ("color", "depth"))
         width, height = _size(folder, files)
+        # An absurd ratio of the two cameras would make a filter of any width.
+        check_plausible(f"`{folder}/intrinsic/intrinsic_color.txt`", Camera(colour, *common_size(str(folder), files)))
         has_depth = any(file.depth is not None for file in files)
         camera = Camera(depth, width, height)
         return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour)

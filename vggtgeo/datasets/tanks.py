@@ -71,8 +71,8 @@ def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray
     try:
         axis = "XYZ".index(crop["orthogonal_axis"].upper())
         low, high = float(crop["axis_min"]), float(crop["axis_max"])
-        polygon = np.array(crop["bounding_polygon"], np.float64)
-    except (KeyError, ValueError, AttributeError) as error:
+        polygon = np.array(crop["bounding_polygon"], np.float64).reshape(-1, 3)
+    except (KeyError, ValueError, AttributeError, TypeError) as error:
         raise InputError(
             f"`{file}`: expected orthogonal_axis, axis_min, axis_max, bounding_polygon ({error!r})"
         ) from None

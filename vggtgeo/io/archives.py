@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -24,7 +25,7 @@ MOST_BYTES = 2**28
 # What zipfile, zlib and numpy raise for damaged archives and headers.
 _UNREADABLE = (
     *(ValueError, OSError, EOFError, RuntimeError, NotImplementedError, OverflowError, MemoryError, SyntaxError),
-    *(TypeError, KeyError, zipfile.BadZipFile, zlib.error, struct.error),
+    *(TypeError, KeyError, zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError),
 )
 
 

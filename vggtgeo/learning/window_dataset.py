@@ -150,7 +150,7 @@ class WindowDataset:
         try:
             index = json.loads((place / _INDEX).read_text(encoding="utf-8"))
             return cls(place, int(index["windows"]), tuple(terms))
-        except (OSError, ValueError, KeyError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             raise InputError(f"`{place}` is no complete folder of windows; write one first") from None
 
     def __len__(self) -> int:

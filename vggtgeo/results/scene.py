@@ -7,7 +7,6 @@ Nothing in the file is code: it is read without pickles. `version` is that of it
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.mapping.tracks import Tracks, make_tracks
@@ -23,7 +23,21 @@ from vggtgeo.slam.state import Slam
 VERSION = 1
 QUALITY = 95
 """Of the JPEG pictures."""
-_UNREADABLE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+_LAYOUT: dict[str, tuple[int | str, ...]] = {
+    "frames": ("k",),
+    "timestamps": ("k",),
+    "poses": ("k", 4, 4),
+    "intrinsics": (4,),
+    "size": (2,),
+    "metric": (),
+    "track_points": ("n", 3),
+    "track_colours": ("n", 3),
+    "track_point": ("m",),
+    "track_view": ("m",),
+    "track_pixel": ("m", 2),
+}
+"""Shapes of the arrays: `k` keyframes, `n` points, `m` observations."""
+_WHOLE = ("frames", "size", "track_point", "track_view")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +79,16 @@ class Scene:
         """Reads `scene.npz` of a run's folder; InputError where there is none, or one of another layout."""
         path = Path(folder) / "scene.npz"
         try:
-            with path.open("rb") as handle, np.load(handle, allow_pickle=False) as data:
-                values = {name: data[name] for name in data.files}
-            if int(values.get("version", 0)) != VERSION:
-                raise InputError(f"`{path}` is of layout {values.get('version', 0)}, expected {VERSION}; run again")
-            return cls._of(values)
-        except _UNREADABLE as error:
+            return cls._of(read_archive(path, "the scene of a run", _read))
+        except InputError:
+            raise
+        except ValueError as error:
             raise InputError(f"`{path}` cannot be read ({error}); give a folder that `vggtgeo run` wrote") from None
 
     @classmethod
     def _of(cls, values: Mapping[str, np.ndarray]) -> Scene:
         count = len(values["frames"])
-        poses, (width, height) = values["poses"].reshape(count, 4, 4), values["size"]
+        poses, (width, height) = values["poses"], values["size"]
         tracks = Tracks(*(values[f"track_{name}"] for name in ("points", "colours", "point", "view", "pixel")))
         if not (len(tracks.point) == len(tracks.view) == len(tracks.pixel)):
             raise ValueError("its tracks have observations of unequal number")
@@ -84,8 +96,32 @@ class Scene:
             raise ValueError("its tracks name keyframes that are not there")
         if len(tracks.point) and not (0 <= tracks.point.min() <= tracks.point.max() < len(tracks)):
             raise ValueError("its tracks name points that are not there")
-        size, intrinsics = (int(width), int(height)), values["intrinsics"].reshape(4)
+        size, intrinsics = (int(width), int(height)), values["intrinsics"]
         return cls(values["frames"], values["timestamps"], poses, intrinsics, size, tracks, bool(values["metric"]))
+
+
+def _read(archive: Archive) -> dict[str, np.ndarray]:
+    """The arrays of the layout, and no others."""
+    version = archive.read(["version"], lambda headers: None)["version"] if "version" in archive else np.array(0)
+    if version.shape or version != VERSION:
+        raise InputError(f"`{archive.path}` is of layout {version}, expected {VERSION}; run again")
+    missing = [name for name in _LAYOUT if name not in archive]
+    if missing:
+        raise ValueError(f"it lacks the arrays {', '.join(missing)}")
+    return archive.read(_LAYOUT, _check)
+
+
+def _check(headers: Mapping[str, ArrayHeader]) -> None:
+    """Shapes that belong together, known before the arrays are read."""
+    lengths: dict[int | str, int] = {}
+    for name, layout in _LAYOUT.items():
+        found = headers[name]
+        for axis, length in zip(layout, found.shape, strict=False):
+            lengths.setdefault(axis, length if isinstance(axis, str) else axis)
+        expected = tuple(lengths.get(axis, axis) for axis in layout)
+        kinds, words = ("iu", "whole numbers") if name in _WHOLE else ("iufb", "numbers")
+        if found.shape != expected or found.dtype.kind not in kinds:
+            raise ValueError(f"its `{name}` is {found.dtype} of shape {found.shape}; expected {words}, {expected}")
 
 
 def write_scene(folder: Path, slam: Slam) -> None:

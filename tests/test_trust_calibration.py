@@ -1,0 +1,128 @@
+"""The calibration against what the images ask for.
+
+The defect is planted into a healthy synthetic walk, which the check is silent about without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from trust_checks import found_by_camera
+from witness import SIZE, K, Walk, walk
+
+from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
+
+
+@pytest.mark.parametrize(
+    ("factor", "shift", "text"),
+    [
+        (1.1, 0.0, "focal length"),
+        (0.85, 0.0, "focal length"),
+        (2.0, 0.0, "focal length"),
+        (1.0, 40.0, "principal point"),
+    ],
+)
+def test_a_wrong_calibration_is_told_with_the_right_one(healthy: Walk, factor: float, shift: float, text: str) -> None:
+    """Intrinsics off by 10 % or 40 px are found within 3 % and 6 px; oracle: those the walk was made with."""
+    wrong = K * np.array([factor, factor, 1, 1]) + np.array([0, 0, shift, shift])
+    estimate = replace(healthy.estimate, intrinsics=wrong, given=wrong)
+    opinion = camera_opinion(estimate, healthy.evidence)
+    assert opinion is not None
+    assert np.exp(opinion.value[0]) * factor == pytest.approx(1.0, abs=0.03)
+    assert opinion.value[1:3] == pytest.approx([-shift, -shift], abs=6)
+    assert [text in f.text for f in check_camera(estimate, opinion, SIZE)] == [True]
+    repaired = replace(estimate, intrinsics=K)
+    assert found_by_camera(repaired, healthy.evidence) == [], "a run that ends with the right camera is in order"
+
+
+def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
+    """Images that were cut or turned after the calibration are told without any opinion of theirs; a camera that the
+    images confirm is none of these. Oracle: the intrinsics that the walk was made with.
+    """
+    check = lambda estimate, opinion, size: [f.text for f in check_camera(estimate, opinion, size)]
+    width, height = SIZE
+    assert check(healthy.estimate, None, (width, height)) == []
+    for size in ((3 * width // 4, 3 * height // 4), (height, width), (width // 2, height // 2)):
+        assert any("cut, turned or scaled" in text for text in check(healthy.estimate, None, size)), size
+    opinion = camera_opinion(healthy.estimate, healthy.evidence)
+    assert opinion is not None
+    confirmed = check(healthy.estimate, opinion, (3 * width // 4, 3 * height // 4))
+    assert not any("cut, turned or scaled" in text for text in confirmed), "the images know their camera"
+
+
+def test_a_zoom_halfway_is_told() -> None:
+    """Pictures that are enlarged by 1.3 in the second half of a long walk are told as a zoom, though half of the pairs
+    fit the given camera. Oracle: the enlargement, and the frames that it was made in.
+    """
+    here = walk(240)
+    half, centre = len(here.evidence) // 2, K[2:].astype(np.float32)
+    zoomed = [
+        replace(frame, pixels=centre + np.float32(1.3) * (frame.pixels - centre)) if row >= half else frame
+        for row, frame in enumerate(here.evidence)
+    ]
+    opinion = camera_opinion(here.estimate, zoomed)
+    assert opinion is not None
+    assert opinion.better < 2 / 3
+    assert opinion.better_half > 0.9
+    assert any("was there a zoom" in f.text for f in check_camera(here.estimate, opinion, SIZE)), opinion
+
+
+def test_a_focal_length_that_few_pairs_fit_better_is_no_want(healthy: Walk) -> None:
+    """A camera that is 20 % off is told, as nearly all pairs fit the right one better; what half of them fit better is
+    chance, however sure the mean. Oracle: the intrinsics that the walk was made with.
+    """
+    wrong = replace(healthy.estimate, intrinsics=healthy.estimate.intrinsics * [1.2, 1.2, 1.0, 1.0])
+    opinion = camera_opinion(wrong, healthy.evidence)
+    assert opinion is not None
+    assert opinion.better > 0.9
+    told = lambda opinion: any("focal length" in f.text for f in check_camera(wrong, opinion, SIZE))
+    assert told(opinion)
+    assert not told(replace(opinion, better=0.55, better_half=0.75))
+    right = camera_opinion(healthy.estimate, healthy.evidence)
+    assert right is not None
+    assert right.better < 2 / 3
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "centre"),
+    [
+        (640, 480, (318.6, 255.3)),
+        (640, 480, (325.1, 249.7)),
+        (640, 480, (320.1, 247.6)),
+        (752, 480, (367.215, 248.375)),
+        (1241, 376, (607.1928, 185.2157)),
+        (1226, 370, (601.8873, 183.1104)),
+        (640, 480, (319.5, 239.5)),
+    ],
+    ids=["TUM freiburg1", "freiburg2", "freiburg3", "EuRoC cam0", "KITTI 00", "KITTI 04", "ICL-NUIM"],
+)
+def test_published_calibrations_are_no_other_images(
+    healthy: Walk, width: int, height: int, centre: tuple[float, float]
+) -> None:
+    """No camera that is known to be right is called that of cut images; oracle: the data sets' own calibrations."""
+    estimate = replace(healthy.estimate, intrinsics=np.array([*K[:2], *centre]))
+    assert check_camera(estimate, None, (width, height)) == []
+
+
+def test_distortion_that_was_not_told_is_named() -> None:
+    """k1 = -0.2 in the images is found within 0.05, and called distortion; oracle: the lens of the walk."""
+
+    def lens(pixels: np.ndarray) -> np.ndarray:
+        x = (pixels - K[2:]) / K[:2]
+        square = (x**2).sum(1, keepdims=True)
+        return np.where(square < 1.2, x * (1 - 0.2 * square), np.nan) * K[:2] + K[2:]  # beyond, it folds back
+
+    here = walk(lens=lens)
+    opinion = camera_opinion(here.estimate, here.evidence)
+    assert opinion is not None
+    assert opinion.value[3] == pytest.approx(-0.2, abs=0.05)
+    assert any("distorted" in f.text for f in check_camera(here.estimate, opinion, SIZE))
+
+
+def test_a_guessed_camera_is_no_wrong_calibration(healthy: Walk) -> None:
+    """Where nothing was given there is nothing to contradict."""
+    wrong = K * np.array([1.2, 1.2, 1, 1])
+    estimate = replace(healthy.estimate, intrinsics=wrong, given=wrong, sigma=np.full(4, 150.0))
+    assert found_by_camera(estimate, healthy.evidence) == []

@@ -1,0 +1,90 @@
+"""Depth against motion and against other depth.
+
+The defect is planted into a healthy synthetic walk, which the check is silent about without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from trust_checks import found_by_depth
+from witness import Walk, walk, with_depth
+
+from vggtgeo.slam.trust.evidence import FrameEvidence
+
+
+@pytest.mark.parametrize(
+    ("name", "check"),
+    [
+        ("constant", "depth and motion"),
+        ("late", "depth and motion"),
+        ("other unit", "depth scale"),
+        ("drifting", "depth scale"),
+    ],
+)
+def test_depth_of_another_world_is_told(healthy: Walk, name: str, check: str) -> None:
+    """Depth that is constant, some frames late, of another unit than the poses, or of a scale that changes."""
+    rng = np.random.default_rng(0)
+    change = {
+        "constant": lambda f: np.full(len(f.ids), 2.0),
+        "late": lambda f: _of_frame(healthy.evidence[max(f.frame - 8, 0)], f, rng),
+        "other unit": lambda f: 1.25 * f.depth,
+        "drifting": lambda f: f.depth * (0.7 if f.frame % 2 else 1.3),
+    }[name]
+    found = found_by_depth(healthy.estimate, with_depth(healthy.evidence, change))
+    assert check in {f.check for f in found}
+    assert all(f.scale for f in found), "such depth gives no metres"
+
+
+def _of_frame(other: FrameEvidence, frame: FrameEvidence, rng: np.random.Generator) -> np.ndarray:
+    """The depth that another frame has at this frame's pixels: that of its nearest corner."""
+    del rng
+    gap = np.linalg.norm(other.pixels[None] - frame.pixels[:, None], axis=2)
+    return other.depth[gap.argmin(1)]
+
+
+@pytest.mark.parametrize("noise", [3e-4, 2e-2])
+def test_turns_alone_say_nothing_of_the_depth(noise: float) -> None:
+    """A camera that only turns, tracked to a third of a millimetre or to two centimetres, has no word on the depth,
+    though one corner in ten slipped by some 30 pixels, which is parallax to such a motion; oracle: the walk's own
+    depth, which is right.
+    """
+    turning, rng = walk(step=0.0, sway=0.0), np.random.default_rng(3)
+    poses = turning.estimate.poses.copy()
+    poses[:, :3, 3] += noise * rng.standard_normal((len(poses), 3))
+    slips = lambda pixels: 30.0 * rng.standard_normal(pixels.shape) * (rng.random((len(pixels), 1)) < 0.1)
+    evidence = [
+        replace(frame, pixels=(frame.pixels + slips(frame.pixels)).astype(np.float32)) for frame in turning.evidence
+    ]
+    assert found_by_depth(turning.with_poses(poses), evidence) == []
+
+
+def test_poses_that_are_a_degree_off_say_little_of_the_depth() -> None:
+    """Where turns are wrong by a degree, so is what they make of parallax, and good depth is not blamed for it; oracle:
+    the walk's own depth, which is right.
+    """
+    slow, rng = walk(step=0.04), np.random.default_rng(3)
+    wrong = np.tile(np.eye(4), (len(slow.estimate.poses), 1, 1))
+    wrong[:, :3, :3] = Rotation.from_rotvec(0.015 * rng.standard_normal((len(wrong), 3))).as_matrix()
+    assert found_by_depth(slow.with_poses(wrong @ slow.estimate.poses), slow.evidence) == []
+
+
+def test_a_few_corners_with_depth_say_nothing_of_it(healthy: Walk) -> None:
+    """Where a sensor sees nearly nothing, the few depths that two frames share are those of its border: off by half in
+    every other frame they are not held against it, and many are. Oracle: how many corners were left their depth.
+    """
+
+    def seen(count: int) -> list[FrameEvidence]:
+        kept = lambda frame: np.where(np.arange(len(frame.ids)) < count, frame.depth, np.nan)
+        factors = (1.0, 1.5)
+        return [
+            replace(frame, depth=(factors[row % 2] * kept(frame)).astype(np.float32))
+            for row, frame in enumerate(healthy.evidence)
+        ]
+
+    told = lambda evidence: "depth and depth" in [f.check for f in found_by_depth(healthy.estimate, evidence)]
+    assert told(seen(len(healthy.evidence[0].ids)))
+    assert not told(seen(6))

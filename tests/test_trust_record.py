@@ -1,0 +1,29 @@
+"""Frames that were lost, and runs that never began.
+
+The defect is planted into a healthy synthetic walk, which the check is silent about without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from witness import Walk
+
+from vggtgeo.slam.trust.record import check_record
+
+
+def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
+    """Two lost frames mark their segment; a tenth of them the run; most of them fail it; a second origin is told."""
+    lose = lambda rows: replace(healthy.estimate, tracked=~np.isin(np.arange(40), rows))
+    assert [(f.start, f.end, f.local) for f in check_record(lose([7, 8]))] == [(7, 8, True)]
+    assert [f.local for f in check_record(lose(np.arange(10, 16)))] == [False]
+    assert "failed" in {f.level for f in check_record(lose(np.arange(8, 40)))}
+    assert [f.check for f in check_record(replace(healthy.estimate, pieces=2))] == ["parts"]
+
+
+def test_a_run_that_never_began_has_failed(healthy: Walk) -> None:
+    """No map, or one tracked frame: failed."""
+    never = replace(healthy.estimate, tracked=np.arange(40) == 0)
+    assert [f.level for f in check_record(never)] == ["failed"]
+    assert [f.level for f in check_record(replace(healthy.estimate, started=False))] == ["failed"]
