@@ -15,6 +15,22 @@ from vggtgeo.slam.trust.finding import Finding, spans
 from vggtgeo.slam.trust.steps import LEAST_CORNERS, MOST_DISPLACED, Step
 
 LEAST_INLIERS = 20
+MANY = 50
+"""Corners of an image that shows something, and inliers of a pose that chance does not give: as many as let a frame be
+tracked by one keyframe."""
+
+
+def cuts(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> np.ndarray:
+    """Steps between two frames that show much and nothing in common, the second of which was placed by many matches:
+    the video was cut, and the camera found again. bool [n - 1].
+    """
+    shown = np.array([len(noted.pixels) >= MANY for noted in evidence], bool)
+    placed = estimate.tracked & (estimate.inliers >= MANY)
+    found = np.array([len(step.agrees) < LEAST_CORNERS for step in taken], bool)
+    found &= shown[:-1] & shown[1:] & placed[:-1] & placed[1:]
+    for row in np.nonzero(found)[0]:
+        found[row] = not _seen_around(evidence, int(row))
+    return found
 
 
 def check_blind(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> list[Finding]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from vggtgeo.slam.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.blind import check_blind
+from vggtgeo.slam.trust.blind import check_blind, cuts
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
 from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
@@ -34,19 +34,22 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     by_frame = {noted.frame: noted for noted in evidence}
     aligned = [by_frame[frame] for frame in estimate.frames if frame in by_frame]
     known = frame_uncertainty(slam) if slam.keyframes else None
-    found = [*input_findings, *check_record(estimate), *check_speed(estimate)]
+    found = [*input_findings, *check_record(estimate)]
     found += check_extent(estimate, None if known is None else known.translation)
     if estimate.started and estimate.metric:
         found += check_surfaces(slam.keyframes, estimate.intrinsics)
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
         height, width = slam.keyframes[0].size
         found += _images(estimate, aligned, (width, height))
+    else:
+        found += check_speed(estimate)
     return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)
 
 
 def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> Iterator[Finding]:
     taken = steps(estimate, evidence)
     wrong = breaks(estimate, evidence, taken)
+    yield from check_speed(estimate, cuts(estimate, evidence, taken))
     yield from check_steps(estimate, taken, wrong)
     yield from check_blind(estimate, evidence, taken)
     yield from check_parts(estimate, [divide(step) for step in taken])
