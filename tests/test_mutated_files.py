@@ -30,6 +30,8 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.results import Result
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state_file import load_state, save_state
 
 COUNT = int(os.environ.get("VGGTGEO_FUZZ", "0"))
 WORDS = (b"nan", b"inf", b"-1", b"1e400", b"99999999999999999999", b"\0", b"\xff\xfe", b"\n", b",", b"[", b"{", b'"')
@@ -104,6 +106,12 @@ def _depth(file: Path) -> Any:
     return read_depth(file, FIVE_THOUSANDTHS)
 
 
+def _state(folder: Path) -> bytes:
+    four = np.array([50.0, 50.0, 31.5, 23.5])
+    save_state(folder / "good.npz", Slam(four, four, np.ones(4), metric=True, notes=("a note",)))
+    return (folder / "good.npz").read_bytes()
+
+
 def _finite_problem(file: Path) -> None:
     problem, state, _ = load_problem(file)
     for leaf in jax.tree.leaves((problem.terms, state)):
@@ -124,6 +132,7 @@ KINDS = (
     Kind("summary", "summary.json", _summary, lambda file: Result.load(file.parent)),
     Kind("problem", "p.npz", lambda folder: bad.problem()(folder).read_bytes(), _finite_problem, 60),
     Kind("saved problem", "p.npz", _saved, _finite_problem, 60),
+    Kind("state", "s.npz", _state, load_state),
 )  # fmt: skip
 
 

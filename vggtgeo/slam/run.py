@@ -78,10 +78,15 @@ def default_roles(has_depth: bool) -> Roles:
 
 
 def run_frames(
-    frames: Iterable[Frame], camera: Camera, roles: Roles, settings: SlamSettings, clock: Clock
+    frames: Iterable[Frame],
+    camera: Camera,
+    roles: Roles,
+    settings: SlamSettings,
+    clock: Clock,
+    known: Slam | None = None,
 ) -> Iterator[Slam]:
-    """The same over any iterable of frames of one camera."""
-    slam = begin(camera, roles, settings)
+    """The same over any iterable of frames of one camera, on from a state that is known."""
+    slam = begin(camera, roles, settings) if known is None else known
     for frame, description in _described(frames, camera, roles, clock):
         slam = step(slam, frame, description, roles, settings, clock)
         yield slam
