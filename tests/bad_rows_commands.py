@@ -155,6 +155,7 @@ RUN = rows(
         ("a principal point far outside", good, flags("--intrinsics", "55,55,3200,24")),
         ("`--fps 0`", good, flags("--fps", "0")),
         ("`--fps nan`", good, flags("--fps", "nan")),
+        ("`--checkpoint-every -1`", good, flags("--checkpoint-every", "-1")),
         ("`--fps` where frames have times", bad.rgbd(lambda folder: None), flags("--fps", "5")),
         ("`--provider cuda` without a GPU", good, flags("--provider", "cuda")),
         ("`--provider tpu`", good, flags("--provider", "tpu")),
