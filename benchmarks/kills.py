@@ -2,9 +2,9 @@
 
     .venv/bin/python benchmarks/kills.py --kills 100     # simulated; exit code 1 if any bytes differ
 
-A run is killed (SIGKILL) after a random time, resumed, killed again, until it ends; then another begins, until there
-were so many kills. Times are drawn by `--seed`, from its start on, so that compiling, the first frame, the writing of
-a state and that of the results are hit as well.
+A run is killed (SIGKILL), resumed, killed again, until it ends; then another begins, until there were so many kills. By
+turns one comes at any time after the start, so that compiling and the writing of the results are hit, and one while
+frames are tracked: after the state of a frame drawn at random was kept. All is drawn by `--seed`.
 """
 
 from __future__ import annotations
@@ -54,8 +54,10 @@ def killed_runs(given: argparse.Namespace, whole: dict[str, object], seconds: fl
         shutil.rmtree("out")
         ends: list[int] = []
         while not Path("out/summary.json").exists():
-            left = moments.uniform(0, seconds) if kills < given.kills else None
-            alive = run(["--resume", "--checkpoint-every", str(given.every)], left)
+            moment: float | int | None = None
+            if kills < given.kills:
+                moment = moments.uniform(0, seconds) if kills % 2 else moments.randrange(1, given.frames // 2)
+            alive = run(["--resume", "--checkpoint-every", str(given.every)], moment)
             kills += not alive
             ends.append(kept())
         runs += 1
@@ -67,16 +69,18 @@ def killed_runs(given: argparse.Namespace, whole: dict[str, object], seconds: fl
     return int(wrong > 0)
 
 
-def run(flags: list[str], seconds: float | None) -> bool:
-    """Whether a run ended by itself; killed after so many seconds."""
+def run(flags: list[str], moment: float | None) -> bool:
+    """Whether a run ended by itself; killed after so many seconds, or (if whole) when so many more frames are kept."""
     settings = [word for setting in SMALL for word in ("--set", setting)]
     command = [sys.executable, "-c", PROGRAM, "run", "room", "-o", "out", "--no-global", "--quiet", *settings, *flags]
     with subprocess.Popen(command) as program:
-        try:
-            code = program.wait(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            program.kill()
-            return False
+        began, before = time.monotonic(), kept()
+        while moment is not None and program.poll() is None:
+            if (kept() - before if isinstance(moment, int) else time.monotonic() - began) >= moment:
+                program.kill()
+                return False
+            time.sleep(0.05)
+        code = program.wait()
     if code not in (0, 3):
         raise SystemExit(f"a run ended with code {code}")
     return True

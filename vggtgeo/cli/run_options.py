@@ -80,6 +80,19 @@ DenseOption = Annotated[
 SaveDepthOption = Annotated[
     bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
 ]
+MapOption = Annotated[
+    Path | None,
+    typer.Option("--map", help="Map of an earlier run (`--save-map`): frames are placed in it, and extend it."),
+]
+LocaliseOption = Annotated[
+    bool,
+    typer.Option(
+        "--localise-only/--no-localise-only", help="Only place frames in the map of `--map`; it stays as it is."
+    ),
+]
+SaveMapOption = Annotated[
+    Path | None, typer.Option("--save-map", help="File for the map, so that another run can go on in it.")
+]
 ResumeOption = Annotated[
     bool | None,
     typer.Option(

@@ -39,8 +39,9 @@ class Output:
     """Where a run of the command line leaves what, and what it prints meanwhile.
 
     flags: the effective settings by the names of the flags, for `settings.toml`. rerun: where to log the run, see
-    `vggtgeo/viewing/target.py`. source: what is read, which nothing may be written into. resume: whether to go on with
-    a run into the folder that was killed; None: there must be none. checkpoint_every: s, see `Checkpoints`.
+    `vggtgeo/viewing/target.py`. source: what is read, which nothing may be written into. save_map: file for the map.
+    resume: whether to go on with a run into the folder that was killed; None: there must be none. checkpoint_every: s,
+    see `Checkpoints`.
     """
 
     folder: Path
@@ -50,6 +51,7 @@ class Output:
     quiet: bool = False
     as_json: bool = False
     source: Path | None = None
+    save_map: Path | None = None
     resume: bool | None = False
     checkpoint_every: float = EVERY
 
@@ -66,6 +68,7 @@ def run_and_write(
     title: str | None = None,
     facts: Mapping[str, Any] | None = None,
     warned: Iterable[Warning | str] = (),
+    known_map: Slam | None = None,
 ) -> None:
     """Run a sequence with a progress bar, write its folder, print the report, and leave with the code of the verdict.
 
@@ -101,8 +104,11 @@ def run_and_write(
                 facts=facts,
                 warned=warned,
                 checkpoints=checkpoints,
+                known_map=known_map,
             )
             bar.on_stage("writing")
+            if output.save_map is not None:
+                result.save_map(output.save_map)
             summary = result.save_into(folder, depth=output.save_depth, settings=output.flags)
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: everything was done and is written", err=True)

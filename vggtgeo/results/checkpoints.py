@@ -191,6 +191,15 @@ def digest_of(frame: Frame) -> str:
     return digest.hexdigest()
 
 
+def digest_of_map(known: Slam) -> str:
+    """SHA-256 of the poses and the key points of a map."""
+    digest = hashlib.sha256(repr(len(known.pairs)).encode())
+    for keyframe in known.keyframes:
+        digest.update(keyframe.pose.tobytes())
+        digest.update(np.ascontiguousarray(keyframe.features.pixels).data)
+    return digest.hexdigest()
+
+
 def settled(slam: Slam) -> Slam:
     """The state with nothing under way beside it.
 

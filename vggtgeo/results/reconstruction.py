@@ -23,12 +23,22 @@ from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.warned import collected_warnings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.checkpoints import Checkpoints, Keeper, Notice, RunSoFar, check_same_frame, identity, resumed
+from vggtgeo.results.checkpoints import (
+    Checkpoints,
+    Keeper,
+    Notice,
+    RunSoFar,
+    check_same_frame,
+    digest_of_map,
+    identity,
+    resumed,
+)
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
+from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import default_roles, finish, run_frames
@@ -62,6 +72,7 @@ def reconstruct(
     facts: Mapping[str, Any] | None = None,
     warned: Iterable[Warning | str] = (),
     checkpoints: Checkpoints | None = None,
+    known_map: Slam | None = None,
 ) -> Result:
     """Track and map every frame, adjust the whole map, judge the result.
 
@@ -85,6 +96,8 @@ def reconstruct(
         facts: what the summary shall say besides.
         warned: warnings about the input that came before, for the verdict and the report.
         checkpoints: where the state of the run is kept while it goes on, and whether it goes on from the one there.
+        known_map: what `vggtgeo.load_map` gave: the frames are placed in this map, and extend it, or, with the setting
+            `keyframes.localise_only`, leave it as it is.
 
     Raises:
         InputError: the frames cannot be read, none of them can be used, or the run to go on with is of something else.
@@ -104,18 +117,20 @@ def reconstruct(
         perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric)
         selection = (start, end, stride)
+        first = _first_state(known_map, source.camera, settings)
         wanted = identity(
             *(settings, perception.roles, source.known(selection)),
             {name: session.digest for name, session in perception.networks.items()},
             dense=dense,
             seed=seed,
+            known_map=None if first is None else digest_of_map(first),
         )
         before = resumed(source.resumable(checkpoints), wanted)
         windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
         hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
-        loop = _Loop(source, selection, perception, settings, hooks, stop, collected, began, before)
+        loop = _Loop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
         with loop.keeping(checkpoints, wanted) as keeper:
             tracked = loop.track(keeper)
             slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
@@ -247,6 +262,15 @@ def _truth(sequence: Sequence) -> Trajectory | None:
         return None
 
 
+def _first_state(known: Slam | None, camera: Camera, settings: SlamSettings) -> Slam | None:
+    """Before the first frame, in a map that is known; InputError for one of another camera, or where one is needed."""
+    if known is not None:
+        return entered(known, camera)
+    if settings.keyframes.localise_only:
+        raise InputError("`keyframes.localise_only` needs a map to place frames in: give `known_map` (`--map FILE`)")
+    return None
+
+
 def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:
     found = roles if isinstance(roles, Perception) else Perception(roles or default_roles(has_depth), {})
     return replace(found, roles=found.roles.seeded(seed)) if seed else found
@@ -294,7 +318,9 @@ class _Tracked:
 
 @dataclass(frozen=True, eq=False)
 class _Loop:
-    """The loop over frames. collected: warnings so far. began: of the run, s. before: the run that this one goes on."""
+    """The loop over frames. collected: warnings so far. began: of the run, s. before: the run that this one goes on.
+    first: the state before the first frame, where there is a map.
+    """
 
     source: _Source
     selection: tuple[int, int | None, int]
@@ -305,6 +331,7 @@ class _Loop:
     collected: list[Warning | str]
     began: float
     before: RunSoFar | None
+    first: Slam | None
 
     @contextmanager
     def keeping(self, asked: Checkpoints | None, wanted: Mapping[str, str]) -> Iterator[Keeper | None]:
@@ -321,7 +348,7 @@ class _Loop:
 
     def track(self, keeper: Keeper | None) -> _Tracked:
         """Ctrl-C ends it after a whole frame, an input error of the sequence without a result."""
-        known = None if self.before is None else self.before.slam
+        known = self.first if self.before is None else self.before.slam
         slam, frame, interrupted = known, None, False
         given: dict[int, Frame] = {}
         self.hooks.each("on_begin", self.source.name, self.source.count(*self.selection))
