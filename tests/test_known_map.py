@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,10 +12,13 @@ import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS
 from same_leaves import differences
+from typer.testing import CliRunner
 
 import vggtgeo as vg
+from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
 from vggtgeo.results import Result
+from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.known_map import as_map, save_map
 from vggtgeo.slam.state import Slam
@@ -89,7 +93,9 @@ def test_known_space_gets_no_second_keyframes(known: Slam) -> None:
 
 def test_localising_leaves_the_map_as_it_is(known: Slam) -> None:
     """Frames are placed, and no keyframe, match, tie or camera changes, however far they lead; oracle: the map."""
-    slam = vg.finish(run(HALF - 3, settings=FIXED, known_map=known), ROLES, FIXED)
+    known = replace(known, factors=())  # so that going from keyframe to keyframe would tie them anew
+    slam = vg.finish(run(0, settings=FIXED, known_map=known), ROLES, FIXED)
+    assert len({record.reference for record in slam.frames}) > 1
     for name in ("keyframes", "pairs", "factors", "intrinsics", "origins", "pose_sigma"):
         assert list(differences(getattr(known, name), getattr(slam, name))) == [], name
     assert np.mean([record.tracked for record in slam.frames]) > 0.5
@@ -142,3 +148,21 @@ def test_a_whole_run_in_a_map(known: Slam, tmp_path: Path) -> None:
     again = vg.reconstruct(sequence(), **given, known_map=vg.load_map(tmp_path / "both.map"))
     assert len(again.keyframes) == len(result.keyframes)
     assert worst_error(again.record.slam) < 0.02
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_the_command_saves_and_takes_a_map(tmp_path: Path) -> None:
+    """`--save-map`, then `--map --localise-only` on the same frames: all are placed, no keyframe is added; oracle: the
+    summaries.
+    """
+    for _ in write_tum_folder(vg.simulate("room", 3, 0, (320, 240), rate=20.0), tmp_path / "room"):
+        pass
+    found = []
+    for more in (["--save-map", str(tmp_path / "a.map")], ["--map", str(tmp_path / "a.map"), "--localise-only"]):
+        command = ["run", str(tmp_path / "room"), "-o", str(tmp_path / "out"), "--dense", "none", "--json", *more]
+        done = CliRunner().invoke(make_app(), command)
+        assert done.exit_code in (0, 3), done.output
+        found.append(json.loads(done.stdout))
+    assert [one["frames_tracked"] for one in found] == [3, 3]
+    assert [one["keyframes"] for one in found] == [1, 1]
+    assert found[1]["notes"] == ["frame 0 (0.000000.png) is the first that was found in the map"]
