@@ -13,6 +13,7 @@ from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -51,6 +52,8 @@ def recorded_run() -> RecordedRun:
     for slam in run_frames(iter(frames), sequence.camera, ROLES, SETTINGS, Clock()):
         recorder.on_frame(slam, frames[slam.frames[-1].frame])
         states.append(slam)
+    states[-1] = settled(states[-1])
+    recorder.on_adjust(states[-1])
     return RecordedRun(
         sequence,
         frames,

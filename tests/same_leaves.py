@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ import numpy as np
 
 def differences(first: Any, second: Any, where: str = "value") -> Iterator[str]:
     """The ways to what differs, in kind, element type, order in memory, or any bit."""
+    first, second = _result(first), _result(second)
     if type(first) is not type(second):
         yield f"{where}: {type(first).__name__}, {type(second).__name__}"
     elif dataclasses.is_dataclass(first) and not isinstance(first, type):
@@ -32,6 +34,10 @@ def differences(first: Any, second: Any, where: str = "value") -> Iterator[str]:
         yield from _array_differences(first, second, where)
     elif not (first == second or first != first) or str(first) != str(second):
         yield f"{where}: {first!r}, {second!r}"
+
+
+def _result(value: Any) -> Any:
+    return ("result", value.result()) if isinstance(value, Future) else value
 
 
 def _array_differences(first: Any, second: Any, where: str) -> Iterator[str]:

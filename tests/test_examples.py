@@ -22,7 +22,16 @@ def session() -> dict[str, Any]:
     return {"vg": vg, "jax": jax, "problem": problem, "initial": initial, "index": index, "solution": solution}
 
 
-@pytest.mark.parametrize("name", sorted(set(vg.__all__) - WITHOUT))
+LONG = {"ArrowAdjoint", "reconstruct"}
+"""What compiles for long, of what other files show in a quick test."""
+
+
+NAMES = [
+    pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in sorted(set(vg.__all__) - WITHOUT)
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_the_example_of_a_public_name_is_true(name: str, session: dict[str, Any]) -> None:
     """Its docstring has an example, and running it prints what stands there; oracle: Python's doctest."""
     text = getattr(vg, name).__doc__
@@ -33,6 +42,28 @@ def test_the_example_of_a_public_name_is_true(name: str, session: dict[str, Any]
     assert not wrong, "".join(wrong)
 
 
+def test_outside_jit_a_call_compiles_one_program(session: dict[str, Any]) -> None:
+    """A plain call, as in a notebook, does not compile its operations one by one (`covariances` took 50 s that way).
+    Oracle: JAX's own count of the programs that it compiles.
+    """
+    compiled: list[str] = []
+
+    def listen(event: str, duration: float, **_: Any) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    functions = (vg.covariances, vg.energy, vg.observability, vg.residual_sizes, vg.residuals_at)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for function in functions:
+            function(session["problem"], session["initial"])
+        vg.solve(session["problem"], session["initial"])
+    finally:
+        jax.monitoring.clear_event_listeners()
+    # Besides: a few operations of the checks of arguments.
+    assert len(compiled) < 30
+
+
 def test_the_exceptions_are_public() -> None:
-    """The list of names without an example holds no name that is gone."""
-    assert set(vg.__all__) >= WITHOUT
+    """The lists of names hold no name that is gone."""
+    assert set(vg.__all__) >= WITHOUT | LONG

@@ -21,6 +21,7 @@ from vggtgeo.results import Result
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.known_map import as_map, save_map
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
 
@@ -37,7 +38,7 @@ def run(start: int = 0, end: int | None = None, seed: int = 0, **options: Any) -
     """The last state of a run over some frames."""
     given = {"settings": SETTINGS, **options}
     *_, slam = vg.run(sequence(seed), ROLES, **given, start=start, end=end)
-    return slam
+    return settled(slam)
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,12 +28,13 @@ from vggtgeo.slam.compile_ahead import compile_global, expected_keyframes
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.global_shape import padded_count, shape_for
 from vggtgeo.slam.loops import close_loops
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import updated
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import solve_jit
+from vggtgeo.slam.window import adjust, solve_jit
 
 SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.
@@ -50,7 +52,7 @@ def room() -> tuple[list[Frame], Camera, object]:
 
 
 def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES, settings: SlamSettings = SETTINGS) -> Slam:
-    return list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1]
+    return settled(list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1])
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +75,21 @@ def test_single_precision_of_the_caller_changes_nothing(room, tracked: Slam) -> 
     frames, camera, _ = room
     with jax.enable_x64(False):
         again = _run(frames, camera)
+    np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
+
+
+def test_how_long_a_window_takes_changes_nothing(room, tracked: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows are adjusted beside tracking, and taken up at a frame, not at a time; oracle: the run in which they come
+    early, bit for bit.
+    """
+    frames, camera, _ = room
+
+    def late(slam: Slam, settings: SlamSettings) -> Slam:
+        time.sleep(0.1 * (len(slam.keyframes) % 3))
+        return adjust(slam, settings)
+
+    monkeypatch.setattr("vggtgeo.slam.pipeline.adjust", late)
+    again = _run(frames, camera)
     np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
 
 

@@ -15,6 +15,7 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
+from vggtgeo.io.errors import InputError
 
 EXACT = make_scene()
 NOISY = make_scene(noise=0.5, outliers=0.15, depth_error=0.05, seed=2)
@@ -211,6 +212,19 @@ def test_without_jit_it_is_the_same(solved: Solve) -> None:
     assert int(two.iterations) == 2
     assert not bool(two.converged)
     np.testing.assert_allclose(two.history, compiled.history[:3], rtol=1e-12)
+
+
+def test_a_jitted_function_may_close_over_the_problem(solved: Solve) -> None:
+    """Only the start is an argument, as in a notebook: the problem has values to look at, and the graph chooses the
+    linear algebra. Oracle: the problem as an argument.
+    """
+    problem, start, truth = exact_problem()
+    found = jax.jit(lambda state: solve(problem, state))(start)
+    assert distance(found.state, truth) < 1e-8
+    weightless = jax.tree.map(jnp.zeros_like, problem.points.weight)
+    nothing = problem.with_terms((replace(problem.points, weight=weightless),))
+    with pytest.raises(InputError, match="nothing is observed"):
+        jax.jit(lambda state: solve(nothing, state))(start)
 
 
 def test_vmap_solves_each(solved: Solve) -> None:

@@ -75,7 +75,8 @@ def used(model: Any) -> tuple[jax.Array, jax.Array]:
 
 
 @pytest.mark.parametrize(  # one kind of kernel, so that it is compiled once
-    ("shape", "camera"), [(1.0, vg.Pinhole), (-2.0, vg.Pinhole), (1.0, vg.SquarePinhole)]
+    ("shape", "camera"),
+    [(1.0, vg.Pinhole), (-2.0, vg.Pinhole), pytest.param(1.0, vg.SquarePinhole, marks=pytest.mark.long)],
 )
 def test_what_is_written_by_hand_is_what_is_derived(shape: float, camera: type[vg.AbstractCamera]) -> None:
     # Proves energy, columns (with and without a correction), gradient and exact model of points and lines, outliers,

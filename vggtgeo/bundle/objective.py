@@ -33,6 +33,11 @@ def energy(problem: Problem, state: State) -> Float[Array, ""]:
         True
 
     """
+    return _energy_jit(problem, state)
+
+
+@jax.jit
+def _energy_jit(problem: Problem, state: State) -> Float[Array, ""]:
     return prepared_energy(prepared(problem), state)
 
 

@@ -25,9 +25,10 @@ def check_observed(problem: Problem) -> None:
     about = [term for term in problem.terms if not isinstance(term, CameraTerm)]
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(about)):
         return
-    for term in about:
-        if np.any(np.asarray(term.present())) and not (isinstance(term, DenseTerm) and not int(term.rows())):
-            return
+    with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
+        for term in about:
+            if np.any(np.asarray(term.present())) and not (isinstance(term, DenseTerm) and not int(term.rows())):
+                return
     raise InputError(
         "nothing is observed: all weights of the terms on landmarks and poses are zero, so every state is an optimum; "
         "give at least one observation a positive weight"

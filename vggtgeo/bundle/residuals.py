@@ -72,6 +72,11 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
         points 0.65 px (240), lines 0.43 px (144), depth 0.71 sigma (128)
 
     """
+    return _sizes_jit(problem, state)
+
+
+@jax.jit
+def _sizes_jit(problem: Problem, state: State) -> ResidualSizes:
     problem = prepared(problem)
     found = {term.name: _size(term, term_residuals(problem, term, state)) for term in problem.terms}
     return ResidualSizes(
@@ -98,6 +103,11 @@ def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."
         ((240, 2), 0.5)
 
     """
+    return _residuals_jit(problem, state)
+
+
+@jax.jit
+def _residuals_jit(problem: Problem, state: State) -> dict[str, Float[Array, "..."]]:
     problem = prepared(problem)
     found = {}
     for term in problem.terms:

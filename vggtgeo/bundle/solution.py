@@ -114,15 +114,16 @@ def solve(
         problem: observations and priors, `vggtgeo.pack` makes one from flat lists.
         initial: starting state, world -> camera poses, pixels, 1/m; lines of two ends start straight along them.
         solver: iteration and linear algebra; default `SchurLevenbergMarquardt()` with the linear solver that
-            `choose_reduced_solver` finds for the graph. Inside `jit` it cannot look: give it for a large problem.
+            `choose_reduced_solver` finds for the graph. Of a `problem` that is an argument of a jitted function it
+            cannot see the graph: give it there for a large problem.
         adjoint: how to differentiate; default `ArrowAdjoint()`. `optimistix.RecursiveCheckpointAdjoint()` with
             `SchurLevenbergMarquardt(differentiable_loop=True)` differentiates through the iterates instead.
         graduation: wider kernels to go through first, for a redescending kernel and a start that outliers dominate;
             `history` and `iterations` are those of the last kernel, the one of `problem`.
 
     Raises:
-        InputError: nothing is observed (outside `jit`, where weights can be looked at; inside, such a problem converges
-            where it starts).
+        InputError: nothing is observed (where weights have values to look at; as the argument of a jitted function such
+            a problem converges where it starts).
 
     Example:
         >>> import jax, vggtgeo as vg
@@ -134,7 +135,17 @@ def solve(
     """
     check_observed(problem)
     solver = default_solver(problem) if solver is None else solver
-    adjoint = ArrowAdjoint() if adjoint is None else adjoint
+    return _solve_jit(problem, initial, solver, ArrowAdjoint() if adjoint is None else adjoint, graduation)
+
+
+@eqx.filter_jit  # outside the caller's `jit`, every operation of the derivative would be compiled by itself
+def _solve_jit(
+    problem: Problem,
+    initial: State,
+    solver: SchurLevenbergMarquardt,
+    adjoint: optx.AbstractAdjoint,
+    graduation: Graduation | None,
+) -> Solution:
     initial = BundleAdjustment(problem).straightened(initial)
     if graduation is not None:
         initial = graduation.start(problem, initial, solver)

@@ -67,7 +67,8 @@ def default_solver(problem: Problem) -> SchurLevenbergMarquardt:
     cannot be looked at, the dense one, with a warning where that is slow.
     """
     if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(problem)):
-        return SchurLevenbergMarquardt(reduced_solver=choose_reduced_solver(problem))
+        with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
+            return SchurLevenbergMarquardt(reduced_solver=choose_reduced_solver(problem))
     if problem.num_keyframes > MUCH_DENSE and not problem.dense_terms:
         warnings.warn(
             f"`solve` of {problem.num_keyframes} keyframes inside `jit` takes a dense linear solver, for the graph "

@@ -6,7 +6,8 @@ and fields are set as they were, past constructors.
 
 JSON says `null`, booleans, whole numbers, texts and finite floats as they are, and a tuple as a list. All else is an
 object of one key: `f` (a float that is not finite), `l` (a list), `d` (a dictionary), `c` (the number of a class in the
-list of classes; its fields under `v`), `k` (a class itself), `t` (an element type), and, by its number in the list of
+list of classes; its fields under `v`), `k` (a class itself), `t` (an element type), `r` (the result of a future, which
+is waited for; it is done when it is read), and, by its number in the list of
 arrays, `a` (a numpy array), `s` (a numpy scalar), `b` (bytes), `j` (a JAX array), `w` (one that is weakly typed).
 """
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any
 
 import jax
@@ -148,6 +150,7 @@ class _Packer:
         (lambda v: type(v) is dict, lambda self, v, at: self._dictionary(v, at)),
         (lambda v: isinstance(v, np.dtype), lambda self, v, at: {"t": v.str}),
         (lambda v: isinstance(v, type), lambda self, v, at: self._class(v, at)),
+        (lambda v: isinstance(v, Future), lambda self, v, at: {"r": self._tree(v.result(), at)}),
     )
 
 
@@ -185,6 +188,8 @@ class _Unpacker:
             return self._class(content)
         if sign == "t":
             return _element_type(content)
+        if sign == "r":
+            return _done(self.value(content))
         raise ValueError(f"it holds {sign!r}, which means nothing")
 
     def _class(self, name: str) -> type:
@@ -227,6 +232,12 @@ _FROM_ARRAY: dict[str, Callable[[np.ndarray], Any]] = {
     # JAX makes a weak type of a Python number alone, or of an operation on weak types.
     "w": lambda values: jnp.broadcast_to(jnp.asarray(values.dtype.type(0).item()), values.shape).at[...].set(values),
 }
+
+
+def _done(value: Any) -> Future[Any]:
+    future: Future[Any] = Future()
+    future.set_result(value)
+    return future
 
 
 def _element_type(name: Any) -> np.dtype[Any]:

@@ -99,7 +99,7 @@ class WindowWriter:
 class RunWindows(Callback):
     """Writes every window that a run adjusts: give it to `vggtgeo.reconstruct` as a callback, close `writer` after it.
 
-    label: of the state after a frame, for labels such as the true poses of the window's keyframes.
+    label: of the state that has a window adjusted (`slam.solved`), for labels such as its keyframes' true poses.
 
     Example:
         >>> with vg.WindowWriter("windows") as writer:  # doctest: +SKIP
@@ -112,6 +112,12 @@ class RunWindows(Callback):
         self._last: object = None
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
+        self._write(slam)
+
+    def on_adjust(self, slam: Slam) -> None:
+        self._write(slam)
+
+    def _write(self, slam: Slam) -> None:
         if slam.solved is None or slam.solved is self._last:
             return
         self._last = slam.solved

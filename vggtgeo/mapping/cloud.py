@@ -13,6 +13,7 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.threads import map_in_threads
 
 STEP = 3
 """Pixels between those of a depth map that become points: at 2.5 m and 500 pixels of focal length, 1.5 cm."""
@@ -53,13 +54,14 @@ def map_points(
         voxel: edge of a cell, metres.
 
     """
-    parts = []
-    for i, keyframe in enumerate(keyframes):
+
+    def part(i: int) -> _Points:
         if depth_maps[i] is None:
-            parts.append(_sparse_points(keyframe, intrinsics))
-            continue
+            return _sparse_points(keyframes[i], intrinsics)
         around = [j for j in (i - 2, i - 1, i + 1, i + 2) if 0 <= j < len(keyframes) and depth_maps[j] is not None]
-        parts.append(_dense_points(keyframes, depth_maps, i, around, intrinsics))
+        return _dense_points(keyframes, depth_maps, i, around, intrinsics)
+
+    parts = map_in_threads(part, range(len(keyframes)))
     columns = [[getattr(part, name) for part in parts] for name in ("points", "colours", "normals", "weight")]
     return _average_in_voxels(_Points(*(np.concatenate(column) for column in columns)), voxel)
 

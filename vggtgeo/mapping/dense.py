@@ -20,6 +20,7 @@ from vggtgeo.mapping.tsdf import fused_mesh
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.threads import map_in_threads
 
 DenseMode = Literal["auto", "mvs", "sensor", "network", "none"]
 """Where dense depth comes from. "auto": what was measured, by a sensor or a network; where nothing was, the pictures.
@@ -109,16 +110,16 @@ def dense_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: st
     check_dense(mode, measured)
     if mode == "none":
         return [None] * len(keyframes)
-    own = [
-        None if depth is None else _measured(keyframe, depth)
-        for keyframe, depth in zip(keyframes, fused_depths(keyframes, intrinsics), strict=True)
-    ]
+    own = map_in_threads(_measured, zip(keyframes, fused_depths(keyframes, intrinsics), strict=True))
     if mode in ("sensor", "network") or (mode == "auto" and measured):
         return own
     return [_filled(*pair) for pair in zip(own, stereo_depths(keyframes, intrinsics), strict=True)]
 
 
-def _measured(keyframe: Keyframe, depth: np.ndarray) -> DepthMap:
+def _measured(pair: tuple[Keyframe, np.ndarray | None]) -> DepthMap | None:
+    keyframe, depth = pair
+    if depth is None:
+        return None
     return DepthMap(
         depth.astype(np.float32),
         keyframe.depth_sigma.astype(np.float32),

@@ -104,9 +104,12 @@ def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[
         float32 [H, W] metres for each keyframe, NaN where it has no depth; None where it has none at all.
 
     """
-    depths: list[np.ndarray | None] = [
-        keyframe.depth.astype(np.float32) if np.any(np.isfinite(keyframe.depth)) else None for keyframe in keyframes
-    ]
+
+    def measured(keyframe: Keyframe) -> np.ndarray | None:
+        depth = keyframe.depth
+        return depth.astype(np.float32) if np.any(np.isfinite(depth)) else None
+
+    depths = map_in_threads(measured, keyframes)
     for _ in range(ROUNDS):
         depths = _one_round(keyframes, depths, intrinsics)
     return depths
@@ -123,10 +126,13 @@ def _one_round(
         depth = corrected[i]
         return None if depth is None else _averaged(depth, keyframes[i], _around(clouds, i), intrinsics)
 
+    def points(i: int) -> np.ndarray | None:
+        depth = corrected[i]
+        return None if depth is None else _world_points(depth, keyframes[i], intrinsics)
+
     numbers = range(len(keyframes))
     corrected = map_in_threads(correct, numbers)
-    pairs = list(zip(keyframes, corrected, strict=True))
-    clouds = [None if depth is None else _world_points(depth, keyframe, intrinsics) for keyframe, depth in pairs]
+    clouds = map_in_threads(points, numbers)
     return map_in_threads(average, numbers)
 
 

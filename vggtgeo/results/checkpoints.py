@@ -200,15 +200,6 @@ def digest_of_map(known: Slam) -> str:
     return digest.hexdigest()
 
 
-def settled(slam: Slam) -> Slam:
-    """The state with nothing under way beside it.
-
-    The one place for work that goes on beside tracking: what is computed there must be waited for here, and its result
-    stored so that it is taken up at the frame at which the run itself would have.
-    """
-    return slam
-
-
 @dataclass(eq=False)
 class Keeper:
     """Keeps the state of one run. gather: what there is beside the state, asked between two frames. tell: says a
@@ -251,11 +242,11 @@ class Keeper:
             self._ended(self._writing)
 
     def _begin(self, slam: Slam, frame: Frame) -> None:
-        so_far = self.gather(settled(slam))
+        so_far = self.gather(slam)
         self._writing = self._pool.submit(self._write, so_far, frame)
 
     def _write(self, so_far: RunSoFar, frame: Frame) -> float:
-        """Writes the file; returns the processor's seconds that it took."""
+        """Writes the file, waiting for a window that is adjusted meanwhile; returns the processor's seconds it took."""
         began = time.thread_time()
         count = len(so_far.slam.frames)
         facts = {"identity": self.identity, "frames": count, "last": frame.index, "digest": digest_of(frame)}

@@ -7,6 +7,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -39,6 +40,7 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import default_roles, finish, run_frames
@@ -46,6 +48,7 @@ from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
+from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.input import check_input, check_refusals
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.window import warm_up
@@ -170,14 +173,20 @@ def _concluded(
 ) -> Result:
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
-    hooks.each("on_stage", "dense map")
-    with clock.measure("dense map"):
-        built = dense_map(slam, run.dense)
-    hooks.each("on_finish", slam, built.cloud)
-    hooks.each("on_stage", "verdict")
-    with clock.measure("verdict"):
-        left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
-        verdict = judge(slam, evidence.frames, left_out)
+
+    @in_double_precision
+    def judged() -> Verdict:
+        with clock.measure("verdict (own thread)"):
+            left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
+            return judge(slam, evidence.frames, left_out)
+
+    hooks.each("on_stage", "dense map and verdict")
+    with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:
+        judging = pool.submit(judged)
+        with clock.measure("dense map"):
+            built = dense_map(slam, run.dense)
+        hooks.each("on_finish", slam, built.cloud)
+        verdict = judging.result()
     summary = summarise(
         slam,
         verdict,
@@ -374,6 +383,7 @@ class _Loop:
             self._tell("interrupted: keeping what there is")
         elif keeper is not None:
             keeper.on_end(slam, frame)
+        slam = settled(slam)
         earlier = 0.0 if self.before is None else self.before.tracking
         return _Tracked(slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began))
 

@@ -7,6 +7,7 @@ import os
 import time
 import warnings
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -32,6 +33,7 @@ from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise, with_writing
 from vggtgeo.slam.known_map import save_map
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
@@ -112,6 +114,7 @@ class Result:
         evidence: what an `EvidenceRecorder` noted of all frames; without it the verdict rests on the run's own record.
         truth: camera -> world, where it is known. dense: whose depth the map is made of, as of `vggtgeo.reconstruct`.
         """
+        slam = settled(slam)
         verdict, built = judge(slam, evidence), dense_map(slam, dense)
         count = len(built.cloud)
         summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=count)
@@ -203,12 +206,13 @@ class Result:
             self.keyframes.save_tum(place / "keyframes.txt")
             if self.saved_uncertainty is not None:
                 write_uncertainty(place / "uncertainty.txt", self.saved_uncertainty)
-        self.cloud.save_ply(place / "map.ply")
-        if self.mesh is not None:
-            self.mesh.save_ply(place / "mesh.ply")
-        self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
-        if self.record is not None:
-            write_scene(place, self.record.slam)
+        with ThreadPoolExecutor(1, thread_name_prefix="mesh") as pool:  # beside the page: both take as long
+            meshed = pool.submit(self._save_mesh, place / "mesh.ply")
+            self.cloud.save_ply(place / "map.ply")
+            self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
+            if self.record is not None:
+                write_scene(place, self.record.slam)
+            meshed.result()
         if depth and self.record is not None:
             write_depth(place, self.record.slam.keyframes, self.record.dense.depth_maps, self.record.slam.metric)
         if self.record is not None:
@@ -227,6 +231,10 @@ class Result:
         if self.record is None:
             raise InputError("a map needs a result that is still in memory; this one was read from a folder")
         save_map(path, self.record.slam)
+
+    def _save_mesh(self, path: Path) -> None:
+        if self.mesh is not None:
+            self.mesh.save_ply(path)
 
     def _draw(self, place: Path, name: str, summary: Mapping[str, Any]) -> None:
         record = self.record

@@ -18,6 +18,7 @@ from vggtgeo.slam.global_shape import GlobalShape, global_solver, shape_of
 from vggtgeo.slam.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window import solve_jit
 
 MUCH = 0.01
@@ -70,7 +71,8 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
 
 
 def _surfaces(slam: Slam) -> list[Surface]:
-    return [Surface.of(keyframe, slam.intrinsics) for keyframe in slam.keyframes] if slam.metric else []
+    of = lambda keyframe: Surface.of(keyframe, slam.intrinsics)
+    return map_in_threads(of, slam.keyframes) if slam.metric else []
 
 
 def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:

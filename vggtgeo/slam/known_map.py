@@ -17,6 +17,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.record_file import Layout
 from vggtgeo.io.records import by_name
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, checked_state
@@ -29,6 +30,7 @@ calibrations of one camera differ by up to 1.6 % (redkitchen: 525 px as given, 5
 
 def as_map(slam: Slam) -> Slam:
     """What of a run's state is its map."""
+    slam = settled(slam)
     count = len(slam.keyframes)
     keyframes = tuple(
         replace(keyframe.compressed(), frame=keyframe.number - count, timestamp=float(keyframe.number - count))

@@ -17,13 +17,24 @@ from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
+from vggtgeo.slam.pending_window import begin_window, is_due, settled
 from vggtgeo.slam.pieces import join_pieces
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, revisit, sight_of, view_of, wait
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking import Expectation, Sight, Track, refined_by_map, tie_between, tie_to, track, track_by_map
+from vggtgeo.slam.tracking import (
+    Expectation,
+    Sight,
+    Track,
+    moved_with,
+    refined_by_map,
+    tie_between,
+    tie_to,
+    track,
+    track_by_map,
+)
 from vggtgeo.slam.window import adjust, enter
 
 LOST_PATIENCE = 10
@@ -46,6 +57,8 @@ def step(
 ) -> Slam:
     """Take one frame (undistorted) into the state; its key points are found if they are needed."""
     clock = clock or Clock()
+    if is_due(slam):
+        slam = _settled(slam, clock)
     if not slam.metric:
         roles = without_depth(roles)
     if not slam.keyframes:
@@ -56,6 +69,11 @@ def step(
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
             return begun or start_without_depth(slam, frame, features, roles, settings)
     return _follow(slam, frame, description, roles, settings, clock)
+
+
+def _settled(slam: Slam, clock: Clock) -> Slam:
+    with clock.measure("wait for the window"):
+        return settled(slam)
 
 
 def _started(slam: Slam) -> bool:
@@ -97,6 +115,13 @@ def _follow(
         # In a map of another run nothing tells where the first frame is: it is searched by what it looks like alone.
         blind = _in_known_map(slam) and slam.reference is None
         found = None if blind else _find(slam, sight, roles, settings)
+    if slam.pending is not None and (found is None or not found.accepted):
+        slam = _settled(slam, clock)
+        with clock.measure("track"):
+            found = _find(slam, sight, roles, settings)
+    if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
+        slam = _settled(slam, clock)
+        found = moved_with(found, slam.keyframes[found.keyframe.number])
     if slam.lost and (found is None or not found.accepted):
         with clock.measure("relocalise"):
             place = relocalise(sight, slam.keyframes, slam, roles)
@@ -164,22 +189,45 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         keyframe = make_keyframe(
             number, frame, found.pose, sight.description, roles, settings, slam.intrinsics, sight.found_lines
         )
-    with clock.measure("match keyframes"):
-        tie = tie_to(found, number)
-        if found.keyframe.number not in slam.window:
-            slam = _window_around(slam, found.keyframe.number, settings)
-        slam = enter(slam, keyframe, roles, settings, tied_to=found.keyframe.number)
-        slam = replace(slam, factors=(*slam.factors, tie), reference=(number, sight.view))
-        slam = _with_pair(slam, tie)
-        slam = constrain_rotation(slam, settings)
-    with clock.measure("adjust window"):
-        slam = adjust(slam, settings)
-    with clock.measure("relocalise"):
-        slam = join_pieces(slam, sight, roles, settings)
+    slam = _mapped(slam, keyframe, found, sight, roles, settings, clock)
     arrival = (found.keyframe.number, found.relative)
     evidence = found.evidence
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)
     return replace(slam, frames=(*slam.frames, record))
+
+
+def _mapped(
+    slam: Slam, keyframe: Keyframe, found: Track, sight: Sight, roles: Roles, settings: SlamSettings, clock: Clock
+) -> Slam:
+    """The state with a new keyframe, whose window is matched and adjusted.
+
+    Beside tracking where the keyframe's own depth places the next frames, and where there is one piece of map only.
+    """
+    tie, tied_to = tie_to(found, keyframe.number), found.keyframe.number
+    if tied_to not in slam.window:
+        slam = _window_around(slam, tied_to, settings)
+    reference = (keyframe.number, sight.view)
+
+    def adjusted(own: str) -> Slam:
+        with clock.measure("match keyframes" + own):
+            entered = enter(slam, keyframe, roles, settings, tied_to=tied_to)
+            entered = _with_pair(replace(entered, factors=(*slam.factors, tie), reference=reference), tie)
+            entered = constrain_rotation(entered, settings)
+        with clock.measure("adjust window" + own):
+            return adjust(entered, settings)
+
+    if slam.metric and len(slam.origins) == 1:
+        begun = replace(
+            slam,
+            keyframes=(*slam.keyframes, keyframe),
+            window=(*slam.window, keyframe.number),
+            factors=(*slam.factors, tie),
+            reference=reference,
+        )
+        return begin_window(begun, lambda: adjusted(" (own thread)"))
+    slam = adjusted("")
+    with clock.measure("relocalise"):
+        return join_pieces(slam, sight, roles, settings)
 
 
 def _with_pair(slam: Slam, tie: MeasuredRelativePose) -> Slam:

@@ -23,6 +23,7 @@ from vggtgeo.slam.description import Description
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.loops import close_loops
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import RgbdView
@@ -60,7 +61,8 @@ def run(
         known_map: what `vggtgeo.load_map` gave; the frames are placed in it, and extend it.
 
     Yields:
-        The state: poses are world -> camera, lengths metres where `metric`. `vggtgeo.finish` adjusts the last one as a
+        The state: poses are world -> camera, lengths metres where `metric`. The newest keyframe's window is adjusted
+        beside tracking, and its result is in the state a few frames later. `vggtgeo.finish` adjusts the last one as a
         whole, `vggtgeo.Result.of` makes trajectory and map of one.
 
     Example:
@@ -115,7 +117,7 @@ def finish(
         Slam(1 frame, 1 keyframe, tracking)
 
     """
-    roles, settings = roles or default_roles(slam.metric), settings or SlamSettings()
+    slam, roles, settings = settled(slam), roles or default_roles(slam.metric), settings or SlamSettings()
     fixed = settings.keyframes.localise_only or not settings.refinement.global_adjustment
     if fixed or len(slam.keyframes) < 3:
         return slam

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -52,6 +53,19 @@ class Waiting:
 
 
 @dataclass(frozen=True, eq=False)
+class PendingWindow:
+    """An adjustment of the window that goes on beside tracking, see `pending_window.py`.
+
+    due: number of frames from which on the state has its result. begun: the state that it began with. result: that
+    state, adjusted.
+    """
+
+    due: int
+    begun: Slam
+    result: Future[Slam]
+
+
+@dataclass(frozen=True, eq=False)
 class Slam:
     """Everything known after some frames.
 
@@ -68,7 +82,8 @@ class Slam:
     was lost. origins: the first keyframe of each piece of the map; pieces are tied to nothing else.
     metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
     world), as the first keyframes saw them. notes: what the user should know.
-    pose_sigma: of each keyframe after the last adjustment, see `pose_uncertainty.keyframe_sigma`.
+    pose_sigma: of each keyframe after the last adjustment, see `pose_uncertainty.keyframe_sigma`. pending: the
+    adjustment of the newest keyframe's window, while it goes on.
     """
 
     intrinsics: np.ndarray
@@ -93,11 +108,17 @@ class Slam:
     held: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
     pose_sigma: np.ndarray | None = None
+    pending: PendingWindow | None = None
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)
         doing = "lost" if self.lost else "waiting for parallax" if self.waiting else "tracking"
         return f"Slam({frames} frame{'s' * (frames != 1)}, {keyframes} keyframe{'s' * (keyframes != 1)}, {doing})"
+
+    @property
+    def adjusted_keyframes(self) -> tuple[Keyframe, ...]:
+        """All but the newest, where that one's window is still being adjusted."""
+        return self.keyframes if self.pending is None else self.keyframes[:-1]
 
     @property
     def calibrated(self) -> bool:

@@ -2,6 +2,8 @@
 
 Everything is stored, also what could be made again (the view of the reference, the last window's problem): that needs
 the poses and the camera of the moment when it was made, which are gone, and costs more to compute than to read.
+A window that is adjusted beside tracking is waited for, and its result is stored apart: it is taken up at the frame at
+which it is due.
 """
 
 from __future__ import annotations
@@ -37,13 +39,13 @@ from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.keyframe_images import CompressedImage, KeyframeImages
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import Gray, RgbdView, Samples, Surface
-from vggtgeo.slam.state import FramePose, Slam, Waiting
+from vggtgeo.slam.state import FramePose, PendingWindow, Slam, Waiting
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(Slam, FramePose, Waiting, Evidence, Keyframe, Slots, KeyframeImages, CompressedImage),
+    *(Slam, PendingWindow, FramePose, Waiting, Evidence, Keyframe, Slots, KeyframeImages, CompressedImage),
     *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
     *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, WindowPrior, MarginalPrior),
     *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),

@@ -221,6 +221,12 @@ def refined_by_map(
     return replace(better, alone=found)
 
 
+def moved_with(found: Track, keyframe: Keyframe) -> Track:
+    """The same track once its keyframe has been adjusted: what was measured is the motion from there."""
+    alone = None if found.alone is None else moved_with(found.alone, keyframe)
+    return replace(found, keyframe=keyframe, pose=rigid.orthonormal(found.relative @ keyframe.pose), alone=alone)
+
+
 def tie_to(found: Track, number: int) -> MeasuredRelativePose:
     """What the track of a frame that is now keyframe `number` says of its motion from the one it was tracked against.
 

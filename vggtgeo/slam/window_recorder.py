@@ -21,7 +21,7 @@ _sizes_jit = eqx.filter_jit(residual_sizes)
 
 @dataclass(frozen=True)
 class WindowRecord:
-    """What one adjustment of the window left: number and time of the frame, residuals, effort.
+    """What one adjustment of the window left: number and time of its newest keyframe's frame, residuals, effort.
 
     rms, counts: RMS residual and number of observations of each term on landmarks and poses, by its name, where it has
     any; units: of the residuals (`px`, `sigma`). iterations: tried steps. energy: `1/2 sum rho` before and after.
@@ -56,8 +56,14 @@ class WindowRecorder(Callback):
     def on_warm_up(self, problem: Problem, state: State) -> None:
         jax.block_until_ready(_sizes_jit(problem, state).rms)
 
-    @in_double_precision
     def on_frame(self, slam: Slam, frame: Frame) -> None:
+        self._note(slam)
+
+    def on_adjust(self, slam: Slam) -> None:
+        self._note(slam)
+
+    @in_double_precision
+    def _note(self, slam: Slam) -> None:
         if slam.solved is None or slam.solved is self._last:
             return
         self._last = slam.solved
@@ -65,11 +71,12 @@ class WindowRecorder(Callback):
         sizes = _sizes_jit(adjustment.problem, state)
         shown = [term for term in adjustment.problem.terms if not isinstance(term, CameraTerm | DenseTerm)]
         counts = {term.name: int(sizes.count[term.name]) for term in shown}
+        newest = slam.keyframes[adjustment.keyframes[-1]]
         energies = slam.energies if slam.energies is not None else np.full(2, np.nan)
         self.records.append(
             WindowRecord(
-                frame.index,
-                frame.timestamp,
+                newest.frame,
+                newest.timestamp,
                 {name: float(sizes.rms[name]) for name, count in counts.items() if count},
                 {name: count for name, count in counts.items() if count},
                 {term.name: term.unit for term in shown if counts[term.name]},

@@ -50,10 +50,10 @@ class RerunCallback(Callback):
         for note in slam.notes[self._notes :]:
             entities.log_note(self.stream, note)
         self._notes = len(slam.notes)
-        self._recorder.on_frame(slam, frame)
-        if len(slam.keyframes) > self._keyframes:
-            self._keyframes = len(slam.keyframes)
-            self._log_new_keyframe(slam)
+        self._log_adjusted(slam)
+
+    def on_adjust(self, slam: Slam) -> None:
+        self._log_adjusted(slam)
 
     def on_finish(self, slam: Slam, cloud: PointCloud) -> None:
         """The path after the last adjustment, and the map."""
@@ -63,8 +63,17 @@ class RerunCallback(Callback):
         entities.log_note(self.stream, f"finished: {counts}", level="INFO")
         flush(self.stream)
 
+    @in_double_precision
+    def _log_adjusted(self, slam: Slam) -> None:
+        """Keyframes appear once their window is adjusted."""
+        self._recorder.on_adjust(slam)
+        if len(slam.adjusted_keyframes) > self._keyframes:
+            self._keyframes = len(slam.adjusted_keyframes)
+            self._log_new_keyframe(slam)
+
     def _log_new_keyframe(self, slam: Slam) -> None:
-        members = [slam.keyframes[number] for number in slam.window]
+        numbers = slam.window if slam.solved is None else slam.solved[0].keyframes
+        members = [slam.keyframes[number] for number in numbers]
         newest = members[-1].number
         joined = [pair for pair in slam.pairs if pair.second == newest]
         entities.log_keyframe(self.stream, members[-1], max(joined, key=lambda pair: pair.first, default=None))

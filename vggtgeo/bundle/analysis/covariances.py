@@ -136,6 +136,13 @@ def covariances(
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
     asked = jnp.arange(problem.num_keyframes) if keyframes is None else jnp.asarray(keyframes)
     _check_size(solver, problem.num_keyframes, len(asked))
+    return _covariances_jit(problem, state, solver, asked)
+
+
+@eqx.filter_jit  # one operation after the other, as outside `jit`, would be compiled one by one: for most of a minute
+def _covariances_jit(
+    problem: Problem, state: State, solver: AbstractReducedSolver, asked: Int[Array, " h"]
+) -> Covariances:
     ready = prepared(problem)
     found = covariance(linearise(ready, state), solver, asked)
     return Covariances(

@@ -71,21 +71,34 @@ def observability(problem: Problem, state: State) -> Observability:
         True
 
     """
-    large = problem.num_keyframes > DENSE_KEYFRAMES
-    if large:
-        _check_large(problem, state)
-    systems, everything, coordinates = (_linearise_jit if large else _linearise_each)(problem, state)
+    if problem.num_keyframes <= DENSE_KEYFRAMES:
+        return _observability_jit(problem, state)
+    _check_large(problem, state)
+    systems, everything, coordinates = _linearise_jit(problem, state)
+    layout = sparse_layout(everything)
+    blocks = (_blocks_jit(systems, keep, problem.fraction, layout) for keep in _selections(len(systems), state))
+    found = [_sparse_spectrum(own, layout, coordinates) for own in blocks]
+    return _found(problem, state, systems, coordinates, jax.tree.map(lambda *leaves: jnp.stack(leaves), *found))
+
+
+@eqx.filter_jit
+def _observability_jit(problem: Problem, state: State) -> Observability:
+    systems, _, coordinates = _linearise_each(problem, state)
+    combined = lambda keep: reduce(_combine(systems, keep, problem.fraction))
+    spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), _selections(len(systems), state))
+    return _found(problem, state, systems, coordinates, spectra)
+
+
+def _selections(count: int, state: State) -> Float[Array, "m k"]:
+    """Which terms are looked at together: all, each alone, all but each."""
+    each = jnp.eye(count, dtype=state.inverse_depth.dtype)
+    return jnp.concatenate([jnp.ones_like(each[:1]), each, 1 - each])
+
+
+def _found(
+    problem: Problem, state: State, systems: list[ArrowSystem], coordinates: _Coordinates, spectra: Spectra
+) -> Observability:
     count, directions = len(systems), coordinates.common
-    selections = jnp.concatenate([jnp.ones((1, count)), jnp.eye(count), 1 - jnp.eye(count)])
-    selections = selections.astype(directions.dtype)
-    if large:
-        layout = sparse_layout(everything)
-        blocks = (_blocks_jit(systems, keep, problem.fraction, layout) for keep in selections)
-        found = [_sparse_spectrum(own, layout, coordinates) for own in blocks]
-        spectra = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
-    else:
-        combined = lambda keep: reduce(_combine(systems, keep, problem.fraction))
-        spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), selections)
     part = lambda start, end: jax.tree.map(lambda leaf: leaf[start:end], spectra)
     balanced = directions * coordinates.scale
     size = jnp.linalg.norm(balanced, axis=1, keepdims=True)

@@ -1,0 +1,61 @@
+"""A window that is adjusted beside tracking: when the state takes it up, and what it keeps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.pending_window import LAG, begin_window, is_due, settled
+from vggtgeo.slam.state import FramePose, Slam
+
+CAMERA = np.array([100.0, 100.0, 50.0, 50.0])
+STATE = Slam(CAMERA, CAMERA, np.ones(4), True, window=(0, 1), notes=("before",))
+
+
+def _tie(first: int, second: int) -> MeasuredRelativePose:
+    return MeasuredRelativePose(first, second, np.eye(4), np.eye(6))
+
+
+def test_what_was_noted_meanwhile_is_kept() -> None:
+    """Window, camera and notes of the adjustment, and the frames, factors and notes of tracking; oracle: by hand."""
+    early, found, late = _tie(0, 1), _tie(1, 2), _tie(0, 2)
+    begun = replace(STATE, factors=(early,))
+    slam = begin_window(
+        begun,
+        lambda: replace(
+            begun, intrinsics=2 * CAMERA, window=(1, 2), factors=(early, found), notes=("before", "adjusted")
+        ),
+    )
+    frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
+    slam = replace(slam, frames=(frame,), factors=(*slam.factors, late), notes=(*slam.notes, "tracked"))
+    after = settled(slam)
+    assert after.pending is None
+    assert after.window == (1, 2)
+    assert after.frames == (frame,)
+    assert after.factors == (early, found, late)
+    assert after.notes == ("before", "adjusted", "tracked")
+    np.testing.assert_array_equal(after.intrinsics, 2 * CAMERA)
+    assert settled(after) is after
+
+
+def test_it_is_due_by_the_number_of_frames() -> None:
+    """Not before `LAG` frames after the keyframe's own, however soon it is done; oracle: the count."""
+    slam = begin_window(STATE, lambda: STATE)
+    assert slam.pending is not None
+    slam.pending.result.result()
+    frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
+    assert [is_due(replace(slam, frames=(frame,) * count)) for count in (1, LAG, LAG + 1)] == [False, False, True]
+    assert not is_due(settled(slam))
+
+
+def test_an_error_is_not_lost() -> None:
+    """What goes wrong in the thread is raised where its result is taken up; oracle: the error itself."""
+
+    def fails() -> Slam:
+        raise ValueError("no optimum")
+
+    with pytest.raises(ValueError, match="no optimum"):
+        settled(begin_window(STATE, fails))
