@@ -36,6 +36,8 @@ from vggtgeo.learning import WindowDataset
 from vggtgeo.results import Result
 from vggtgeo.results.files import read_uncertainty
 from vggtgeo.results.scene import Scene
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state_file import load_state, save_state
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,12 @@ def _mesh(folder: Path) -> bytes:
     return (folder / "good.ply").read_bytes()
 
 
+def _state(folder: Path) -> bytes:
+    four = np.array([50.0, 50.0, 31.5, 23.5])
+    save_state(folder / "good.npz", Slam(four, four, np.ones(4), metric=True, notes=("a note",)))
+    return (folder / "good.npz").read_bytes()
+
+
 def _windows(folder: Path) -> bytes:
     return b'{"windows": 3, "version": 1}'
 
@@ -153,6 +161,7 @@ KINDS = (
     Kind("mesh", "mesh.ply", _mesh, Mesh.load_ply),
     Kind("scene", "scene.npz", _scene, lambda file: Scene.load(file.parent), 100),
     Kind("uncertainty", "u.txt", lambda _: b"# time place turn\n0 0.01 0.1\n1 0.02 nan\n", read_uncertainty),
+    Kind("state", "s.npz", _state, load_state),
     Kind("suite", "s.toml", lambda _: TEXT.encode(), load_suite),
     Kind("windows", "windows.json", _windows, lambda file: WindowDataset.open(file.parent)),
     layout("TUM truth", tiny.tum, "data/groundtruth.txt"),

@@ -25,6 +25,7 @@ WRONG = {
     "tracking.search_map": (1,),
     "keyframes.keyframe_distance": (0.0, -1.0, float("nan"), float("inf"), "far"),
     "keyframes.keyframe_angle": (0.0, 4.0),
+    "keyframes.localise_only": (1,),
     "matching.least_covisible": (0,),
     "matching.least_matches": (-1,),
     "matching.least_line_matches": (1.0,),

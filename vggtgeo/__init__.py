@@ -80,11 +80,13 @@ if TYPE_CHECKING:
     from vggtgeo.results import Result as Result
     from vggtgeo.results import evaluate as evaluate
     from vggtgeo.results import read as read
+    from vggtgeo.results.checkpoints import Checkpoints as Checkpoints
     from vggtgeo.results.reconstruction import reconstruct as reconstruct
     from vggtgeo.simulation import SimulatedWindow as SimulatedWindow
     from vggtgeo.simulation import simulate as simulate
     from vggtgeo.simulation import simulate_window as simulate_window
     from vggtgeo.slam.callback import Callback as Callback
+    from vggtgeo.slam.known_map import load_map as load_map
     from vggtgeo.slam.presets import perception as perception
     from vggtgeo.slam.run import finish as finish
     from vggtgeo.slam.run import frame_trajectory as frame_trajectory
@@ -152,6 +154,8 @@ _HOME = {
     "results.reconstruction": ("reconstruct",),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
     "slam.callback": ("Callback",),
+    "results.checkpoints": ("Checkpoints",),
+    "slam.known_map": ("load_map",),
     "slam.presets": ("perception",),
     "slam.run": ("finish", "frame_trajectory", "run"),
     "slam.setting_groups": (

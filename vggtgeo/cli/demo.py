@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
+from vggtgeo.cli.run_options import ResumeOption
 from vggtgeo.cli.settings_file import SettingsOption
 
 
@@ -19,6 +20,7 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the scene and its noise.")] = 0,
     assignments: AssignmentsOption = None,
     rerun: RerunOption = None,
+    resume: ResumeOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -38,7 +40,7 @@ def demo(
         sequence,
         Roles(),
         slam_settings,
-        Output(output, settings.values() if settings else {}, rerun, quiet=quiet, as_json=as_json),
+        Output(output, settings.values() if settings else {}, rerun, quiet=quiet, as_json=as_json, resume=resume),
         title=f"simulated {scene}",
         facts={"simulated": True},
     )

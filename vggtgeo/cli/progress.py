@@ -23,7 +23,7 @@ class ProgressBar(Callback):
     def __init__(self, console: Console) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         self._progress = Progress(*columns, TextColumn("{task.fields[state]}"), console=console)
-        self._notes = 0
+        self._notes = self._resumed = 0
         self._began = 0.0
         self._stage: TaskID | None = None
 
@@ -40,12 +40,17 @@ class ProgressBar(Callback):
         self._progress.start()
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        rate = len(slam.frames) / (time.perf_counter() - self._began)
+        rate = (len(slam.frames) - self._resumed) / (time.perf_counter() - self._began)
         state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {_state(slam)}"
         self._progress.update(self._task, advance=1, state=state)
         for note in slam.notes[self._notes :]:
             self._print(f"warning: {note}")
         self._notes = len(slam.notes)
+
+    def on_resume(self, so_far: None, slam: Slam) -> None:
+        self._progress.update(self._task, completed=len(slam.frames))
+        self._resumed, self._notes = len(slam.frames), len(slam.notes)
+        self._print(f"resumed after frame {slam.frames[-1].frame}, with {len(slam.keyframes)} keyframes")
 
     def on_stage(self, name: str) -> None:
         """A line of its own, whose clock runs while the stage lasts."""

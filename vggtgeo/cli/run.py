@@ -55,28 +55,39 @@ def run(
     save_depth: options.SaveDepthOption = False,
     assignments: AssignmentsOption = None,
     rerun: RerunOption = None,
+    map_file: options.MapOption = None,
+    localise_only: options.LocaliseOption = False,
+    save_map: options.SaveMapOption = None,
+    resume: options.ResumeOption = None,
+    checkpoint_every: options.CheckpointOption = 10.0,
     seed: options.SeedOption = 0,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
-    from vggtgeo.cli.pipeline_settings import Switches, pipeline_settings
+    from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
+    from vggtgeo.slam.known_map import load_map
     from vggtgeo.slam.presets import classical_roles
     from vggtgeo.slam.setting_groups import DepthSettings
+    from vggtgeo.slam.settings_table import Tables
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
     check_flags(preset, features, memory_limit_gb, fps)
     check_provider(preset, provider)
-    switches: Switches = {
+    switches: dict[str, Tables] = {
         "lines": {"line": {"use_lines": lines}},
         "confidence": {"weights": {"use_confidence": confidence}},
         "depth_prior": {"depth_terms": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},
         "global_adjustment": {"refinement": {"global_adjustment": global_adjustment}},
         "refine_intrinsics": {"camera": {"refine_intrinsics": REFINE[refine_intrinsics]}},
     }
+    if localise_only:
+        switches["localise_only"] = {"keyframes": {"localise_only": True}}
+    if save_map is not None and save_map.is_dir():
+        raise InputError(f"`--save-map` is `{save_map}`, which is a folder; give the name of a file")
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:
         sequence = open_input(path, kind, intrinsics, rgb_only, fps)
@@ -88,11 +99,18 @@ def run(
         sequence,
         perceived,
         slam_settings,
-        Output(output, flags, rerun, save_depth, quiet, as_json, source=Path(path)),
+        Output(
+            *(output, flags, rerun, save_depth, quiet, as_json),
+            source=Path(path),
+            save_map=save_map,
+            resume=resume,
+            checkpoint_every=checkpoint_every,
+        ),
         (start, end, stride),
         seed=seed,
         dense=dense,
         warned=warned,
+        known_map=None if map_file is None else load_map(map_file),
     )
 
 

@@ -80,6 +80,31 @@ DenseOption = Annotated[
 SaveDepthOption = Annotated[
     bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
 ]
+MapOption = Annotated[
+    Path | None,
+    typer.Option("--map", help="Map of an earlier run (`--save-map`): frames are placed in it, and extend it."),
+]
+LocaliseOption = Annotated[
+    bool,
+    typer.Option(
+        "--localise-only/--no-localise-only", help="Only place frames in the map of `--map`; it stays as it is."
+    ),
+]
+SaveMapOption = Annotated[
+    Path | None, typer.Option("--save-map", help="File for the map, so that another run can go on in it.")
+]
+ResumeOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--resume/--no-resume",
+        help="Go on with a run into this folder that was killed, or begin anew; without either, such a folder is "
+        "refused.",
+        show_default=False,
+    ),
+]
+CheckpointOption = Annotated[
+    float, typer.Option(help="Seconds between two states of the run that are kept for `--resume`; 0: every frame's.")
+]
 SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the samples that robust estimators draw.")]
 RateOption = Annotated[
     float | None,

@@ -18,6 +18,7 @@ from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.network_errors import as_input_errors
+from vggtgeo.results.checkpoints import EVERY, Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.run_folder import RESERVE, RunFolder, taken
@@ -38,7 +39,9 @@ class Output:
     """Where a run of the command line leaves what, and what it prints meanwhile.
 
     flags: the effective settings by the names of the flags, for `settings.toml`. rerun: where to log the run, see
-    `vggtgeo/viewing/target.py`. source: what is read, which nothing may be written into.
+    `vggtgeo/viewing/target.py`. source: what is read, which nothing may be written into. save_map: file for the map.
+    resume: whether to go on with a run into the folder that was killed; None: there must be none. checkpoint_every: s,
+    see `Checkpoints`.
     """
 
     folder: Path
@@ -48,6 +51,9 @@ class Output:
     quiet: bool = False
     as_json: bool = False
     source: Path | None = None
+    save_map: Path | None = None
+    resume: bool | None = False
+    checkpoint_every: float = EVERY
 
 
 def run_and_write(
@@ -62,6 +68,7 @@ def run_and_write(
     title: str | None = None,
     facts: Mapping[str, Any] | None = None,
     warned: Iterable[Warning | str] = (),
+    known_map: Slam | None = None,
 ) -> None:
     """Run a sequence with a progress bar, write its folder, print the report, and leave with the code of the verdict.
 
@@ -75,7 +82,10 @@ def run_and_write(
     console = Console(stderr=False, quiet=silent)
     start, end, stride = selection
     # From the first frame to the last file a signal only ends the work early; what is there is written as a whole.
-    with interruption() as stop, taken(output.folder, output.source, RESERVE) as folder:
+    with interruption() as stop, taken(output.folder, output.source, RESERVE, output.resume) as folder:
+        checkpoints = Checkpoints(folder.checkpoint, bool(output.resume), output.checkpoint_every)
+        if output.resume and not folder.checkpoint.is_file():
+            typer.echo(f"there is nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)
         callbacks, url = _rerun_callbacks(output, folder, title)
         if callbacks:
             settings = updated(settings, {"window": {"record_iterations": True}})
@@ -93,8 +103,12 @@ def run_and_write(
                 callbacks=(bar, _EarlyFiles(folder.stage, {**output.flags, **changed(settings)}), *callbacks),
                 facts=facts,
                 warned=warned,
+                checkpoints=checkpoints,
+                known_map=known_map,
             )
             bar.on_stage("writing")
+            if output.save_map is not None:
+                result.save_map(output.save_map)
             summary = result.save_into(folder, depth=output.save_depth, settings=output.flags)
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: everything was done and is written", err=True)

@@ -20,7 +20,7 @@ import typer
 
 from vggtgeo.io.errors import InputError
 
-_NOT_SETTINGS = ("settings", "help", "assignments")
+_NOT_SETTINGS = ("settings", "help", "assignments", "resume", "checkpoint_every")
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("true or false", (bool,)),
     int: ("a whole number", (int,)),

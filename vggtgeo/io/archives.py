@@ -78,8 +78,10 @@ class Archive:
             )
         return found
 
-    def read(self, names: Iterable[str], check: Callable[[Mapping[str, ArrayHeader]], None]) -> dict[str, np.ndarray]:
-        """The arrays `names`; `check` sees their headers before any data are read.
+    def read(
+        self, names: Iterable[str], check: Callable[[Mapping[str, ArrayHeader]], None], most: int = MOST_BYTES
+    ) -> dict[str, np.ndarray]:
+        """The arrays `names`, at most so many bytes; `check` sees their headers before any data are read.
 
         Raises:
             InputError: one is too much, or what `header` and `check` raise.
@@ -87,9 +89,9 @@ class Archive:
         """
         headers = {name: self.header(name) for name in names}
         total = sum(header.bytes for header in headers.values())
-        if total > MOST_BYTES:
+        if total > most:
             raise InputError(
-                f"the arrays of `{self.path}` take {total / 2**20:.0f} MiB; at most {MOST_BYTES >> 20} MiB are read"
+                f"the arrays of `{self.path}` take {total / 2**20:.0f} MiB; at most {most >> 20} MiB are read"
             )
         check(headers)
         return {name: self._data(name) for name in headers}

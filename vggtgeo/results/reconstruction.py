@@ -8,7 +8,8 @@ import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from contextlib import contextmanager
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,22 @@ from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.warned import collected_warnings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
+from vggtgeo.results.checkpoints import (
+    Checkpoints,
+    Keeper,
+    Notice,
+    RunSoFar,
+    check_same_frame,
+    digest_of_map,
+    identity,
+    resumed,
+)
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
+from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.presets import Perception
@@ -62,6 +74,8 @@ def reconstruct(
     callbacks: Iterable[Callback] = (),
     facts: Mapping[str, Any] | None = None,
     warned: Iterable[Warning | str] = (),
+    checkpoints: Checkpoints | None = None,
+    known_map: Slam | None = None,
 ) -> Result:
     """Track and map every frame, adjust the whole map, judge the result.
 
@@ -84,9 +98,12 @@ def reconstruct(
         callbacks: called with every frame.
         facts: what the summary shall say besides.
         warned: warnings about the input that came before, for the verdict and the report.
+        checkpoints: where the state of the run is kept while it goes on, and whether it goes on from the one there.
+        known_map: what `vggtgeo.load_map` gave: the frames are placed in this map, and extend it, or, with the setting
+            `keyframes.localise_only`, leave it as it is.
 
     Raises:
-        InputError: the frames cannot be read, or none of them can be used.
+        InputError: the frames cannot be read, none of them can be used, or the run to go on with is of something else.
 
     Example:
         >>> import vggtgeo as vg
@@ -102,12 +119,25 @@ def reconstruct(
         source.check(start, end, stride)
         perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric)
+        selection = (start, end, stride)
+        first = _first_state(known_map, source.camera, settings)
+        wanted = identity(
+            *(settings, perception.roles, source.known(selection)),
+            {name: session.digest for name, session in perception.networks.items()},
+            dense=dense,
+            seed=seed,
+            known_map=None if first is None else digest_of_map(first),
+        )
+        before = resumed(source.resumable(checkpoints), wanted)
         windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
         hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
-        tracked = _track(source, (start, end, stride), perception.roles, settings, hooks, stop)
-        slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
+        loop = _Loop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
+        with loop.keeping(checkpoints, wanted) as keeper:
+            tracked = loop.track(keeper)
+            slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
+        began -= 0.0 if before is None else before.whole
         report = compare(slam, source.truth)
         known = {
             **perception.facts(),
@@ -115,7 +145,7 @@ def reconstruct(
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
         }
-        notices = (*warned, *collected)
+        notices = (*warned, *(collected if before is None else before.unsaid(collected)))
         ending = _Ending(
             slam, source.truth, report, notices, perception.refusals, title or source.name, known, clock, began, dense
         )
@@ -197,6 +227,21 @@ class _Source:
         length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames) or sys.maxsize
         check_selection(self.name, length, start, end, stride)
 
+    def known(self, selection: tuple[int, int | None, int]) -> dict[str, Any]:
+        """What tells this source from another before a frame is read."""
+        length = None if isinstance(self.frames, FrameStream) else len(self.frames)
+        size = f"{self.camera.width} x {self.camera.height}"
+        return {
+            **{"name": self.name, "frames": length, "size": size, "camera": self.camera},
+            **{"depth": self.has_depth, "start, end, stride": selection},
+        }
+
+    def resumable(self, asked: Checkpoints | None) -> Checkpoints | None:
+        """InputError for a resumed run over frames that do not come again."""
+        if asked is not None and asked.resume and self.count(0, None, 1) is None:
+            raise InputError(f"the frames of `{self.name}` come once: such a run cannot be resumed")
+        return asked
+
     def count(self, start: int, end: int | None, stride: int) -> int | None:
         """Frames of a selection; None where only their end will tell."""
         if isinstance(self.frames, FrameStream):
@@ -226,6 +271,15 @@ def _truth(sequence: Sequence) -> Trajectory | None:
         return None
 
 
+def _first_state(known: Slam | None, camera: Camera, settings: SlamSettings) -> Slam | None:
+    """Before the first frame, in a map that is known; InputError for one of another camera, or where one is needed."""
+    if known is not None:
+        return entered(known, camera)
+    if settings.keyframes.localise_only:
+        raise InputError("`keyframes.localise_only` needs a map to place frames in: give `known_map` (`--map FILE`)")
+    return None
+
+
 def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:
     found = roles if isinstance(roles, Perception) else Perception(roles or default_roles(has_depth), {})
     return replace(found, roles=found.roles.seeded(seed)) if seed else found
@@ -245,6 +299,16 @@ class _Callbacks:
         for member in self.members:
             member.on_warm_up(*compiled)
 
+    def so_far(self) -> dict[str, Any]:
+        """What those that have something to keep give, by the names of their classes."""
+        found = {type(member).__name__: member.so_far() for member in self.members}
+        return {name: value for name, value in found.items() if value is not None}
+
+    def resume(self, before: RunSoFar) -> None:
+        """Each goes on from what it gave."""
+        for member in self.members:
+            member.on_resume(before.callbacks.get(type(member).__name__), before.slam)
+
     def each(self, hook: str, *arguments: Any) -> None:
         """Call one hook of every member."""
         with self.clock.measure("record and draw"):
@@ -261,37 +325,96 @@ class _Tracked:
     frames_per_second: float
 
 
-def _track(
-    source: _Source,
-    selection: tuple[int, int | None, int],
-    roles: Roles,
-    settings: SlamSettings,
-    hooks: _Callbacks,
-    stop: Interruption,
-) -> _Tracked:
-    """The loop over frames; Ctrl-C ends it after a whole frame, an input error of the sequence without a result."""
-    slam: Slam | None = None
-    interrupted = False
-    given: dict[int, Frame] = {}
-    hooks.each("on_begin", source.name, source.count(*selection))
-    frames = _remembered(source.frames.frames(*selection), given)
-    began = time.perf_counter()
-    try:
-        for slam in run_frames(frames, source.camera, roles, settings, hooks.clock):
-            hooks.each("on_frame", slam, given.pop(slam.frames[-1].frame))
-            if stop.asked:
-                break
-    except KeyboardInterrupt:
-        interrupted = True
-    interrupted = interrupted or stop.asked
-    if slam is None or not slam.frames:
+@dataclass(frozen=True, eq=False)
+class _Loop:
+    """The loop over frames. collected: warnings so far. began: of the run, s. before: the run that this one goes on.
+    first: the state before the first frame, where there is a map.
+    """
+
+    source: _Source
+    selection: tuple[int, int | None, int]
+    perception: Perception
+    settings: SlamSettings
+    hooks: _Callbacks
+    stop: Interruption
+    collected: list[Warning | str]
+    began: float
+    before: RunSoFar | None
+    first: Slam | None
+
+    @contextmanager
+    def keeping(self, asked: Checkpoints | None, wanted: Mapping[str, str]) -> Iterator[Keeper | None]:
+        """What keeps the state, where it is asked for and could be gone on with; its last file is whole at the end."""
+        if asked is None or self.source.count(*self.selection) is None:
+            yield None
+            return
+        first = time.perf_counter()
+        keeper = Keeper(asked, wanted, lambda slam: self._so_far(slam, first), self._tell)
+        try:
+            yield keeper
+        finally:
+            keeper.close()
+
+    def track(self, keeper: Keeper | None) -> _Tracked:
+        """Ctrl-C ends it after a whole frame, an input error of the sequence without a result."""
+        known = self.first if self.before is None else self.before.slam
+        slam, frame, interrupted = known, None, False
+        given: dict[int, Frame] = {}
+        self.hooks.each("on_begin", self.source.name, self.source.count(*self.selection))
+        began = time.perf_counter()
+        try:
+            frames = _remembered(self._frames(keeper), given)
+            roles, clock = self.perception.roles, self.hooks.clock
+            for slam in run_frames(frames, self.source.camera, roles, self.settings, clock, known):
+                frame = given.pop(slam.frames[-1].frame)
+                self.hooks.each("on_frame", slam, frame)
+                if keeper is not None:
+                    keeper.on_frame(slam, frame)
+                if self.stop.asked:
+                    break
+        except KeyboardInterrupt:
+            interrupted = True
+        interrupted = interrupted or self.stop.asked
+        if slam is None or not slam.frames:
+            if interrupted:
+                raise KeyboardInterrupt
+            raise InputError(f"`{self.source.name}` gave no frame that could be used; nothing was written")
         if interrupted:
-            raise KeyboardInterrupt
-        raise InputError(f"`{source.name}` gave no frame that could be used; nothing was written")
-    if interrupted:
-        hooks.each("on_message", "interrupted: keeping what there is")
-    slam = settled(slam)
-    return _Tracked(slam, interrupted, len(slam.frames) / (time.perf_counter() - began))
+            self._tell("interrupted: keeping what there is")
+        elif keeper is not None:
+            keeper.on_end(slam, frame)
+        slam = settled(slam)
+        earlier = 0.0 if self.before is None else self.before.tracking
+        return _Tracked(slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began))
+
+    def _frames(self, keeper: Keeper | None) -> Iterator[Frame]:
+        """The frames of the selection, or what is left of it after the last that was tracked, which is looked at."""
+        start, end, stride = self.selection
+        if self.before is None or keeper is None:
+            return iter(self.source.frames.frames(start, end, stride))
+        frames = iter(self.source.frames.frames(self.before.slam.frames[-1].frame, end, stride))
+        check_same_frame(keeper.asked, next(frames, None))
+        self.before.restore_refusals(self.perception.refusals)
+        for stage, seconds in self.before.seconds.items():
+            self.hooks.clock.seconds[stage] += seconds
+        self.hooks.resume(self.before)
+        return frames
+
+    def _so_far(self, slam: Slam, first: float) -> RunSoFar:
+        now, before = time.perf_counter(), self.before
+        said = self.collected if before is None else before.unsaid(self.collected)
+        return RunSoFar(
+            slam,
+            self.hooks.so_far(),
+            tuple(map(Notice.of, said)),
+            {role: astuple(counts) for role, counts in self.perception.refusals.items()},
+            dict(self.hooks.clock.seconds),
+            now - first + (0.0 if before is None else before.tracking),
+            now - self.began + (0.0 if before is None else before.whole),
+        )
+
+    def _tell(self, text: str) -> None:
+        self.hooks.each("on_message", text)
 
 
 def _adjust(

@@ -32,6 +32,7 @@ from vggtgeo.results.files import (
 from vggtgeo.results.run_folder import RunFolder, check_finished, taken
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise, with_writing
+from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -219,6 +220,17 @@ class Result:
         write_json(place / "summary.json", plain)
         run.publish()
         return plain
+
+    def save_map(self, path: str | os.PathLike[str]) -> None:
+        """Writes the map that another run can go on in (`vggtgeo.load_map`, `vggtgeo run --map`), atomically.
+
+        Raises:
+            InputError: the result was read from a folder, or has no keyframe.
+
+        """
+        if self.record is None:
+            raise InputError("a map needs a result that is still in memory; this one was read from a folder")
+        save_map(path, self.record.slam)
 
     def _save_mesh(self, path: Path) -> None:
         if self.mesh is not None:

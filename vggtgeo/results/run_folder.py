@@ -4,6 +4,9 @@ While a run goes on, everything that it writes goes to `FOLDER/unfinished/`, and
 `publish` then takes the old files away, the summary first, and moves the new ones in, the summary last. These are
 renames within one file system; signals wait until they are done. Should the process be killed between two of them, the
 folder holds files of one run only, without a summary, and `unfinished/` says so.
+
+What a run keeps of its state (`checkpoints.py`) is there, too, and outlives a run that does not publish: the next run
+goes on from it or throws it away, as it is told by `resume`, and without a word is refused.
 """
 
 from __future__ import annotations
@@ -24,10 +27,13 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import LockedError, locked
+from vggtgeo.results.checkpoints import frames_kept
 
 UNFINISHED = "unfinished"
 """Folder, inside that of the run, of what a run has written before it is done."""
 SUMMARY = "summary.json"
+CHECKPOINT = "checkpoint.npz"
+"""In `unfinished/`: the state that a killed run can go on from."""
 NAMES = (
     SUMMARY,
     "settings.toml",
@@ -69,6 +75,11 @@ class RunFolder:
         """Where the files of the run go before they are all there."""
         return self.folder / UNFINISHED
 
+    @property
+    def checkpoint(self) -> Path:
+        """File of the state that a killed run can go on from."""
+        return self.stage / CHECKPOINT
+
     def release_reserve(self) -> None:
         """Gives back the space that was held for the results: now they are written."""
         (self.stage / _RESERVED).unlink(missing_ok=True)
@@ -78,7 +89,8 @@ class RunFolder:
         with interruption():
             self.release_reserve()
             (self.stage / _NOTE).unlink(missing_ok=True)
-            new = sorted(self.stage.iterdir(), key=lambda path: path.name == SUMMARY)
+            written = (path for path in self.stage.iterdir() if path.name != CHECKPOINT)
+            new = sorted(written, key=lambda path: path.name == SUMMARY)
             strange = [path.name for path in new if not _is_known(path.name)]
             if strange:
                 raise ValueError(
@@ -89,22 +101,28 @@ class RunFolder:
                     _remove(path)
             for path in new:
                 os.replace(path, self.folder / path.name)
+            self.checkpoint.unlink(missing_ok=True)
 
 
 @contextmanager
-def taken(folder: str | os.PathLike[str], source: Path | None = None, reserve: int = 0) -> Iterator[RunFolder]:
+def taken(
+    folder: str | os.PathLike[str], source: Path | None = None, reserve: int = 0, resume: bool | None = False
+) -> Iterator[RunFolder]:
     """Takes a folder for one run; what is in it stays as it is until `publish`.
 
     Without `publish` nothing is left: neither `unfinished/` nor a folder that was made for it, unless there are poses
-    in `unfinished/` (the disk was full when the results were written, say).
+    in `unfinished/` (the disk was full when the results were written, say), or a state that a run can go on from.
 
     Args:
         folder: made where it does not exist.
         source: file or folder that the run reads.
         reserve: bytes to hold for the results.
+        resume: whether the state that a killed run left there is kept (else it is thrown away); None: it must not be
+            there.
 
     Raises:
-        InputError: it cannot be written, another run writes into it, or it holds a sequence of images.
+        InputError: it cannot be written, another run writes into it, it holds a sequence of images, or it holds the
+            state of a killed run and nobody said what shall become of it.
 
     """
     place = Path(folder)
@@ -122,7 +140,9 @@ def taken(folder: str | os.PathLike[str], source: Path | None = None, reserve: i
             except OSError as error:
                 raise _not_written(place, error) from None
             try:
-                yield _begun(RunFolder(place), reserve)
+                if resume is None:
+                    _refuse_unfinished(RunFolder(place))
+                yield _begun(RunFolder(place), reserve, bool(resume))
             finally:
                 _end(place / UNFINISHED)
     finally:
@@ -135,16 +155,24 @@ def check_finished(folder: Path) -> str | None:
     stage = folder / UNFINISHED
     if not stage.is_dir():
         return None
-    return f"a run into `{folder}` goes on or was killed: what it has so far is in `{stage}`" + (
-        ", and the files beside that are of the run before" if (folder / SUMMARY).is_file() else ""
-    )
+    older = ", and the files beside that are of the run before" if (folder / SUMMARY).is_file() else ""
+    further = "; `vggtgeo run --resume` goes on with it" if (stage / CHECKPOINT).is_file() else ""
+    return f"a run into `{folder}` goes on or was killed: what it has so far is in `{stage}`{older}{further}"
 
 
-def _begun(run: RunFolder, reserve: int) -> RunFolder:
-    """An empty stage that can be written, with a note for whoever finds it."""
+def _refuse_unfinished(run: RunFolder) -> None:
+    if run.checkpoint.is_file():
+        raise InputError(
+            f"`{run.folder}` holds a run that was killed after {frames_kept(run.checkpoint)}: add `--resume` to go on "
+            "with it, or `--no-resume` to begin anew"
+        )
+
+
+def _begun(run: RunFolder, reserve: int, resume: bool) -> RunFolder:
+    """An empty stage that can be written, with a note for whoever finds it, and the state of a run to be resumed."""
     try:
-        _remove(run.stage)
-        run.stage.mkdir()
+        _empty(run.stage, CHECKPOINT if resume else None)
+        run.stage.mkdir(exist_ok=True)
         write_text(
             run.stage / _NOTE,
             "A run that goes on, or that was killed. The files in the folder above, if any, are of the run before.\n",
@@ -153,9 +181,19 @@ def _begun(run: RunFolder, reserve: int) -> RunFolder:
             with (run.stage / _RESERVED).open("wb") as file:
                 _allocate(file.fileno(), reserve)
     except OSError as error:
-        _remove(run.stage)
+        _end(run.stage)
         raise _not_written(run.folder, error, reserve) from None
     return run
+
+
+def _empty(stage: Path, kept: str | None) -> None:
+    """Takes all of `stage` away but one file."""
+    if kept is None or not (stage / kept).is_file():
+        _remove(stage)
+        return
+    for path in stage.iterdir():
+        if path.name != kept:
+            _remove(path)
 
 
 def _allocate(file: int, size: int) -> None:
@@ -168,8 +206,8 @@ def _allocate(file: int, size: int) -> None:
 
 
 def _end(stage: Path) -> None:
-    """Takes `stage` away, unless poses that were not published are in it."""
-    if (stage / "trajectory.txt").is_file():
+    """Takes `stage` away, unless poses that were not published, or a state to go on from, are in it."""
+    if (stage / "trajectory.txt").is_file() or (stage / CHECKPOINT).is_file():
         (stage / _RESERVED).unlink(missing_ok=True)
     else:
         _remove(stage)

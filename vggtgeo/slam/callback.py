@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.point_cloud import PointCloud
@@ -27,6 +29,15 @@ class Callback:
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         """The state after `frame` (as it was read, before undistortion)."""
+
+    def so_far(self) -> Any:
+        """What a run that is killed and resumed must hand to `on_resume`: numbers, texts, arrays, tuples of them. Asked
+        between two frames; what is given is never changed later. None: nothing.
+        """
+        return None
+
+    def on_resume(self, so_far: Any, slam: Slam) -> None:
+        """After `on_begin`, where a run goes on: what `so_far` gave after the last frame of `slam`."""
 
     def on_adjust(self, slam: Slam) -> None:
         """The state after the last frame, before the adjustment of the whole map."""

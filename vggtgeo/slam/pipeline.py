@@ -13,6 +13,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.covisibility import without_matches
 from vggtgeo.slam.description import Description
+from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
@@ -62,7 +63,7 @@ def step(
         roles = without_depth(roles)
     if not slam.keyframes:
         return _first(slam, frame, description.features, roles, settings)
-    if not _started(slam):
+    if not _in_known_map(slam) and not _started(slam):
         with clock.measure("start"):
             features = description.features
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
@@ -78,6 +79,11 @@ def _settled(slam: Slam, clock: Clock) -> Slam:
 def _started(slam: Slam) -> bool:
     """Whether there is a map to track in. A later keyframe may well be without depth: its neighbours have some."""
     return len(slam.window) > 1 or bool(np.any(np.isfinite(slam.keyframes[slam.window[-1]].points.inverse_depth)))
+
+
+def _in_known_map(slam: Slam) -> bool:
+    """Whether there is a map that no frame has been tracked in so far, or none that became a keyframe."""
+    return not slam.window
 
 
 def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
@@ -106,21 +112,23 @@ def _follow(
 ) -> Slam:
     with clock.measure("track"):
         sight = _with_lines(sight_of(frame, description, slam, roles), roles, settings)
-        found = _find(slam, sight, roles, settings)
-    if slam.pending is not None and not found.accepted:
+        # In a map of another run nothing tells where the first frame is: it is searched by what it looks like alone.
+        blind = _in_known_map(slam) and slam.reference is None
+        found = None if blind else _find(slam, sight, roles, settings)
+    if slam.pending is not None and (found is None or not found.accepted):
         slam = _settled(slam, clock)
         with clock.measure("track"):
             found = _find(slam, sight, roles, settings)
-    if slam.pending is not None and _needs_keyframe(found, settings):
+    if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
         slam = _settled(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
-    if not found.accepted and slam.lost:
+    if slam.lost and (found is None or not found.accepted):
         with clock.measure("relocalise"):
             place = relocalise(sight, slam.keyframes, slam, roles)
         if place is not None:
             return _found_again(slam, sight, place, roles, settings, clock)
-    if not found.accepted:
-        return _missed(slam, sight, found, roles, settings)
+    if found is None or not found.accepted:
+        return _missed(slam, sight, Evidence() if found is None else found.evidence, roles, settings)
     was_lost = bool(slam.lost)
     if was_lost:
         slam = _noted_found(slam, frame)
@@ -171,8 +179,9 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     frame = sight.frame
     if _needs_keyframe(found, settings):
         with clock.measure("track"):
-            slam, found = _seen_before(slam, sight, found, roles, settings)
-    if not _needs_keyframe(found, settings):
+            tied, found = _seen_before(slam, sight, found, roles, settings)
+            slam = slam if settings.keyframes.localise_only else tied
+    if settings.keyframes.localise_only or not _needs_keyframe(found, settings):
         slam = _refer_to(slam, found.keyframe, roles)
         return replace(slam, frames=(*slam.frames, record_of(frame, found)))
     number = len(slam.keyframes)
@@ -245,6 +254,8 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:
     note = f"found again at frame {frame.index} ({frame.name}), {slam.lost} frames after tracking was lost"
+    if _in_known_map(slam) and slam.reference is None:
+        note = f"frame {frame.index} ({frame.name}) is the first that was found in the map"
     return replace(slam, notes=(*slam.notes, note))
 
 
@@ -256,7 +267,7 @@ def _found_again(slam: Slam, sight: Sight, place: Track, roles: Roles, settings:
     return place_waiting(slam, roles)
 
 
-def _missed(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
+def _missed(slam: Slam, sight: Sight, evidence: Evidence, roles: Roles, settings: SlamSettings) -> Slam:
     """No pose; after too many such frames begin a piece of map of its own."""
     frame, features = sight.frame, sight.features
     if slam.lost == 0:
@@ -265,15 +276,16 @@ def _missed(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: Slam
     waiting = wait(slam, frame, features, MOST_WAITING)
     slam = replace(slam, lost=slam.lost + 1)
     shown = sum(len(other.features) > settings.tracking.least_inliers for other in waiting)
-    if shown > LOST_PATIENCE and len(features) > settings.tracking.least_inliers:
+    patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE
+    if not patient and len(features) > settings.tracking.least_inliers:
         note = (
             f"a new piece of map begins at frame {frame.index} ({frame.name}): "
             "nothing ties it to the one before, its place is only a guess"
         )
         begun = _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
         return place_waiting(begun, roles) if _started(begun) else begun
-    last = slam.frames[-1]
-    record = FramePose(frame.index, frame.timestamp, last.reference, last.relative, False, 0, found.evidence)
+    reference, relative = (slam.frames[-1].reference, slam.frames[-1].relative) if slam.frames else (0, np.eye(4))
+    record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, evidence)
     return replace(slam, frames=(*slam.frames, record), waiting=waiting)
 
 

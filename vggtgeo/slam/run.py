@@ -21,6 +21,7 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.global_adjustment import adjust_all
+from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.loops import close_loops
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pipeline import begin, step
@@ -43,6 +44,7 @@ def run(
     end: int | None = None,
     stride: int = 1,
     clock: Clock | None = None,
+    known_map: Slam | None = None,
 ) -> Iterator[Slam]:
     """Track and map; yields the state after every frame, so that a caller can draw, stop or save.
 
@@ -56,6 +58,7 @@ def run(
         end: frame to stop before.
         stride: take every n-th frame.
         clock: adds up seconds by stage.
+        known_map: what `vggtgeo.load_map` gave; the frames are placed in it, and extend it.
 
     Yields:
         The state: poses are world -> camera, lengths metres where `metric`. The newest keyframe's window is adjusted
@@ -71,7 +74,9 @@ def run(
     source = frames if isinstance(frames, Sequence) else frame_stream(frames, camera)
     roles = roles or default_roles(source.has_depth)
     selected = source.frames(start, end, stride)
-    yield from run_frames(selected, source.camera, roles, settings or SlamSettings(), clock or Clock())
+    settings, clock = settings or SlamSettings(), clock or Clock()
+    known = None if known_map is None else entered(known_map, source.camera)
+    yield from run_frames(selected, source.camera, roles, settings, clock, known)
 
 
 def default_roles(has_depth: bool) -> Roles:
@@ -80,10 +85,15 @@ def default_roles(has_depth: bool) -> Roles:
 
 
 def run_frames(
-    frames: Iterable[Frame], camera: Camera, roles: Roles, settings: SlamSettings, clock: Clock
+    frames: Iterable[Frame],
+    camera: Camera,
+    roles: Roles,
+    settings: SlamSettings,
+    clock: Clock,
+    known: Slam | None = None,
 ) -> Iterator[Slam]:
-    """The same over any iterable of frames of one camera."""
-    slam = begin(camera, roles, settings)
+    """The same over any iterable of frames of one camera, on from a state that is known."""
+    slam = begin(camera, roles, settings) if known is None else known
     for frame, description in _described(frames, camera, roles, clock):
         slam = step(slam, frame, description, roles, settings, clock)
         yield slam
@@ -108,7 +118,8 @@ def finish(
 
     """
     slam, roles, settings = settled(slam), roles or default_roles(slam.metric), settings or SlamSettings()
-    if not settings.refinement.global_adjustment or len(slam.keyframes) < 3:
+    fixed = settings.keyframes.localise_only or not settings.refinement.global_adjustment
+    if fixed or len(slam.keyframes) < 3:
         return slam
     clock = clock or Clock()
     with clock.measure("loops"):

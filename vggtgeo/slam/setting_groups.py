@@ -48,6 +48,8 @@ class KeyframeSettings(CheckedSettings):
     """Metres from the keyframe that the frame is tracked against."""
     keyframe_angle: float = positive(math.radians(5.0), at_most=math.pi)
     """Radians from it."""
+    localise_only: bool = switch(False)
+    """Frames are placed in a map that is known, and never change it."""
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,15 @@ class WindowRecorder(Callback):
         self.records: list[WindowRecord] = []
         self._last: object = None
 
+    def so_far(self) -> tuple[WindowRecord, ...]:
+        """The records."""
+        return tuple(self.records)
+
+    def on_resume(self, so_far: tuple[WindowRecord, ...], slam: Slam) -> None:
+        """The last window of `slam` is among the records."""
+        self.records = list(so_far)
+        self._last = slam.solved
+
     @in_double_precision
     def on_warm_up(self, problem: Problem, state: State) -> None:
         jax.block_until_ready(_sizes_jit(problem, state).rms)

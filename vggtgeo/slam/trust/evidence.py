@@ -58,6 +58,20 @@ class FrameEvidence:
     contrast: float
 
 
+@dataclass(frozen=True, eq=False)
+class EvidenceSoFar:
+    """What an `EvidenceRecorder` noted, and what it needs to go on: small grey image and every eighth depth of the last
+    frame, the corners in that image with their tracks' numbers, the next number.
+    """
+
+    frames: tuple[FrameEvidence, ...]
+    image: np.ndarray | None
+    depth: np.ndarray | None
+    ids: np.ndarray
+    pixels: np.ndarray
+    next: int
+
+
 class EvidenceRecorder(Callback):
     """Collects a `FrameEvidence` of each frame. `vggtgeo.Result.of` takes its `frames`.
 
@@ -95,6 +109,16 @@ class EvidenceRecorder(Callback):
         while len(self._waiting) > MOST_WAITING:
             self._waiting.popleft().result()
         self._waiting.append(self._pool.submit(self._add, frame))
+
+    def so_far(self) -> EvidenceSoFar:
+        """Of the frames so far."""
+        return EvidenceSoFar(tuple(self.frames), self._image, self._depth, self._ids, self._pixels, self._next)
+
+    def on_resume(self, so_far: EvidenceSoFar, slam: Slam) -> None:
+        """The next frame follows the last of these."""
+        self._frames = list(so_far.frames)
+        self._image, self._depth, self._next = so_far.image, so_far.depth, so_far.next
+        self._ids, self._pixels = so_far.ids, so_far.pixels
 
     def add(self, frame: Frame) -> None:
         """Follow the corners into this frame, and begin new ones where there are none."""

@@ -1,0 +1,169 @@
+"""Maps that outlast their run: saved, loaded, found again, extended, or left as they are."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recorded_run import ROLES, SETTINGS
+from same_leaves import differences
+from typer.testing import CliRunner
+
+import vggtgeo as vg
+from vggtgeo.cli.main import make_app
+from vggtgeo.geometry import rigid
+from vggtgeo.results import Result
+from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.slam.connected import pieces_by_size
+from vggtgeo.slam.known_map import as_map, save_map
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state_file import save_state
+
+FRAMES, HALF = 18, 9
+FIXED = replace(SETTINGS, keyframes=replace(SETTINGS.keyframes, localise_only=True))
+
+
+@cache
+def sequence(seed: int = 0) -> Any:
+    return vg.simulate("room", FRAMES, seed, (320, 240), rate=10.0)
+
+
+def run(start: int = 0, end: int | None = None, seed: int = 0, **options: Any) -> Slam:
+    """The last state of a run over some frames."""
+    given = {"settings": SETTINGS, **options}
+    *_, slam = vg.run(sequence(seed), ROLES, **given, start=start, end=end)
+    return settled(slam)
+
+
+@cache
+def first_half() -> Slam:
+    return run(0, HALF)
+
+
+@pytest.fixture
+def known(tmp_path: Path) -> Slam:
+    """The map of the first half, as it was read."""
+    save_map(tmp_path / "room.map", first_half())
+    return vg.load_map(tmp_path / "room.map")
+
+
+def worst_error(slam: Slam) -> float:
+    """Metres between the places of the frames and the true ones in the world of the first half."""
+    truth = sequence().ground_truth().poses
+    places = [rigid.invert(slam.pose(record))[:3, 3] for record in slam.frames if record.tracked]
+    true = [(rigid.invert(truth[0]) @ truth[record.frame])[:3, 3] for record in slam.frames if record.tracked]
+    return float(np.linalg.norm(np.array(places) - true, axis=1).max())
+
+
+def test_a_map_comes_back_to_the_bit(known: Slam) -> None:
+    """All fields of the map, and none of the run; its keyframes are of frames before any run. Oracle: the state."""
+    assert list(differences(as_map(first_half()), known)) == []
+    assert (known.frames, known.window, known.solved, known.notes) == ((), (), None, ())
+    count = len(first_half().keyframes)
+    assert [keyframe.frame for keyframe in known.keyframes] == list(range(-count, 0))
+    for before, after in zip(first_half().keyframes, known.keyframes, strict=True):
+        assert (
+            list(differences(replace(before.compressed(), frame=after.frame, timestamp=after.timestamp), after)) == []
+        )
+
+
+def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:
+    """Frames that follow are found in the map and extend it: one piece, in its world; oracle: the truth."""
+    slam = run(HALF, known_map=known)
+    assert len(pieces_by_size(slam)) == 1
+    assert [record.tracked for record in slam.frames] == [True] * (FRAMES - HALF)
+    assert worst_error(slam) < 0.02
+    assert len(slam.keyframes) > len(known.keyframes)
+    assert f"frame {HALF} " in slam.notes[0]
+    assert "is the first that was found in the map" in slam.notes[0]
+
+
+def test_known_space_gets_no_second_keyframes(known: Slam) -> None:
+    """The same frames again add none: the map grows with space; oracle: the number of keyframes, and the truth."""
+    slam = run(0, HALF, known_map=known)
+    assert len(slam.keyframes) == len(known.keyframes)
+    assert all(record.tracked for record in slam.frames)
+    assert worst_error(slam) < 0.02
+
+
+def test_localising_leaves_the_map_as_it_is(known: Slam) -> None:
+    """Frames are placed, and no keyframe, match, tie or camera changes, however far they lead; oracle: the map."""
+    known = replace(known, factors=())  # so that going from keyframe to keyframe would tie them anew
+    slam = vg.finish(run(0, settings=FIXED, known_map=known), ROLES, FIXED)
+    assert len({record.reference for record in slam.frames}) > 1
+    for name in ("keyframes", "pairs", "factors", "intrinsics", "origins", "pose_sigma"):
+        assert list(differences(getattr(known, name), getattr(slam, name))) == [], name
+    assert np.mean([record.tracked for record in slam.frames]) > 0.5
+    assert worst_error(slam) < 0.03
+
+
+def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
+    """Frames of another room have no pose in the map; oracle: it is another room."""
+    slam = run(0, 6, seed=3, settings=FIXED, known_map=known)
+    assert not any(record.tracked for record in slam.frames)
+    assert len(slam.waiting) == 6
+
+
+def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
+    """Another camera, other images, no map, a state in place of a map: one sentence; oracle: the sentence."""
+    camera = sequence().camera
+    longer = replace(camera, intrinsics=(300.0, 300.0, 159.5, 119.5))
+    focal = r"is of a camera with fx, fy, cx, cy = 266\.2, 266\.2, 159\.5, 119\.5 px; that of this run has 300\.0"
+    for other, sentence in (
+        (replace(camera, width=640), "is of images of 320 x 240 pixels; those of this run are 640 x 240"),
+        (longer, focal),
+    ):
+        with pytest.raises(vg.InputError, match=sentence):
+            next(vg.run(sequence().frames(), ROLES, SETTINGS, camera=other, known_map=known))
+    with pytest.raises(vg.InputError, match=r"localise_only` needs a map to place frames in: give `known_map`"):
+        vg.reconstruct(sequence(), ROLES, FIXED)
+    save_state(tmp_path / "state", first_half())
+    with pytest.raises(vg.InputError, match="is a state; expected a map"):
+        vg.load_map(tmp_path / "state")
+    with pytest.raises(vg.InputError, match="there is no keyframe to save"):
+        save_map(tmp_path / "map", replace(first_half(), keyframes=()))
+    read = object.__new__(Result)
+    object.__setattr__(read, "record", None)
+    with pytest.raises(vg.InputError, match="this one was read from a folder"):
+        read.save_map(tmp_path / "map")
+
+
+@pytest.mark.long
+def test_a_whole_run_in_a_map(known: Slam, tmp_path: Path) -> None:
+    """`vg.reconstruct` in a map writes its folder, its map holds both halves, and a third run finds itself in both;
+    oracle: the truth, the files, the numbers.
+    """
+    given = {"roles": ROLES, "settings": SETTINGS, "dense": "none"}
+    result = vg.reconstruct(sequence(), **given, start=HALF, known_map=known)
+    result.save(tmp_path / "out")
+    result.save_map(tmp_path / "both.map")
+    assert len(result.trajectory) == FRAMES - HALF
+    assert Result.load(tmp_path / "out").summary["frames"] == FRAMES - HALF
+    assert len(list((tmp_path / "out/images").iterdir())) == len(result.keyframes)
+    again = vg.reconstruct(sequence(), **given, known_map=vg.load_map(tmp_path / "both.map"))
+    assert len(again.keyframes) == len(result.keyframes)
+    assert worst_error(again.record.slam) < 0.02
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_the_command_saves_and_takes_a_map(tmp_path: Path) -> None:
+    """`--save-map`, then `--map --localise-only` on the same frames: all are placed, no keyframe is added; oracle: the
+    summaries.
+    """
+    for _ in write_tum_folder(vg.simulate("room", 3, 0, (320, 240), rate=20.0), tmp_path / "room"):
+        pass
+    found = []
+    for more in (["--save-map", str(tmp_path / "a.map")], ["--map", str(tmp_path / "a.map"), "--localise-only"]):
+        command = ["run", str(tmp_path / "room"), "-o", str(tmp_path / "out"), "--dense", "none", "--json", *more]
+        done = CliRunner().invoke(make_app(), command)
+        assert done.exit_code in (0, 3), done.output
+        found.append(json.loads(done.stdout))
+    assert [one["frames_tracked"] for one in found] == [3, 3]
+    assert [one["keyframes"] for one in found] == [1, 1]
+    assert found[1]["notes"] == ["frame 0 (0.000000.png) is the first that was found in the map"]

@@ -1,0 +1,287 @@
+"""A state of the pipeline as a file: the same to the last bit, in what it holds and in what follows from it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from recorded_run import ROLES, SETTINGS, recorded_run
+from same_leaves import differences
+from vggtgeo.solvers.levenberg_marquardt import IterationRecord
+
+from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.record_file import DATA, HEADER, Layout
+from vggtgeo.io.records import by_name
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRotation
+from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.run import run_frames
+from vggtgeo.slam.state import PendingWindow, Slam, Waiting
+from vggtgeo.slam.state_file import STATE, load_state, save_state
+from vggtgeo.slam.window_prior import WindowPrior
+
+MIDDLE = 4
+"""Frame of the recorded run whose state is saved."""
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a state in the middle of the run."""
+    path = tmp_path_factory.mktemp("state") / "state.npz"
+    save_state(path, full(recorded_run().states[MIDDLE]))
+    return path
+
+
+def full(slam: Slam) -> Slam:
+    """The state with something in every field that a good run leaves empty."""
+    frame = recorded_run().frames[MIDDLE]
+    newest = slam.keyframes[-1]
+    waiting = Waiting(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
+    compressed = (slam.keyframes[0].compressed(), *slam.keyframes[1:])
+    slam = settled(slam)
+    assert slam.solved is not None
+    adjustment, state = slam.solved
+    one = jnp.ones(1)
+    under_way: Future[Slam] = Future()
+    under_way.set_result(slam)
+    tries = IterationRecord(one, one, jnp.full(1, jnp.nan), state.poses.wxyz_xyz[None])
+    return replace(
+        slam,
+        keyframes=compressed,
+        waiting=(waiting,),
+        prior=WindowPrior(adjustment.keyframes, no_prior(4)),
+        factors=(*slam.factors, MeasuredRotation(0, np.eye(3), np.eye(3)), MeasuredBaseline(0, 1, 0.1, 1e-3)),
+        iterations=tries,
+        held=(0,),
+        axes=(np.eye(3),),
+        notes=("a note",),
+        pose_sigma=np.ones((2, 2)),
+        pending=PendingWindow(7, slam, under_way),
+    )
+
+
+def test_every_field_comes_back_to_the_bit(saved: Path) -> None:
+    """Each leaf of the loaded state, all classes through, is that of the saved one; oracle: a walk over the fields,
+    which knows no class by name.
+    """
+    before = full(recorded_run().states[MIDDLE])
+    empty = [field.name for field in dataclasses.fields(Slam) if _is_empty(getattr(before, field.name))]
+    assert empty == []  # a new field is to be given a content in `full`
+    assert list(differences(before, load_state(saved))) == []
+
+
+def _is_empty(value: Any) -> bool:
+    return value is None or (isinstance(value, tuple) and not value)
+
+
+def test_the_walk_sees_a_difference() -> None:
+    """The oracle of the test above finds one bit, an order in memory, a kind and a length; so a lost field would be
+    seen.
+    """
+    slam = settled(recorded_run().states[MIDDLE])
+    pose = slam.keyframes[0].pose
+    off = pose.copy()
+    off[0, 3] = np.nextafter(off[0, 3], 1)
+    changed = lambda **values: replace(slam, keyframes=(replace(slam.keyframes[0], **values), *slam.keyframes[1:]))
+    for other in (
+        changed(pose=off), changed(pose=np.asfortranarray(pose)), changed(place=None),
+        replace(slam, lost=1), replace(slam, frames=slam.frames[:-1]), replace(slam, solved=None),
+    ):  # fmt: skip
+        assert list(differences(slam, other)), other
+
+
+def test_the_run_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    """Every state after the saved one, up to the end, is that of the undisturbed run; oracle: that run."""
+    run = recorded_run()
+    save_state(tmp_path / "state.npz", run.states[MIDDLE])
+    loaded = load_state(tmp_path / "state.npz")
+    rest = iter(run.frames[MIDDLE + 1 :])
+    again = list(run_frames(rest, run.sequence.camera, ROLES, SETTINGS, Clock(), loaded))
+    again[-1] = settled(again[-1])
+    assert loaded.pending is not None  # a window was being adjusted when the state was saved
+    assert len(again[-1].keyframes) > len(loaded.keyframes)
+    for one, other in zip(run.states[MIDDLE + 1 :], again, strict=True):
+        assert list(differences(one, other)) == []
+
+
+def test_arrays_that_fields_share_are_stored_once(saved: Path) -> None:
+    """An array that two fields hold is one array again; oracle: identity, before and after."""
+    before, after = recorded_run().states[MIDDLE].keyframes[0], load_state(saved).keyframes[0]
+    for keyframe in (before, after):
+        assert keyframe.points.pixels is keyframe.features.pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """Anything."""
+
+    content: Any
+
+
+BOX = Layout("box", 2, by_name([Box]))
+VALUES: dict[str, Any] = {
+    "floats": (0.1, -0.0, 1e-320, float("inf"), -float("inf"), float("nan"), 2**70, -1, True, None, "ü\ud800"),
+    "containers": ([1, (2, [])], {"a": {}, "b": ()}, (), b"", b"\x00\xff", np.dtype(np.float16), Box),
+    "scalars": (np.float64(0.1), np.float32(np.nan), np.int16(-3), np.bool_(True)),
+    "orders": tuple(
+        np.arange(120.0).reshape(4, 5, 6)[view]
+        for view in (np.s_[:], np.s_[::-1], np.s_[:, ::2, 1], np.s_[..., ::-1], np.s_[0, 0, :0], np.s_[2, 1, 3])
+    ) + (np.eye(3).T.copy("F"), np.ones((4, 3)).T, np.broadcast_to(np.float32(2), (3, 3)), np.zeros((0, 2))),
+    "jax": (jnp.arange(3.0), jnp.asarray(2.0), jnp.asarray(True), jnp.asarray(2.0) * jnp.ones(()), jnp.float32(3)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_any_value_comes_back(name: str, tmp_path: Path) -> None:
+    """Numbers that JSON does not know, orders in memory, weak types; oracle: the values."""
+    BOX.write(tmp_path / "box", Box(VALUES[name]), {"why": name})
+    again, facts = BOX.read(tmp_path / "box")
+    assert list(differences(Box(VALUES[name]), again)) == []
+    assert facts == BOX.facts(tmp_path / "box") == {"why": name}
+
+
+@pytest.mark.parametrize("value", [object(), {1: 2}, np.array(["a"]), np.array([None]), Evidence(), Keyframe])
+def test_what_is_not_listed_is_not_written(value: Any, tmp_path: Path) -> None:
+    """A class that nobody listed ends the writing with the way to it, and leaves no file; oracle: the error."""
+    with pytest.raises(TypeError, match=r"`value\.content.*no file of states can hold"):
+        BOX.write(tmp_path / "box", Box((1, value)))
+    assert not list(tmp_path.iterdir())
+
+
+def rewritten(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
+    """The file with another header."""
+    with zipfile.ZipFile(path) as archive:
+        members = {info.filename: archive.read(info) for info in archive.infolist()}
+    text = members[f"{HEADER}.npy"]
+    header = json.loads(text[text.index(b"\n") + 1 :])
+    values = np.frombuffer(json.dumps(change(header) or header).encode(), np.uint8)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            with archive.open(name, "w") as member:
+                if name == f"{HEADER}.npy":
+                    np.lib.format.write_array(member, values)
+                else:
+                    member.write(data)
+    return path
+
+
+def box(tmp_path: Path, value: Any = 1.5) -> Path:
+    BOX.write(tmp_path / "box", Box((np.arange(3.0), value)))
+    return tmp_path / "box"
+
+
+BAD_HEADERS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+    "another kind": (lambda h: h.update(vggtgeo="state"), "is a state; expected a box"),
+    "a later version": (lambda h: h.update(version=3), "is a box of version 3; this program reads version 2"),
+    "no version": (lambda h: h.pop("version"), "is no box that vggtgeo wrote"),
+    "no object": (lambda h: ["text"], "is no box that vggtgeo wrote"),
+    "an unknown class": (lambda h: h["classes"].append(["Popen", []]), "holds a `Popen`, which this version"),
+    "a field less": (lambda h: h["classes"][0][1].clear(), r"`Box` has the fields \['content'\]; the file has \[\]"),
+    "beyond the data": (lambda h: h["arrays"][0].__setitem__(1, 8), "array 0 reaches beyond the 24 bytes"),
+    "before the data": (lambda h: h["arrays"][0].__setitem__(1, -8), "was changed since: array 0 has the place -8"),
+    "a huge shape": (lambda h: h["arrays"][0].__setitem__(2, [2**62]), "array 0 reaches beyond the 24 bytes"),
+    "objects": (lambda h: h["arrays"][0].__setitem__(0, "|O"), "holds an array of object; expected numbers"),
+    "wide strides": (lambda h: h["arrays"][0].__setitem__(3, [2**40]), "of 24 bytes is spread over"),
+    "a sign of nothing": (lambda h: h.update(tree={"x": 1}), "'x', which means nothing"),
+    "too deep": (lambda h: h.update(tree=None) or _deep(h), "is no box that vggtgeo wrote"),
+}  # fmt: skip
+
+
+def _deep(header: dict[str, Any]) -> None:
+    for _ in range(900):
+        header["tree"] = [header["tree"]] * 1 if header["tree"] is not None else [{"l": [{"f": []}]}]
+
+
+@pytest.mark.parametrize("name", BAD_HEADERS)
+def test_a_header_that_is_wrong(name: str, tmp_path: Path) -> None:
+    """One sentence with the file's name says what is wrong; oracle: the sentence."""
+    change, sentence = BAD_HEADERS[name]
+    path = rewritten(box(tmp_path), change)
+    with pytest.raises(InputError, match=sentence) as caught:
+        BOX.read(path)
+    assert str(path) in str(caught.value)
+
+
+def test_an_older_version_is_upgraded(tmp_path: Path) -> None:
+    """A header of an older version goes through the listed changes, one number after the other; oracle: the values."""
+
+    def renamed(header: dict[str, Any]) -> dict[str, Any]:
+        return {**header, "version": header["version"] + 1, "classes": [["Box", ["content"]]]}
+
+    path = box(tmp_path)
+    rewritten(path, lambda h: h.update(version=0, classes=[["Case", ["inside"]]]))
+    with pytest.raises(InputError, match="of version 0; this program reads version 2"):
+        BOX.read(path)
+    read, _ = replace(BOX, upgrades={0: renamed, 1: renamed}).read(path)
+    assert read.content[1] == 1.5
+
+
+def test_files_that_are_no_states(tmp_path: Path) -> None:
+    """Missing, foreign, packed, cut off: one sentence; oracle: the sentence."""
+    path = tmp_path / "box"
+    with pytest.raises(InputError, match="is no file; give"):
+        BOX.read(path)
+    path.write_bytes(b"text")
+    with pytest.raises(InputError, match="cannot be read as"):
+        BOX.read(path)
+    np.savez(path.with_suffix(".npz"), description=np.zeros(3))
+    with pytest.raises(InputError, match="expected a header and its data"):
+        BOX.read(path.with_suffix(".npz"))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in (HEADER, DATA):
+            archive.writestr(f"{name}.npy", b"0" * 1000)
+    with pytest.raises(InputError, match="`header` is compressed"):
+        BOX.read(path)
+    whole = box(tmp_path).read_bytes()
+    for end in range(0, len(whole), 37):
+        path.write_bytes(whole[:end])
+        with pytest.raises(InputError):
+            BOX.read(path)
+
+
+def test_every_flipped_bit_of_the_content_is_noticed(tmp_path: Path) -> None:
+    """A bit changed in header or data is an InputError, never another value; oracle: zip's checksums."""
+    path = box(tmp_path)
+    whole = path.read_bytes()
+    inside = range(whole.index(b"\x93NUMPY"), whole.rindex(b"PK\x01\x02") - 200)
+    for place in inside[::11]:
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        try:
+            read, _ = BOX.read(path)
+        except InputError:
+            continue
+        assert list(differences(Box((np.arange(3.0), 1.5)), read)) == [], place
+
+
+def test_states_whose_parts_do_not_belong_together(tmp_path: Path) -> None:
+    """A file whose window names a keyframe that is not there is refused; oracle: the sentence."""
+    slam = recorded_run().states[1]
+    for wrong, sentence in (
+        (replace(slam, window=(7,)), "names keyframes that are not there"),
+        (replace(slam, keyframes=()), "names keyframes that are not there"),
+        (replace(slam, intrinsics=np.ones(3)), "its camera has another shape"),
+        (Evidence(), "holds a Evidence; expected the state of a run"),
+    ):
+        STATE.write(tmp_path / "state.npz", wrong)
+        with pytest.raises(InputError, match=sentence):
+            load_state(tmp_path / "state.npz")
+
+
+def test_reading_keeps_the_callers_precision(saved: Path) -> None:
+    """Double precision is the pipeline's own, the caller's switch stays; oracle: the switch, and the type read."""
+    with jax.enable_x64(False):
+        assert load_state(saved).solved[1].intrinsics.dtype == jnp.float64
+        assert jnp.asarray(np.ones(2)).dtype == jnp.float32

@@ -1,0 +1,266 @@
+"""What a run keeps of itself while it goes on, so that it goes on after a kill to the same bits: a state file with what
+the callbacks have gathered, the warnings, the times, and what the run is of.
+
+It is written in a thread of its own, as a state never changes, and takes its place in one step. The next one waits so
+long that all of them take at most `SHARE` of the run: of the processor's time, which is what the thread takes from it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.io.record_file import Layout
+from vggtgeo.io.records import by_name
+from vggtgeo.models.onnx.bounds import Refusals
+from vggtgeo.results.summary import versions
+from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state_file import STATE_CLASSES, checked_state
+from vggtgeo.slam.trust.evidence import EvidenceSoFar, FrameEvidence
+from vggtgeo.slam.window_recorder import WindowRecord
+
+EVERY = 10.0
+"""Seconds between two states that are kept."""
+SHARE = 0.025
+"""Most of a run's time that keeping its state may take."""
+
+
+@dataclass(frozen=True)
+class Checkpoints:
+    """Where a run keeps its state, and whether it goes on from the one that is there.
+
+    path: of the file. resume: go on from it; where there is none, the run begins at its first frame. every: seconds
+    between two states, or more where they are large; 0: after each frame, whatever it takes.
+    """
+
+    path: Path
+    resume: bool = False
+    every: float = EVERY
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.every) and self.every >= 0):
+            raise InputError(f"`checkpoint-every` is {self.every:g}; it must be seconds, at least 0")
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A warning about the input. frames: that were left out, None of another kind."""
+
+    text: str
+    frames: int | None = None
+
+    @classmethod
+    def of(cls, warning: Warning | str) -> Notice:
+        """Of a warning that was collected."""
+        return cls(str(warning), warning.frames if isinstance(warning, LeftOutWarning) else None)
+
+    def warning(self) -> Warning:
+        """The warning again."""
+        return InputWarning(self.text) if self.frames is None else LeftOutWarning(self.text, self.frames)
+
+
+@dataclass(frozen=True, eq=False)
+class RunSoFar:
+    """A run between two frames. callbacks: what each gave, by the name of its class. refused: by role, the counts of
+    `Refusals`. seconds: by stage; tracking, whole: since the first frame, and since the run began.
+    """
+
+    slam: Slam
+    callbacks: Mapping[str, Any]
+    notices: tuple[Notice, ...]
+    refused: Mapping[str, tuple[int, ...]]
+    seconds: Mapping[str, float]
+    tracking: float
+    whole: float
+
+    def unsaid(self, collected: Iterable[Warning | str]) -> list[Warning | str]:
+        """All warnings of the run, those of this part after those before: what is read again says the same again."""
+        known = Counter(self.notices)
+        fresh: list[Warning | str] = []
+        for warning in collected:
+            if known[Notice.of(warning)] > 0:
+                known[Notice.of(warning)] -= 1
+            else:
+                fresh.append(warning)
+        return [*(notice.warning() for notice in self.notices), *fresh]
+
+    def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
+        """Counts on from those of before."""
+        for role, counts in self.refused.items():
+            for entry, value in zip(dataclasses.fields(Refusals), counts, strict=True):
+                setattr(refusals[role], entry.name, value)
+
+
+CHECKPOINT = Layout(
+    "checkpoint", 1, by_name((*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, WindowRecord))
+)
+
+
+def identity(
+    settings: SlamSettings, roles: Roles, source: Mapping[str, Any], networks: Mapping[str, str], **more: Any
+) -> dict[str, str]:
+    """What a run is of, as texts by their names; a run goes on only where all are the same.
+
+    source: what is known of the sequence. networks: digest of each file. more: what else the result depends on.
+    """
+    by_stage = {
+        f"{group.name}.{entry.name}": getattr(getattr(settings, group.name), entry.name)
+        for group in dataclasses.fields(settings)
+        for entry in dataclasses.fields(getattr(settings, group.name))
+    }
+    played = {entry.name: getattr(roles, entry.name) for entry in dataclasses.fields(roles)}
+    every = {**versions(), **source, **by_stage, **played, **networks, **more}
+    # An object without a `repr` of its own tells its address, which is another in each process.
+    return {name: re.sub(r" at 0x[0-9a-f]+", "", repr(value)) for name, value in every.items()}
+
+
+@in_double_precision
+def resumed(asked: Checkpoints | None, wanted: Mapping[str, str]) -> RunSoFar | None:
+    """The run to go on with; None where nothing is asked, or there is none.
+
+    Raises:
+        InputError: the file is damaged, or of a run of something else.
+
+    """
+    if asked is None or not asked.resume or not asked.path.is_file():
+        return None
+    known = _facts(asked.path)["identity"]
+    for name in {**known, **wanted}:
+        before, now = known.get(name), wanted.get(name)
+        if before != now:
+            raise InputError(
+                f"`{asked.path}` is of a run with `{name}` {_short(before)}, and this one has {_short(now)}: give the "
+                "same, or begin anew with `--no-resume`"
+            )
+    found, _ = CHECKPOINT.read(asked.path)
+    if not isinstance(found, RunSoFar) or not found.slam.frames:
+        raise InputError(f"`{asked.path}` holds no run; begin anew with `--no-resume`")
+    checked_state(asked.path, found.slam)
+    return found
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    """What the header says of a run, before its data are read."""
+    found = CHECKPOINT.facts(path)
+    if found.keys() != {"identity", "frames", "last", "digest"} or not isinstance(found["identity"], dict):
+        raise InputError(f"`{path}` holds no run; begin anew with `--no-resume`")
+    return found
+
+
+def _short(value: str | None) -> str:
+    return "nothing" if value is None else f"{value[:80]}..." if len(value) > 80 else value
+
+
+def frames_kept(path: Path) -> str:
+    """How far the run in a file had come, in words."""
+    count = _facts(path)["frames"]
+    return f"{count} frame{'s' * (count != 1)}"
+
+
+def check_same_frame(asked: Checkpoints, frame: Frame | None) -> None:
+    """InputError unless `frame` is the last one of the run that goes on."""
+    known = _facts(asked.path)
+    if frame is None or known["digest"] != digest_of(frame):
+        raise InputError(
+            f"frame {known['last']} is another one than when the run in `{asked.path}` was killed: give the same "
+            "source, or begin anew with `--no-resume`"
+        )
+
+
+def digest_of(frame: Frame) -> str:
+    """SHA-256 of time, image and depth."""
+    digest = hashlib.sha256(repr((frame.index, float(frame.timestamp), frame.image.shape)).encode())
+    for image in (frame.image, frame.depth):
+        if image is not None:
+            digest.update(np.ascontiguousarray(image).data)
+    return digest.hexdigest()
+
+
+def digest_of_map(known: Slam) -> str:
+    """SHA-256 of the poses and the key points of a map."""
+    digest = hashlib.sha256(repr(len(known.pairs)).encode())
+    for keyframe in known.keyframes:
+        digest.update(keyframe.pose.tobytes())
+        digest.update(np.ascontiguousarray(keyframe.features.pixels).data)
+    return digest.hexdigest()
+
+
+@dataclass(eq=False)
+class Keeper:
+    """Keeps the state of one run. gather: what there is beside the state, asked between two frames. tell: says a
+    sentence to the user.
+    """
+
+    asked: Checkpoints
+    identity: Mapping[str, str]
+    gather: Callable[[Slam], RunSoFar]
+    tell: Callable[[str], None]
+    _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="checkpoint"))
+    _writing: Future[float] | None = None
+    _next: float = 0.0
+    _kept: int = 0
+    _failed: bool = False
+
+    def __post_init__(self) -> None:
+        self._next = time.monotonic() + self.asked.every
+
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
+        """Keeps the state after a frame, if it is time."""
+        if self._writing is not None and (self._writing.done() or self.asked.every == 0):
+            self._ended(self._writing)
+        if self._writing is None and not self._failed and time.monotonic() >= self._next:
+            self._begin(slam, frame)
+
+    def on_end(self, slam: Slam, frame: Frame | None) -> None:
+        """Keeps the state after the last frame, if the run took so long that it is worth it."""
+        self._wait()
+        if self._kept and frame is not None and not self._failed:
+            self._begin(slam, frame)
+
+    def close(self) -> None:
+        """Waits until the last file is written."""
+        self._wait()
+        self._pool.shutdown()
+
+    def _wait(self) -> None:
+        if self._writing is not None:
+            self._ended(self._writing)
+
+    def _begin(self, slam: Slam, frame: Frame) -> None:
+        so_far = self.gather(slam)
+        self._writing = self._pool.submit(self._write, so_far, frame)
+
+    def _write(self, so_far: RunSoFar, frame: Frame) -> float:
+        """Writes the file, waiting for a window that is adjusted meanwhile; returns the processor's seconds it took."""
+        began = time.thread_time()
+        count = len(so_far.slam.frames)
+        facts = {"identity": self.identity, "frames": count, "last": frame.index, "digest": digest_of(frame)}
+        CHECKPOINT.write(self.asked.path, so_far, facts)
+        return time.thread_time() - began
+
+    def _ended(self, writing: Future[float]) -> None:
+        """A run whose state cannot be kept goes on without."""
+        self._writing = None
+        try:
+            took = writing.result()
+        except (OSError, TypeError, ValueError) as error:
+            self._failed = True
+            self.tell(f"the state of the run cannot be kept, so that it could not be resumed: {error}")
+            return
+        self._kept += 1
+        self._next = time.monotonic() + (max(self.asked.every, took / SHARE) if self.asked.every else 0.0)

@@ -1,0 +1,106 @@
+"""Maps that outlast their run: saved as a file, loaded by another run, which finds itself in it and goes on from there.
+
+A map is a state that no frame has been tracked in: keyframes with all that was measured in them, their matches, what
+ties them, the camera. Its keyframes are of no frame of the run that uses it, so their frames and times (s) count up to
+-1: before the first frame of any run, in their order.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.record_file import Layout
+from vggtgeo.io.records import by_name
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state_file import STATE_CLASSES, checked_state
+
+MAP = Layout("map", 1, by_name(STATE_CLASSES))
+SAME_CAMERA = 0.02
+"""Relative difference of focal lengths and principal point up to which a calibration is that of a map's camera: two
+calibrations of one camera differ by up to 1.6 % (redkitchen: 525 px as given, 534 as adjusted)."""
+
+
+def as_map(slam: Slam) -> Slam:
+    """What of a run's state is its map."""
+    slam = settled(slam)
+    count = len(slam.keyframes)
+    keyframes = tuple(
+        replace(keyframe.compressed(), frame=keyframe.number - count, timestamp=float(keyframe.number - count))
+        for keyframe in slam.keyframes
+    )
+    first = Slam(slam.intrinsics, slam.given_intrinsics, slam.intrinsics_sigma, slam.metric)
+    return replace(
+        first,
+        keyframes=keyframes,
+        pairs=slam.pairs,
+        factors=slam.factors,
+        origins=slam.origins,
+        pose_sigma=slam.pose_sigma,
+    )
+
+
+def save_map(path: str | os.PathLike[str], slam: Slam) -> None:
+    """Writes the map of a state (the last of a run, best after `vggtgeo.finish`), atomically; no pickles.
+
+    Raises:
+        InputError: the state has no keyframe.
+        TypeError: a matcher's descriptors are of a class that files do not know.
+
+    """
+    if not slam.keyframes:
+        raise InputError(f"there is no keyframe to save as a map in `{path}`; track at least one frame")
+    MAP.write(Path(path), as_map(slam))
+
+
+@in_double_precision
+def load_map(path: str | os.PathLike[str]) -> Slam:
+    """The map that `vggtgeo run --save-map` or `Result.save_map` wrote, for `known_map` of `vggtgeo.run` and
+    `vggtgeo.reconstruct`.
+
+    Raises:
+        InputError: the file is missing, damaged, of a version that is not known, or no map.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.load_map("office.map")
+        Traceback (most recent call last):
+            ...
+        vggtgeo.io.errors.InputError: `office.map` is no file; give the .npz of a map
+
+    """
+    found, _ = MAP.read(Path(path))
+    known = checked_state(Path(path), found)
+    if not known.keyframes or known.frames or known.window:
+        raise InputError(f"`{path}` holds no map; expected keyframes alone: save one with `vggtgeo run --save-map`")
+    return known
+
+
+def entered(known: Slam, camera: Camera) -> Slam:
+    """The state before the first frame of a run with this camera in a known map.
+
+    Raises:
+        InputError: the map is of another camera.
+
+    """
+    height, width = known.keyframes[0].size
+    if (width, height) != (camera.width, camera.height):
+        raise InputError(
+            f"`known_map` is of images of {width} x {height} pixels; those of this run are {camera.width} x "
+            f"{camera.height}: a map is used with the camera that it was made with"
+        )
+    given = np.array(camera.intrinsics, np.float64)
+    if camera.known and np.abs(given - known.given_intrinsics).max() > SAME_CAMERA * known.given_intrinsics[0]:
+        cameras = [", ".join(f"{value:.1f}" for value in values) for values in (known.given_intrinsics, given)]
+        raise InputError(
+            f"`known_map` is of a camera with fx, fy, cx, cy = {cameras[0]} px; that of this run has {cameras[1]} px: "
+            "a map is used with the camera that it was made with"
+        )
+    return replace(known, lost=1)

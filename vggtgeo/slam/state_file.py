@@ -1,0 +1,106 @@
+"""The state of the pipeline as a file: `step` goes on from it as from the state that was saved, to the last bit.
+
+Everything is stored, also what could be made again (the view of the reference, the last window's problem): that needs
+the poses and the camera of the moment when it was made, which are gone, and costs more to compute than to read.
+A window that is adjusted beside tracking is waited for, and its result is stored apart: it is taken up at the frame at
+which it is due.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import jaxlie
+
+from vggtgeo.bundle.padding import SlotIndex
+from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.terms.baseline import BaselinePrior
+from vggtgeo.bundle.terms.depth import DepthPrior
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.line import LineTerm
+from vggtgeo.bundle.terms.marginal import MarginalPrior
+from vggtgeo.bundle.terms.point import PointTerm
+from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
+from vggtgeo.bundle.terms.rotation import RotationPrior
+from vggtgeo.geometry.cameras import Pinhole
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.record_file import Layout
+from vggtgeo.io.records import by_name
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
+from vggtgeo.models.onnx.fit import Fit
+from vggtgeo.models.onnx.mast3r import Mast3rView
+from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
+from vggtgeo.slam.adjustment import Adjustment
+from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation
+from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.keyframe_images import CompressedImage, KeyframeImages
+from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.rgbd_view import Gray, RgbdView, Samples, Surface
+from vggtgeo.slam.state import FramePose, PendingWindow, Slam, Waiting
+from vggtgeo.slam.window_prior import WindowPrior
+from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
+from vggtgeo.solvers.levenberg_marquardt import IterationRecord
+
+STATE_CLASSES: tuple[type, ...] = (
+    *(Slam, PendingWindow, FramePose, Waiting, Evidence, Keyframe, Slots, KeyframeImages, CompressedImage),
+    *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
+    *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, WindowPrior, MarginalPrior),
+    *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
+    *(PointTerm, LineTerm, DepthPrior, IntrinsicsPrior, RelativePose, SurfaceAlignment, RotationPrior, BaselinePrior),
+    *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
+)
+"""All that a file may name; a state with anything else in it is not written."""
+VERSION = 1
+STATE = Layout("state", VERSION, by_name(STATE_CLASSES))
+
+
+def save_state(path: str | os.PathLike[str], slam: Slam) -> None:
+    """Writes a state, atomically; no pickles.
+
+    Raises:
+        TypeError: the state holds something of a class that is not in `STATE_CLASSES` (the descriptors of a matcher of
+            your own, say).
+
+    """
+    STATE.write(Path(path), slam)
+
+
+@in_double_precision
+def load_state(path: str | os.PathLike[str]) -> Slam:
+    """The state that `save_state` wrote, bit by bit.
+
+    Raises:
+        InputError: the file is missing, damaged, of a version that is not known, or holds no state.
+
+    """
+    found, _ = STATE.read(Path(path))
+    return checked_state(Path(path), found)
+
+
+def checked_state(path: Path, found: object) -> Slam:
+    """What was read, if its parts belong together; InputError otherwise."""
+    if not isinstance(found, Slam):
+        raise InputError(f"`{path}` holds a {type(found).__name__}; expected the state of a run")
+    try:
+        wrong = _disagreement(found)
+    except (TypeError, AttributeError, ValueError, IndexError) as error:
+        wrong = str(error)
+    if wrong:
+        raise InputError(f"`{path}` is no state that vggtgeo wrote, or was changed since: {wrong}")
+    return found
+
+
+def _disagreement(slam: Slam) -> str | None:
+    """What does not belong together in a state, if anything."""
+    count = len(slam.keyframes)
+    if [keyframe.number for keyframe in slam.keyframes] != list(range(count)):
+        return "its keyframes are not numbered one after the other"
+    if any(keyframe.pose.shape != (4, 4) for keyframe in slam.keyframes) or slam.intrinsics.shape != (4,):
+        return "a pose or its camera has another shape"
+    named = [number for pair in slam.pairs for number in pair.key]
+    named += [number for factor in slam.factors for number in factor.keyframes]
+    named += [*slam.window, *slam.origins, *slam.held, *(record.reference for record in slam.frames)]
+    return None if all(0 <= number < count for number in named) else "it names keyframes that are not there"
