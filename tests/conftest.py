@@ -41,16 +41,22 @@ gc.set_threshold(200_000, 50, 100)
 
 LONGEST = (
     "test_pipeline",
-    "test_notebooks",
     "test_gradients",
     "test_single_leaves",
-    "test_tracking",
-    "test_user_terms",
     "test_optimised",
+    "test_run_folder",
+    "test_tracking",
+    "test_reduced_solvers",
+    "test_structured_inverse",
+    "test_stubs",
     "test_examples",
-    "test_batches",
+    "test_terms",
+    "test_simulation_sequence",
+    "test_known_map",
+    "test_resume",
+    "test_notebooks",
 )
-"""Files of more than 30 s: they begin, so that no worker waits long for another's last file (`make test` keeps this
+"""Files of more than 15 s: they begin, so that no worker waits long for another's last file (`make test` keeps this
 order by `--no-loadscope-reorder`; pytest-xdist would begin with the files of most tests)."""
 
 

@@ -151,6 +151,7 @@ def test_a_whole_run_in_a_map(known: Slam, tmp_path: Path) -> None:
     assert worst_error(again.record.slam) < 0.02
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("uncompiled")
 def test_the_command_saves_and_takes_a_map(tmp_path: Path) -> None:
     """`--save-map`, then `--map --localise-only` on the same frames: all are placed, no keyframe is added; oracle: the

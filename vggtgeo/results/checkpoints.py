@@ -46,6 +46,14 @@ class Checkpoints:
 
     path: of the file. resume: go on from it; where there is none, the run begins at its first frame. every: seconds
     between two states, or more where they are large; 0: after each frame, whatever it takes.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import vggtgeo as vg
+        >>> kept = vg.Checkpoints(Path("night.npz"), resume=True)  # give it to `vg.reconstruct(..., checkpoints=kept)`
+        >>> kept.every  # seconds
+        10.0
+
     """
 
     path: Path
