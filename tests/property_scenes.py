@@ -93,11 +93,12 @@ class Drawn:
 
 
 def finite_problems(largest: float = LARGEST) -> st.SearchStrategy[Drawn]:
-    """Any problem of numbers up to `largest`: up to 12 of a scene's are replaced and all of some weights, and so is
-    what is held, the prior of the camera, the kernel's width and the weight of the depths.
+    """Any problem of numbers up to `largest` (what must be positive: down to its inverse): up to 12 of a scene's are
+    replaced and all of some weights, and so is what is held, the prior of the camera, the kernel's width and the weight
+    of the depths.
     """
     held = lambda count: st.tuples(*[st.booleans()] * count)
-    positive = _numbers(largest).map(lambda value: max(abs(value), LEAST))
+    positive = _numbers(largest).map(lambda value: max(abs(value), LEAST, 1 / largest))
     return st.builds(
         Drawn,
         seed=SEEDS,

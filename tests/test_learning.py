@@ -84,6 +84,7 @@ def test_a_failed_solve_is_no_small_error(batch: Batch) -> None:
     assert np.isnan(float(error))
 
 
+@pytest.mark.long
 def test_methods_are_told_apart(batch: Batch) -> None:
     """`compare` with a network that says what the oracle knows gives the oracle's errors."""
     knows = jax.tree_util.Partial(lambda _: jnp.where(batch.right, jnp.ones_like(batch.saliency), LEAST))

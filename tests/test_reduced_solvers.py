@@ -170,6 +170,7 @@ def test_a_free_scale_is_held(name: str) -> None:
     assert abs(float(system.gauge[:, 0] @ step.dense)) < 1e-8 * float(jnp.linalg.norm(step.dense))
 
 
+@pytest.mark.long
 def test_the_same_energy_is_reached() -> None:
     # Proves that whole solves agree: the band on a sequence, inexact steps on one with loops (the default forcing term
     # costs no accuracy at the end). Oracle: the energy that dense Cholesky reaches.

@@ -22,6 +22,7 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.keyframe import make_keyframe
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.pipeline import step
 from vggtgeo.slam.rgbd_alignment import RgbdAlignment
@@ -52,7 +53,7 @@ def room() -> Room:
 
 
 def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES) -> Slam:
-    return list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1]
+    return settled(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
 
 
 def _black(frame: Frame) -> Frame:
