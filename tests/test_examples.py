@@ -52,7 +52,7 @@ def test_outside_jit_a_call_compiles_one_program(session: dict[str, Any]) -> Non
         if event == "/jax/core/compile/backend_compile_duration":
             compiled.append(event)
 
-    functions = (vg.covariances, vg.energy, vg.observability, vg.residual_sizes, vg.residuals_at)
+    functions = (vg.covariances, vg.energy, vg.energy_terms, vg.observability, vg.residual_sizes, vg.residuals_at)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         for function in functions:

@@ -50,6 +50,11 @@ def energy_terms(problem: Problem, state: State) -> dict[str, Float[Array, ""]]:
         True
 
     """
+    return _energy_terms_jit(problem, state)
+
+
+@jax.jit
+def _energy_terms_jit(problem: Problem, state: State) -> dict[str, Float[Array, ""]]:
     return {term.name: energy(problem.with_terms((term,)), state) for term in problem.terms}
 
 

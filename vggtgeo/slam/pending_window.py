@@ -41,17 +41,12 @@ def settled(slam: Slam) -> Slam:
         return slam
     begun, found = slam.pending.begun, slam.pending.result.result()
     return replace(
-        slam,
-        intrinsics=found.intrinsics,
-        keyframes=found.keyframes,
-        pairs=found.pairs,
-        window=found.window,
-        prior=found.prior,
+        found,
+        frames=slam.frames,
+        velocity=slam.velocity,
+        reference=slam.reference,
+        waiting=slam.waiting,
+        lost=slam.lost,
         factors=(*found.factors, *slam.factors[len(begun.factors) :]),
-        solved=found.solved,
-        energies=found.energies,
-        iterations=found.iterations,
-        axes=found.axes,
         notes=(*found.notes, *slam.notes[len(begun.notes) :]),
-        pending=None,
     )

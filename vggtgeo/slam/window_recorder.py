@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -15,8 +14,6 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
-
-_sizes_jit = eqx.filter_jit(residual_sizes)
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,7 @@ class WindowRecorder(Callback):
 
     @in_double_precision
     def on_warm_up(self, problem: Problem, state: State) -> None:
-        jax.block_until_ready(_sizes_jit(problem, state).rms)
+        jax.block_until_ready(residual_sizes(problem, state).rms)
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         self._note(slam)
@@ -68,7 +65,7 @@ class WindowRecorder(Callback):
             return
         self._last = slam.solved
         adjustment, state = slam.solved
-        sizes = _sizes_jit(adjustment.problem, state)
+        sizes = residual_sizes(adjustment.problem, state)
         shown = [term for term in adjustment.problem.terms if not isinstance(term, CameraTerm | DenseTerm)]
         counts = {term.name: int(sizes.count[term.name]) for term in shown}
         newest = slam.keyframes[adjustment.keyframes[-1]]

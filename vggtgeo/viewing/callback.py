@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from vggtgeo.bundle.analysis.covariances import covariances
@@ -18,8 +17,6 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import flush
-
-_covariances_jit = eqx.filter_jit(covariances)
 
 
 class RerunCallback(Callback):
@@ -39,7 +36,7 @@ class RerunCallback(Callback):
     def on_warm_up(self, problem: Problem, state: State) -> None:
         """Compile for windows of the shape of `problem`."""
         self._recorder.on_warm_up(problem, state)
-        _covariances_jit(problem, state).poses.block_until_ready()
+        covariances(problem, state).poses.block_until_ready()
 
     @in_double_precision
     def on_frame(self, slam: Slam, frame: Frame) -> None:
@@ -83,7 +80,7 @@ class RerunCallback(Callback):
         if slam.solved is None or not self._recorder.records:
             return
         adjustment, state = slam.solved
-        found = np.asarray(_covariances_jit(adjustment.problem, state).poses)[: len(members)]
+        found = np.asarray(covariances(adjustment.problem, state).poses)[: len(members)]
         entities.log_covariance(self.stream, members, found)
         entities.log_residuals(self.stream, self._recorder.records[-1])
         self._log_iterations(slam)
