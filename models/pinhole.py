@@ -35,8 +35,11 @@ def grid_rays(shape: tuple[int, int], intrinsics: Intrinsics, dtype: type[np.flo
 def project(points: np.ndarray, intrinsics: Intrinsics, nearest: float = 1e-3) -> np.ndarray:
     """Pixels [..., 2] of points [..., 3] in the camera's frame; NaN where they are nearer than `nearest` metres."""
     focal, centre = _split(intrinsics, points.dtype)
-    z = np.where(points[..., 2:] > nearest, points[..., 2:], np.nan)
-    return points[..., :2] / z * focal + centre
+    z = np.where(points[..., 2] > nearest, points[..., 2], np.nan)
+    pixels = np.empty((*z.shape, 2), np.result_type(points, focal))
+    for axis in (0, 1):  # numpy takes three times as long for pairs at once
+        pixels[..., axis] = points[..., axis] / z * focal[axis] + centre[axis]
+    return pixels
 
 
 def visible(
@@ -48,10 +51,9 @@ def visible(
     sensors of depth begin there.
     """
     with np.errstate(invalid="ignore"):
-        places = np.rint(project(points, intrinsics, nearest))
-        inside = ((places >= 0) & (places < np.array(shape[::-1]))).all(axis=-1)
-    columns, rows = places[inside].astype(int).T
-    return inside, rows, columns
+        x, y = np.ascontiguousarray(np.rint(project(points, intrinsics, nearest)).T)
+        inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
+    return inside, y[inside].astype(int), x[inside].astype(int)
 
 
 def coarser(intrinsics: Intrinsics, factor: int) -> np.ndarray:

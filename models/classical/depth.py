@@ -71,7 +71,15 @@ class SensorDepth:
 
     def noise(self, depth: np.ndarray) -> np.ndarray:
         """Relative standard deviation of a depth (metres, any shape) away from jumps."""
-        return np.hypot((self.axial + self.quadratic * (depth - self.near) ** 2) / depth, self.floor)
+        # In place, and not by np.hypot: a third of the time, and nothing here is near the ends of the numbers.
+        away = depth - self.near
+        away *= away
+        away *= self.quadratic
+        away += self.axial
+        away /= depth
+        away *= away
+        away += self.floor**2
+        return np.asarray(np.sqrt(away))
 
 
 @dataclass(frozen=True)

@@ -48,15 +48,13 @@ class PatchAlignment:
         if not len(pixels_i):
             return pixels_j, np.zeros(0, dtype=bool)
         grid = _grid(self.radius)
-        template, descent = _template(gray_i, pixels_i, grid)
-        normal = descent @ descent.transpose(0, 2, 1)
-        normal += 1e-3 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9 * np.eye(6)
-        inverse = np.linalg.inv(normal)
+        reference = _Template.of(gray_i, pixels_i, self.radius)
+        template, inverse = reference.patch, reference.inverse
         warp = np.tile(np.eye(2), (len(pixels_i), 1, 1))
         target = pixels_j.astype(np.float64)
         for _ in range(self.steps):
             patch = _normalised(_sample(gray_j, target, warp, grid))
-            step = (inverse @ (descent @ (patch - template)[..., None]))[..., 0]
+            step = (inverse @ reference.product(patch - template)[..., None])[..., 0]
             warp, target = _compose(warp, target, step, self.radius)
         patch = _normalised(_sample(gray_j, target, warp, grid))
         correlation = (patch * template).sum(axis=1)
@@ -69,47 +67,94 @@ def patch_correlation(
     gray_i: np.ndarray, gray_j: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray, radius: int = 7
 ) -> np.ndarray:
     """Normalised cross-correlation of the patches around `pixels_i` and `pixels_j`, float [n, 2] each; float32 [n]."""
-    grid, still = _grid(radius), np.broadcast_to(np.eye(2), (len(pixels_i), 2, 2))
+    side = _side(radius)
     first, second = (
-        _normalised(_sample(gray, at, still, grid)) for gray, at in ((gray_i, pixels_i), (gray_j, pixels_j))
+        _normalised(_upright(gray, at, side, side)) for gray, at in ((gray_i, pixels_i), (gray_j, pixels_j))
     )
     return np.asarray((first * second).sum(axis=1))
 
 
+@dataclass(frozen=True, eq=False)
+class _Template:
+    """The normalised patches of view i and what an alignment needs of them.
+
+    patch: float32 [n, P]. descent: float32 [n, 6, P], its derivatives by shift and by the four entries of the warp, as
+    they come from the image. inverse: [n, 6, 6] of their normal equations after the patch was normalised.
+    """
+
+    patch: np.ndarray
+    descent: np.ndarray
+    inverse: np.ndarray
+    _along: np.ndarray
+    """float32 [n, 6]: what of each derivative normalising the patch takes away."""
+
+    @classmethod
+    def of(cls, gray: np.ndarray, pixels: np.ndarray, radius: int) -> _Template:
+        side, halves = _side(radius), np.arange(-radius - 0.5, radius + 1, dtype=np.float32)
+        raw = _upright(gray, pixels, side, side)
+        patch = _normalised(raw)
+        count, width = len(raw), len(side)
+        size = np.maximum(np.linalg.norm(raw - raw.mean(axis=1, keepdims=True), axis=1, keepdims=True), 1e-3)
+        across = _upright(gray, pixels, halves, side).reshape(count, width, width + 1)
+        down = _upright(gray, pixels, side, halves).reshape(count, width + 1, width)
+        descent = np.empty((count, 6, width, width), np.float32)
+        scale = 1 / size[:, :, None]
+        np.multiply(across[:, :, 1:] - across[:, :, :-1], scale, out=descent[:, 0])
+        np.multiply(down[:, 1:] - down[:, :-1], scale, out=descent[:, 1])
+        unit = side / radius
+        for row, (of, along) in enumerate(((0, unit), (0, unit[:, None]), (1, unit), (1, unit[:, None])), 2):
+            np.multiply(descent[:, of], along, out=descent[:, row])
+        flat = descent.reshape(count, 6, -1)
+        # Normalising a patch removes its mean and its length, and so does the derivative of that; written with the few
+        # numbers that it takes away, the derivatives stay as they are: D - mean(D) - (D . t) t.
+        along = (flat @ patch[..., None])[..., 0]
+        mean = flat.mean(axis=2)
+        normal = flat @ flat.transpose(0, 2, 1)
+        normal -= flat.shape[2] * mean[:, :, None] * mean[:, None] + along[:, :, None] * along[:, None]
+        normal = normal + 1e-3 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9 * np.eye(6)
+        return cls(patch, flat, np.linalg.inv(normal), along)
+
+    def product(self, difference: np.ndarray) -> np.ndarray:
+        """Derivatives of the normalised patch times a difference of two such patches [n, P]; [n, 6]."""
+        along = (self.patch * difference).sum(axis=1)
+        return np.asarray((self.descent @ difference[..., None])[..., 0] - self._along * along[:, None])
+
+
+def _side(radius: int) -> np.ndarray:
+    return np.arange(-radius, radius + 1, dtype=np.float32)
+
+
 def _grid(radius: int) -> np.ndarray:
-    """Offsets of a patch's pixels, float64 [P, 2]."""
-    side = np.arange(-radius, radius + 1, dtype=np.float64)
-    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    """Offsets of a patch's pixels, float32 [P, 2]."""
+    return np.stack(np.meshgrid(_side(radius), _side(radius)), axis=-1).reshape(-1, 2)
+
+
+def _upright(gray: np.ndarray, centre: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """float32 [n, Y X]: `gray` at the offsets `x` [X] and `y` [Y] from each centre, row by row."""
+    middle, count = centre.astype(np.float32), len(x) * len(y)
+    column, row = np.empty((2, len(centre), len(y), len(x)), np.float32)
+    column[:] = middle[:, 0, None, None] + x
+    row[:] = middle[:, 1, None, None] + y[:, None]
+    return _looked_up(gray, column.reshape(-1, count), row.reshape(-1, count))
 
 
 def _sample(gray: np.ndarray, centre: np.ndarray, warp: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """float32 [n, P]: `gray` at centre + warp @ offset."""
-    turn, middle, (x, y) = warp.astype(np.float32), centre.astype(np.float32), grid.T.astype(np.float32)
-    # Written out: numpy multiplies stacks of 2 x 2 matrices one by one.
-    column, row = (turn[:, i, :1] * x + turn[:, i, 1:] * y + middle[:, i, None] for i in (0, 1))
-    values = cv2.remap(gray, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return values.astype(np.float32)
+    # One product for all patches, and the centre added after it, as large as it is.
+    turned = warp.astype(np.float32).transpose(1, 0, 2).reshape(-1, 2) @ grid.T
+    column, row = turned.reshape(2, len(warp), -1)
+    column += centre[:, 0, None].astype(np.float32)
+    row += centre[:, 1, None].astype(np.float32)
+    return _looked_up(gray, column, row)
+
+
+def _looked_up(gray: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    return cv2.remap(gray, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
 
 
 def _normalised(patch: np.ndarray) -> np.ndarray:
     centred = patch - patch.mean(axis=1, keepdims=True)
     return centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-3)
-
-
-def _template(gray: np.ndarray, pixels: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The normalised patch [n, P] and its derivatives [n, 6, P] by shift and by the four entries of the warp."""
-    still = np.broadcast_to(np.eye(2), (len(pixels), 2, 2))
-    raw = _sample(gray, pixels, still, grid)
-    template = _normalised(raw)
-    size = np.maximum(np.linalg.norm(raw - raw.mean(axis=1, keepdims=True), axis=1, keepdims=True), 1e-3)
-    ahead = [_sample(gray, pixels + shift, still, grid) for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))]
-    dx, dy = (ahead[0] - ahead[1]) / size, (ahead[2] - ahead[3]) / size
-    x, y = (grid / np.abs(grid).max()).astype(np.float32).T
-    columns = np.stack([dx, dy, dx * x, dx * y, dy * x, dy * y], axis=1)
-    # Normalising the patch removes its mean and its length: so must its derivative.
-    columns -= columns.mean(axis=2, keepdims=True)
-    columns -= (columns @ template[..., None]) * template[:, None]
-    return template, columns
 
 
 def _compose(warp: np.ndarray, target: np.ndarray, step: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:

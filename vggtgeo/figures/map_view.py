@@ -87,22 +87,19 @@ def _splat(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Squares of `sizes` pixels, the nearest on top."""
     height, width = shape
-    nearest = np.full(height * width, np.inf)
-    image = np.full((height * width, 3), BACKGROUND, np.uint8)
+    nearest = np.full(height * width, -1)  # of each pixel, by its place in the order from the farthest point on
     sizes = np.clip(np.ceil(sizes), 1, _LARGEST).astype(int)
-    order = np.argsort(-distance, kind="stable")  # numpy keeps the last of equal indices: the nearest
-    place, distance, colours, sizes = place[order], distance[order], colours[order], sizes[order]
+    order = np.argsort(-distance, kind="stable")
+    place, colours, sizes = place[order], colours[order], sizes[order]
     corner = np.floor(place - 0.5 * (sizes - 1)[:, None]).astype(int)
     for down, right in np.ndindex(_LARGEST, _LARGEST):
         x, y = corner[:, 0] + right, corner[:, 1] + down
-        drawn = (sizes > max(down, right)) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        at = y[drawn] * width + x[drawn]
-        layer = np.full(height * width, np.inf)
-        layer[at] = distance[drawn]
-        colour = image.copy()
-        colour[at] = colours[drawn]
-        closer = layer < nearest
-        nearest[closer], image[closer] = layer[closer], colour[closer]
+        number = np.flatnonzero((sizes > max(down, right)) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+        at = y[number] * width + x[number]
+        closer = number > nearest[at]
+        nearest[at[closer]] = number[closer]  # numpy keeps the last of equal indices: the nearest
+    image = np.full((height * width, 3), BACKGROUND, np.uint8)
+    image[nearest >= 0] = colours[nearest[nearest >= 0]]
     return image.reshape(height, width, 3)
 
 

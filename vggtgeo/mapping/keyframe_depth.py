@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
@@ -69,13 +69,24 @@ def optimised_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> np.n
     np.add.at(moment, cell, weight * correction)
     mass, moment = (gaussian_filter(grid, 1.0, mode="constant") for grid in (mass, moment))
     # A weak pull towards no correction: far from any slot the prior stands.
-    field = moment / (mass + 0.02)
-    known = np.isfinite(log_depth)
-    y, x = np.nonzero(known)
-    place = np.stack([y / CELL + 1, x / CELL + 1, (log_depth[known] - low) / DEPTH_CELL + 1])
-    result = depth.copy()
-    result[known] = depth[known] * np.exp(map_coordinates(field, place, order=1, mode="nearest"))
-    return result
+    return depth * np.exp(_sliced(moment / (mass + 0.02), (log_depth - low) / DEPTH_CELL + 1))
+
+
+def _sliced(field: np.ndarray, layer: np.ndarray) -> np.ndarray:
+    """`field` [h, w, d] at every pixel, float32 [H, W], by its place in the grid and its `layer` [H, W], NaN = NaN.
+
+    Trilinear: the layers stand one below the other in one image, in which the two that enclose a pixel are looked up.
+    """
+    rows, columns, layers = field.shape
+    image = np.ascontiguousarray(field.transpose(2, 0, 1), np.float32).reshape(layers * rows, columns)
+    with np.errstate(invalid="ignore"):
+        below = np.nan_to_num(np.floor(layer)).clip(0, layers - 2)
+    height, width = layer.shape
+    x = np.broadcast_to(np.arange(width, dtype=np.float32) / CELL + 1, layer.shape)
+    y = below * rows + (np.arange(height, dtype=np.float32) / CELL + 1)[:, None]
+    x, y = np.ascontiguousarray(x, np.float32), y.astype(np.float32)
+    first, second = (cv2.remap(image, x, y + rows * up, cv2.INTER_LINEAR) for up in (np.float32(0), np.float32(1)))
+    return np.asarray(first + (layer - below) * (second - first))
 
 
 def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 JPEG = (".jpg", (cv2.IMWRITE_JPEG_QUALITY, 95))
-PNG = (".png", (cv2.IMWRITE_PNG_COMPRESSION, 1))
+PNG = (".png", (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP))
+"""One filter for all rows: its choice row by row takes a third of the time and makes these files no smaller."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,8 +113,9 @@ def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.n
     across a jump. Neighbouring pixels share their errors (smoothing, interpolation), so a block knows no more than one.
     """
     height, width = depth.shape[0] // factor * factor, depth.shape[1] // factor * factor
-    known = np.isfinite(depth[:height, :width])
-    inverse = np.where(known, 1.0 / np.where(known, depth[:height, :width], 1.0), 0.0).astype(np.float32)
+    depth = np.ascontiguousarray(depth[:height, :width], np.float32)
+    known = np.isfinite(depth)
+    inverse = _zero_where(~known, 1.0 / depth)
     size = (width // factor, height // factor)
     share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     mean, square = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (inverse, inverse * inverse))
@@ -123,8 +124,13 @@ def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.n
     spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
     good = (share >= 0.5) & (spread < 0.05 * mean)
     cells = np.where(good, 1.0 / np.maximum(mean, 1e-6), np.nan).astype(np.float32)
-    noise = np.where(known, sigma[:height, :width], 0.0).astype(np.float32)
+    noise = _zero_where(~known, np.array(sigma[:height, :width], np.float32))
     return cells, cells * cv2.resize(noise, size, interpolation=cv2.INTER_AREA) / safe
+
+
+def _zero_where(unknown: np.ndarray, image: np.ndarray) -> np.ndarray:
+    image[unknown] = 0.0
+    return image
 
 
 def _unproject_grid(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
@@ -166,7 +172,7 @@ def _spread(surface: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> Samp
 def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     """The strongest gradient of each cell whose depth is known: points float32 [3, m], brightness of each level."""
     finest = levels[0]
-    strength = np.hypot(finest.image[..., 1], finest.image[..., 2])
+    strength = cv2.magnitude(*(np.ascontiguousarray(finest.image[..., side]) for side in (1, 2)))
     height, width = (side // EDGE_CELL * EDGE_CELL for side in strength.shape)
     blocks = strength[:height, :width].reshape(height // EDGE_CELL, EDGE_CELL, width // EDGE_CELL, EDGE_CELL)
     flat = blocks.transpose(0, 2, 1, 3).reshape(height // EDGE_CELL, width // EDGE_CELL, -1)
