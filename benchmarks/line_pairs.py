@@ -20,6 +20,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features, LineFeatures
 
 from vggtgeo.datasets import open_sequence
@@ -147,7 +148,7 @@ def place(
             errors[group, method].append(_error(pose, pair.second.pose))
     rng = np.random.default_rng(pair.second.frame.index)
     shift, turn = (size * way / np.linalg.norm(way) for size, way in zip(AWAY, rng.normal(size=(2, 3)), strict=True))
-    start = replace(pair.expected, pose=rigid.exponential(np.r_[shift, turn]) @ pair.second.pose)
+    start = replace(pair.expected, pose=exponential(np.r_[shift, turn]) @ pair.second.pose)
     for one in (found["lines"], pair.by("lines", keyframe, start)):
         distance, angle = _error(one.pose, pair.second.pose)
         if distance < NEAR[0] and angle < NEAR[1]:

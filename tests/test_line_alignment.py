@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import chi2
 from vggtgeo.models import pinhole
 from vggtgeo.models.classical import sample_segments
+from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, RelativeView, Segments
 
 from vggtgeo.geometry import rigid
@@ -24,7 +25,7 @@ from vggtgeo.slam.settings_table import updated
 INTRINSICS = np.array([400.0, 400.0, 239.5, 179.5])
 SIZE = (480, 360)
 NOTHING = np.zeros((6, 6))
-MOTION = rigid.exponential(np.array([0.05, -0.03, 0.08, 0.02, -0.04, 0.015]))
+MOTION = exponential(np.array([0.05, -0.03, 0.08, 0.02, -0.04, 0.015]))
 
 
 class _Same:
@@ -86,7 +87,7 @@ def test_lines_bring_a_wrong_start_to_the_true_motion() -> None:
     distances = []
     for _ in range(30):
         points = _segments(40, rng)
-        start = rigid.exponential(np.array([0.04, 0.03, -0.03, 0.03, 0.02, -0.02])) @ MOTION
+        start = exponential(np.array([0.04, 0.03, -0.03, 0.03, 0.02, -0.02])) @ MOTION
         found = align_lines(
             _keyframe(points, rng, 0.02), _seen(points, MOTION, rng), _Same(8), start, NOTHING, INTRINSICS
         )
@@ -102,7 +103,7 @@ def test_lines_behind_the_camera_say_nothing() -> None:
     """From a start that sees all segments from behind there is no motion by them. Oracle: they lie 2 to 4 m ahead."""
     rng = np.random.default_rng(0)
     points = _segments(10, rng)
-    behind = rigid.exponential(np.array([0.0, 0.0, -9.0, 0.0, 0.0, 0.0]))
+    behind = exponential(np.array([0.0, 0.0, -9.0, 0.0, 0.0, 0.0]))
     sure = 1e6 * np.eye(6)
     assert (
         align_lines(_keyframe(points, rng, 0.02), _seen(points, MOTION, rng), _Same(), behind, sure, INTRINSICS) is None
@@ -112,7 +113,7 @@ def test_lines_behind_the_camera_say_nothing() -> None:
 def test_what_parallel_lines_do_not_say_is_missing() -> None:
     """Lines along one direction leave the motion along it unknown; the start is kept there. Oracle: the direction."""
     along = np.array([0.6, 0.0, 0.8])
-    wrong = rigid.exponential(np.array([0.0, 0.03, 0.0, 0.01, 0.0, 0.0])) @ MOTION
+    wrong = exponential(np.array([0.0, 0.03, 0.0, 0.01, 0.0, 0.0])) @ MOTION
     turned = MOTION[:3, :3] @ along
     across = np.cross(turned, [0.0, 1.0, 0.0])
     for seed in range(10):
@@ -156,7 +157,7 @@ def test_segments_without_depth_get_it_from_other_views() -> None:
     views, edges = {0: blind}, []
     index, ones = np.arange(50), np.ones(50)
     for number in (1, 2, 3):
-        pose = rigid.exponential(np.r_[-0.12 * number * baseline, 0.0, 0.0, 0.0])
+        pose = exponential(np.r_[-0.12 * number * baseline, 0.0, 0.0, 0.0])
         views[number] = replace(known, number=number, pose=pose, lines=_seen(points, pose, rng))
         edges.append(Directed(0, number, np.zeros(0, int), np.zeros((0, 2)), np.zeros(0), index, index, ones))
     found = with_segment_depths(views, edges, INTRINSICS)[0]

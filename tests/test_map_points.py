@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from vggtgeo.models.classical import SiftMatcher, search_near, search_tree
+from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
@@ -33,7 +34,7 @@ from vggtgeo.slam.tracking import (
 
 SIZE = (320, 240)
 ROLES = Roles(points=SiftMatcher(count=500))
-OFF = rigid.exponential(np.array([0.008, -0.006, 0.008, 0.004, -0.004, 0.003]))
+OFF = exponential(np.array([0.008, -0.006, 0.008, 0.004, -0.004, 0.003]))
 VAGUE = np.diag(1.0 / np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01]) ** 2)
 View = tuple[tuple[Keyframe, ...], Keyframe, np.ndarray, np.ndarray]
 
@@ -121,7 +122,7 @@ def test_keyframes_with_too_few_points_each_place_a_frame_together(view: View) -
     """
     keyframes, frame, true, intrinsics = view
     poor = tuple(_knowing(keyframe, frame, true, intrinsics, 10) for keyframe in keyframes)
-    wrong = rigid.exponential(np.array([0.05, -0.04, 0.04, 0.03, -0.035, 0.02])) @ true
+    wrong = exponential(np.array([0.05, -0.04, 0.04, 0.03, -0.035, 0.02])) @ true
     sight = Sight(Frame(8, 0.8, frame.image, None, ""), Description.of(frame.features), None)
     expected = Expectation(wrong, np.eye(4))
     for keyframe in poor:

@@ -5,9 +5,11 @@ from typing import Any
 import numpy as np
 import plane_views as views
 import pytest
+from scipy.linalg import expm
 from vggtgeo.models import roles
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry, TwoViewStart
 from vggtgeo.models.classical.pose_refinement import refine_pose
+from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import GeometryResult
 
 POSE = views.pose((5.0, -10.0, 3.0), (0.3, -0.2, 0.1))
@@ -177,3 +179,12 @@ def test_no_start_from_nonsense(pixels: np.ndarray) -> None:
     guess = TwoViewStart().start(pixels, other, views.INTRINSICS)
     assert guess.result is not GeometryResult.SUCCESS
     assert np.isfinite(guess.pose).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.99e-4, 1.01e-4, 0.3, 3.0, 7.0])
+def test_a_small_motion_turns_by_its_rotation_vector(angle: float) -> None:
+    # Proves the retraction of the pose estimators on both sides of its series. Oracle: the matrix exponential.
+    axis = np.array([0.36, -0.48, 0.8])
+    motion = exponential(np.array([0.1, 0.2, -0.3, *(angle * axis)]))
+    np.testing.assert_allclose(motion[:3, :3], expm(np.cross(np.eye(3), angle * axis)), atol=1e-14)
+    np.testing.assert_allclose(motion[:, 3], [0.1, 0.2, -0.3, 1.0])

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
+from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery, Segments
 
 from vggtgeo.datasets.frame import Frame
@@ -185,7 +186,7 @@ def _by_lines(room: Room, keep: Callable[[np.ndarray], np.ndarray]) -> tuple[Tra
     kept = keep(segments.endpoints)
     segments = Segments(segments.endpoints[kept], segments.scores[kept])
     sight = Sight(frames[2], blank, None, lambda: ROLES.line_matches.describe(frames[2].image, segments))
-    wrong = rigid.exponential(np.array([0.03, -0.02, 0.02, 0.02, -0.025, 0.015])) @ poses[2]
+    wrong = exponential(np.array([0.03, -0.02, 0.02, 0.02, -0.025, 0.015])) @ poses[2]
     return track(sight, keyframe, None, Expectation(wrong, np.eye(4)), intrinsics, ROLES), poses[2]
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from vggtgeo.models import pinhole
+from vggtgeo.models.rigid_motion import exponential
 
 
 def refine_pose(
@@ -23,12 +23,12 @@ def refine_pose(
 
     pose: [4, 4] world -> camera, the start. points [n, 3], pixels [n, 2], weights [n]. Returns float64 [4, 4].
     """
-    current, energy = pose, _energy(pose, points, pixels, weights, intrinsics, delta)
+    current, (energy, error, local) = pose, _judged(pose, points, pixels, weights, intrinsics, delta)
     for _ in range(steps):
-        step = _gauss_newton_step(current, points, pixels, weights, intrinsics, delta)
+        step = _gauss_newton_step(error, local, weights, intrinsics, delta)
         for fraction in (1.0, 0.5, 0.25, 0.125):
-            trial = _exponential(fraction * step) @ current
-            trial_energy = _energy(trial, points, pixels, weights, intrinsics, delta)
+            trial = exponential(fraction * step) @ current
+            trial_energy, error, local = _judged(trial, points, pixels, weights, intrinsics, delta)
             if trial_energy < energy:
                 break
         else:
@@ -58,42 +58,30 @@ def pose_information(pose: np.ndarray, points: np.ndarray, intrinsics: np.ndarra
     return (row_x @ row_x.T + row_y @ row_y.T) / sigma**2
 
 
-def _energy(
+def _judged(
     pose: np.ndarray,
     points: np.ndarray,
     pixels: np.ndarray,
     weights: np.ndarray,
     intrinsics: np.ndarray,
     delta: float,
-) -> float:
-    size = np.linalg.norm(residuals(pose, points, pixels, intrinsics)[0], axis=1)
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """The energy at `pose`, and what `residuals` gives."""
+    error, local = residuals(pose, points, pixels, intrinsics)
     # A point behind the camera costs as much as one a thousand pixels away, so that the energy stays finite.
-    size = np.minimum(size, 1e3)
-    return float(weights @ np.where(size <= delta, size * size, delta * (2.0 * size - delta)))
+    size = np.minimum(np.hypot(error[:, 0], error[:, 1]), 1e3)
+    return float(weights @ np.where(size <= delta, size * size, delta * (2.0 * size - delta))), error, local
 
 
 def _gauss_newton_step(
-    pose: np.ndarray,
-    points: np.ndarray,
-    pixels: np.ndarray,
-    weights: np.ndarray,
-    intrinsics: np.ndarray,
-    delta: float,
+    error: np.ndarray, local: np.ndarray, weights: np.ndarray, intrinsics: np.ndarray, delta: float
 ) -> np.ndarray:
-    error, local = residuals(pose, points, pixels, intrinsics)
     use = np.isfinite(error[:, 0])
-    error, weights = error[use], weights[use]
-    weights = weights * np.minimum(1.0, delta / np.maximum(np.linalg.norm(error, axis=1), 1e-12))
-    row_x, row_y = pinhole.projection_rows(local[use], intrinsics)
+    if not use.all():
+        error, local, weights = error[use], local[use], weights[use]
+    weights = weights * np.minimum(1.0, delta / np.maximum(np.hypot(error[:, 0], error[:, 1]), 1e-12))
+    row_x, row_y = pinhole.projection_rows(local, intrinsics)
     hessian = (row_x * weights) @ row_x.T + (row_y * weights) @ row_y.T
     gradient = row_x @ (weights * error[:, 0]) + row_y @ (weights * error[:, 1])
     hessian[np.diag_indices(6)] += 1e-9 * np.trace(hessian) + 1e-12
-    return -np.linalg.solve(hessian, gradient)
-
-
-def _exponential(tangent: np.ndarray) -> np.ndarray:
-    """Exp on SO(3) x R^3: to first order the exponential of SE(3), and as good a retraction."""
-    pose = np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(tangent[3:])[0]
-    pose[:3, 3] = tangent[:3]
-    return pose
+    return np.asarray(-np.linalg.solve(hessian, gradient))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -91,16 +90,6 @@ def fraction(motion: np.ndarray, share: float) -> np.ndarray:
     part[:3, :3] = Rotation.from_rotvec(share * Rotation.from_matrix(motion[:3, :3]).as_rotvec()).as_matrix()
     part[:3, 3] = share * motion[:3, 3]
     return part
-
-
-def exponential(tangent: np.ndarray) -> np.ndarray:
-    """The motion [4, 4] of a translation and a rotation vector, float64 [6]: Exp on R^3 x SO(3), to first order that of
-    SE(3), and as good a retraction.
-    """
-    motion = np.eye(4)
-    motion[:3, :3] = cv2.Rodrigues(np.asarray(tangent[3:], np.float64))[0]
-    motion[:3, 3] = tangent[:3]
-    return motion
 
 
 def adjoint(pose: np.ndarray) -> np.ndarray:

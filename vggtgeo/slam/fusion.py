@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
+from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import LineFeatures, LineMatcher
 from vggtgeo.slam.evidence import Evidence, tangent
 from vggtgeo.slam.keyframe import Keyframe
@@ -48,7 +49,7 @@ def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) 
     if off @ np.linalg.solve(noise[0] + noise[1], off) < AGREEMENT_GATE:
         both = by_points.information + dense.information
         mean = np.linalg.solve(both + 1e-9 * np.eye(6), by_points.information @ off)
-        return Motion(rigid.exponential(mean) @ dense.motion, both)
+        return Motion(exponential(mean) @ dense.motion, both)
     # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
     near = np.linalg.norm(off[:3]) < LARGEST_DISAGREEMENT or not evidence.points_strong
     return by_picture if evidence.dense_fair and near else by_points
@@ -61,7 +62,7 @@ def drawn_to(found: Motion, prior: Motion) -> Motion:
     """
     off = tangent(prior.motion @ rigid.invert(found.motion))
     step = np.linalg.solve(found.information + prior.information, prior.information @ off)
-    return Motion(rigid.exponential(step) @ found.motion, found.information)
+    return Motion(exponential(step) @ found.motion, found.information)
 
 
 def wanting(found: Motion) -> bool:

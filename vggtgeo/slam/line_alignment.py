@@ -25,6 +25,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.models.classical import line_coefficients
+from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
 from vggtgeo.slam.evidence import tangent, worst_sigma
 from vggtgeo.slam.keyframe import Keyframe
@@ -132,7 +133,7 @@ def align_lines(
         for _ in range(ITERATIONS):
             rows = _rows(segments, own, theirs, motion, intrinsics)
             step = _step(rows, motion, start, known)
-            motion = rigid.exponential(step) @ motion
+            motion = exponential(step) @ motion
             if np.abs(step).max() < 1e-4:
                 break
         rows = _rows(segments, own, theirs, motion, intrinsics)

@@ -18,6 +18,7 @@ from scipy.stats import chi2 as chi_square
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
+from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.evidence import tangent
 from vggtgeo.slam.keyframe import Keyframe
@@ -83,7 +84,7 @@ def refine_by_map(
         gradient = known @ tangent(current @ rigid.invert(pose))
         gradient -= np.sum([known @ own.step() for known, own in zip(limited, equations, strict=True)], axis=0)
         step = -_solve(information + known, gradient)
-        current = rigid.exponential(step) @ current
+        current = exponential(step) @ current
         if np.abs(step).max() < 1e-4:
             break
     return Refined(current, information, sum(len(part.points) for part in parts), len(parts)) if parts else None

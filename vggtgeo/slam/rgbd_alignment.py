@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.slam.rgbd_view import LEVELS, RgbdView, Samples
 
 FARTHEST = 0.15
@@ -75,7 +75,7 @@ class RgbdAlignment:
                 if edges is None and surface is None:
                     return None
                 change = _solve(*self._normal_equations(edges, surface))
-                motion = rigid.exponential(change) @ motion
+                motion = exponential(change) @ motion
                 if np.abs(change).max() < (SETTLED if level == 0 else 10 * SETTLED):
                     break
         return self._judged(source, target, motion)
