@@ -1,6 +1,7 @@
 """Readers of the benchmarks' layouts, each on a tiny recording of just that layout."""
 
 import itertools
+import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import tiny_layouts as tiny
 import tiny_sequences
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets import Sequence, open_sequence, with_rate
+from vggtgeo.datasets import Sequence, open_sequence, with_depth_scale, with_rate
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.registration import registered_depth
 from vggtgeo.datasets.seven_scenes import _TO_COLOUR
@@ -53,6 +54,52 @@ def test_replica(tmp_path: Path) -> None:
     truth = sequence.ground_truth()
     assert truth.positions[:, 0].tolist() == [0, 1, 2]
     np.testing.assert_allclose(truth.timestamps, [frame.timestamp for frame in frames])
+
+
+@pytest.mark.parametrize(
+    ("colour", "depth"),
+    [
+        ("rgb/{}.png", "depth/{}.png"),
+        ("color/{:06d}.png", "depth/{:06d}.png"),  # Open3D's
+        ("RGB/rgb_{}.png", "Depth/depth_00{}.png"),
+        ("images/130503110{}.175304.png", "depth/130503110{}.162211.png"),
+        ("image/{}_left_a1.png", "depth/{}_depth_a1.png"),  # only the order tells
+    ],
+)
+def test_folders_of_colour_and_depth_are_paired(tmp_path: Path, colour: str, depth: str) -> None:
+    # Proves pairing by name, number, time and order, millimetres, and the camera of Open3D's recorders. Oracle: what
+    # was written: the depth of a frame tells which it is.
+    sequence = _open(tiny.rgbd(tmp_path / "own", colour, depth))
+    frames = _check(sequence, "RgbdFolders")
+    assert [frame.depth[3, 7] for frame in frames] == pytest.approx([1.007, 1.017, 1.027])
+    halved = with_depth_scale(sequence, 2000.0)
+    assert next(iter(halved.frames())).depth[3, 7] == pytest.approx(1.007 / 2)
+    assert next(iter(with_rate(sequence, 10.0).frames(2))).timestamp == pytest.approx(0.2)
+
+
+def test_folders_that_cannot_be_paired_are_named(tmp_path: Path) -> None:
+    # Proves the errors: names without a relation, a camera of another size, a unit of depth for a sequence without.
+    folder = tiny.rgbd(tmp_path / "own", "rgb/{}_left_a1.png", "depth/{}_depth_a1.png")
+    (folder / "depth" / "2_depth_a1.png").unlink()
+    with pytest.raises(InputError, match=r"3 images .* and the 2 depths .* cannot be paired"):
+        open_sequence(folder)
+    folder = tiny.rgbd(tmp_path / "resized")
+    camera = folder / "intrinsic.json"
+    camera.write_text(camera.read_text().replace(f'"width": {tiny_sequences.WIDTH}', '"width": 848'))
+    with pytest.raises(InputError, match="is of images of 848 x 30 pixels; those here are 40 x 30"):
+        open_sequence(folder)
+    camera.write_text('{"fx": 50, "fy": 50, "ppx": 20, "ppy": 15}')
+    assert open_sequence(folder).camera.intrinsics == (50, 50, 20, 15)
+    camera.write_text('{"fx": 50}')
+    with pytest.raises(InputError, match=r"expected `intrinsic_matrix` \(nine numbers"):
+        open_sequence(folder)
+    camera.unlink()
+    shutil.rmtree(folder / "depth")
+    alone = _open(folder)
+    assert not alone.has_depth
+    assert len(alone) == tiny.COUNT
+    with pytest.raises(InputError, match="no depth files whose unit could be another"):
+        with_depth_scale(alone, 5000.0)
 
 
 def test_scannet_brings_images_to_the_depth_camera(tmp_path: Path) -> None:

@@ -27,6 +27,18 @@ def replica(folder: Path) -> Path:
     return folder
 
 
+def rgbd(folder: Path, colour: str = "rgb/{}.png", depth: str = "depth/{}.png") -> Path:
+    """Colour and depth side by side, depth in millimetres, the camera as Open3D's recorders write it."""
+    for number in range(COUNT):
+        write_image(folder / colour.format(number), image(number))
+        write_image(folder / depth.format(number), depth_codes(number))
+    fx, fy, cx, cy = INTRINSICS
+    matrix = [fx, 0.0, 0.0, 0.0, fy, 0.0, cx, cy, 1.0]
+    camera = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": matrix}
+    (folder / "intrinsic.json").write_text(json.dumps(camera))
+    return folder
+
+
 def scannet(folder: Path) -> Path:
     """An exported scan: colour of twice the pixels, millimetres, the second pose lost."""
     for number in range(COUNT):

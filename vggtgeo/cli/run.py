@@ -36,6 +36,7 @@ def run(
     fps: options.RateOption = None,
     intrinsics: options.IntrinsicsOption = None,
     rgb_only: options.RgbOnlyOption = False,
+    depth_scale: options.DepthScaleOption = None,
     lines: options.LinesOption = True,
     depth_prior: options.DepthPriorOption = True,
     confidence: options.ConfidenceOption = True,
@@ -90,7 +91,7 @@ def run(
         raise InputError(f"`--save-map` is `{save_map}`, which is a folder; give the name of a file")
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:
-        sequence = open_input(path, kind, intrinsics, rgb_only, fps)
+        sequence = open_input(path, kind, intrinsics, rgb_only, fps, depth_scale)
     classical = classical_roles(sequence.has_depth, init, features)
     mixed = {"points": points, "lines": line_detector, "depth": depth}
     perceived = make_perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
@@ -138,12 +139,19 @@ def check_provider(preset: str, provider: options.Provider) -> None:
 
 
 def open_input(
-    path: str | Path, kind: str | None, intrinsics: str | None, rgb_only: bool, fps: float | None = None
+    path: str | Path,
+    kind: str | None,
+    intrinsics: str | None,
+    rgb_only: bool,
+    fps: float | None = None,
+    depth_scale: float | None = None,
 ) -> Sequence:
     """The sequence at `path`, with what the flags say otherwise."""
-    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_intrinsics, without_depth
+    from vggtgeo.datasets import open_sequence, parse_intrinsics, with_depth_scale, with_intrinsics, without_depth
 
     sequence = open_sequence(path, kind, fps)
+    if depth_scale is not None:
+        sequence = with_depth_scale(sequence, depth_scale)
     if intrinsics is not None:
         sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
     return without_depth(sequence) if rgb_only else sequence

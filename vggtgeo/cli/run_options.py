@@ -110,3 +110,7 @@ RateOption = Annotated[
     float | None,
     typer.Option("--fps", help="Frames a second of a video or a folder of images, in place of what is assumed."),
 ]
+DepthScaleOption = Annotated[
+    float | None,
+    typer.Option(help="Units a metre of 16-bit depth files, in place of what their layout says: 1000 is millimetres."),
+]

@@ -7,7 +7,7 @@ from vggtgeo.datasets.opening import KINDS, open_sequence
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
-from vggtgeo.datasets.views import SequenceView, with_intrinsics, with_rate, without_depth
+from vggtgeo.datasets.views import SequenceView, with_depth_scale, with_intrinsics, with_rate, without_depth
 
 __all__ = [
     "KINDS",
@@ -20,6 +20,7 @@ __all__ = [
     "VideoFile",
     "open_sequence",
     "parse_intrinsics",
+    "with_depth_scale",
     "with_intrinsics",
     "with_rate",
     "without_depth",

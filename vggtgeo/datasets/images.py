@@ -27,15 +27,15 @@ class ImageFolder(FolderSequence):
     @classmethod
     def matches(cls, folder: Path) -> bool:
         """Whether `folder` has an image."""
-        return bool(_images(folder))
+        return bool(image_files(folder))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Lists the images; InputError where there is none."""
-        images = _images(folder)
+        images = image_files(folder)
         if not images:
             raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
-        times = _times(images)
+        times = times_by_name(images)
         files = tuple(
             FrameFile(index, time, image) for index, (time, image) in enumerate(sorted(zip(times, images, strict=True)))
         )
@@ -54,12 +54,14 @@ def natural_key(name: str) -> list[int | str]:
     return [int(part) if part.isdigit() else part.lower() for part in re.split(r"([0-9]+)", name)]
 
 
-def _images(folder: Path) -> list[Path]:
+def image_files(folder: Path) -> list[Path]:
+    """The images in `folder`, in natural order."""
     found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     return sorted(found, key=lambda path: (natural_key(path.name), path.name))
 
 
-def _times(images: list[Path]) -> list[float]:
+def times_by_name(images: list[Path]) -> list[float]:
+    """Seconds by the names where all are times, else position / 30 s."""
     stems = [image.stem for image in images]
     for pattern, unit in ((_SECONDS, 1.0), (_NANOSECONDS, 1e-9)):
         if all(pattern.fullmatch(stem) for stem in stems):

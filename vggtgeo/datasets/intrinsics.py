@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vggtgeo.datasets.pose_files import read_json
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -19,6 +20,8 @@ LEAST_VALID = 0.5
 more than 0.8."""
 CALIBRATION = "calibration.txt"
 MATRIX = "camera-intrinsics.txt"
+JSON = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
+"""Names that recorders give to it."""
 
 # Colour cameras of the TUM RGB-D benchmark, 640 x 480 (fx fy cx cy, k1 k2 p1 p2 k3), from
 # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; freiburg3 is published undistorted.
@@ -39,9 +42,18 @@ def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
 
 def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
     """The camera of `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`), else of
-    `camera-intrinsics.txt` (3 x 3) in `folder`, else None. InputError where such a file is there but wrong.
+    `camera-intrinsics.txt` (3 x 3), else of a JSON file as Open3D's and RealSense's recorders write it, in `folder`,
+    else None. InputError where such a file is there but wrong.
     """
-    for name, read in ((CALIBRATION, _read_calibration), (MATRIX, _read_matrix)):
+
+    def of_this_size(file: Path) -> tuple[tuple[float, float, float, float], tuple[float, ...]]:
+        return _read_json_camera(file, width, height)
+
+    for name, read in (
+        (CALIBRATION, _read_calibration),
+        (MATRIX, _read_matrix),
+        *((name, of_this_size) for name in JSON),
+    ):
         file = folder / name
         if file.is_file():
             intrinsics, distortion = read(file)
@@ -127,6 +139,37 @@ def _read_matrix(file: Path) -> tuple[tuple[float, float, float, float], tuple[f
         return check_intrinsics((fx, fy, cx, cy)), ()
     except InputError as error:
         raise InputError(f"`{file}`: {error}") from None
+
+
+def _read_json_camera(
+    file: Path, width: int, height: int
+) -> tuple[tuple[float, float, float, float], tuple[float, ...]]:
+    """Of Open3D: `width`, `height` and `intrinsic_matrix`, nine numbers column by column; of RealSense: `fx`, `fy`,
+    `ppx`, `ppy`, or `cx`, `cy`.
+    """
+    content = read_json(file)
+    if not isinstance(content, dict):
+        raise InputError(f"`{file}`: found {type(content).__name__}; expected an object with the camera")
+    size = content.get("width", width), content.get("height", height)
+    if size != (width, height):
+        raise InputError(
+            f"`{file}` is of images of {size[0]} x {size[1]} pixels; those here are {width} x {height}: write the "
+            f"camera of these into `{CALIBRATION}`, or give --intrinsics fx,fy,cx,cy"
+        )
+    matrix = content.get("intrinsic_matrix")
+    if isinstance(matrix, list) and len(matrix) == 9:
+        found = [matrix[0], matrix[4], matrix[6], matrix[7]]
+    else:
+        found = [content.get(name, content.get(other)) for name, other in _JSON_NAMES]
+    if not all(isinstance(number, int | float) for number in found):
+        raise InputError(f"`{file}`: expected `intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`")
+    try:
+        return check_intrinsics(tuple(map(float, found))), ()
+    except (InputError, OverflowError) as error:
+        raise InputError(f"`{file}`: {error}") from None
+
+
+_JSON_NAMES = (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy"))
 
 
 def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
 from vggtgeo.datasets.replica import Replica
+from vggtgeo.datasets.rgbd_folders import RgbdFolders
 from vggtgeo.datasets.scannet import ScanNet
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tanks import TanksAndTemples
@@ -47,6 +48,7 @@ FOLDER_KINDS: dict[str, FolderReader] = {
     "icl": IclNuim,
     "7scenes": SevenScenes,
     "tum": TumRgbd,
+    "rgbd": RgbdFolders,
     "images": ImageFolder,
 }
 """Readers by name, in the order in which a folder is tried: the plain ones last."""
@@ -101,7 +103,8 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
             return reader.open(place)
     raise InputError(
         f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
-        "a TUM RGB-D folder (`rgb.txt`), another layout of `vggtgeo data list`, or a folder of images"
+        "a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of `vggtgeo data list`, or a folder "
+        "of images"
     )
 
 

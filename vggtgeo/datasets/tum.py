@@ -42,7 +42,7 @@ class TumRgbd(FolderSequence):
         """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
         images = _read_list(folder / "rgb.txt", frames=True)
         depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
-        partners = _partners(images, depths)
+        partners = partners_in_time(images, depths)
         files = tuple(
             FrameFile(index, time, image, None if partner is None else depths[partner][1])
             for index, ((time, image), partner) in enumerate(zip(images, partners, strict=True))
@@ -100,8 +100,11 @@ def _in_order(file: Path, entries: list[_Entry], frames: bool) -> list[_Entry]:
     return unique
 
 
-def _partners(images: list[_Entry], depths: list[_Entry]) -> list[int | None]:
-    """For each image the row of its depth: pairs are made in the order of their time difference, each row once."""
+def partners_in_time(images: list[_Entry], depths: list[_Entry]) -> list[int | None]:
+    """For each image (time, file) the row of its depth in a list in the order of time.
+
+    Pairs are made in the order of their time difference, each row once.
+    """
     times = np.array([time for time, _ in depths])
     candidates = []
     for row, (time, _) in enumerate(images):

@@ -8,6 +8,7 @@ from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
+from vggtgeo.datasets.rgbd_folders import RgbdFolders
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -61,9 +62,25 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
         raise InputError(f"`rate` is {rate:g}; it must be a positive number of frames a second")
     if isinstance(sequence, VideoFile):
         return replace(sequence, given_rate=rate)
-    if isinstance(sequence, ImageFolder):
+    if isinstance(sequence, ImageFolder | RgbdFolders):
         return replace(sequence, files=tuple(replace(file, timestamp=file.index / rate) for file in sequence.files))
     raise InputError(f"`{sequence.name}` has times of its own; a rate is for videos and folders of images")
+
+
+def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
+    """The sequence whose 16-bit depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
+
+    Raises:
+        InputError: it is no positive number, or the depth comes from no such files.
+
+    """
+    if not (math.isfinite(units_per_metre) and units_per_metre > 0):
+        raise InputError(f"the depth's scale is {units_per_metre:g}; it must be a positive number of units a metre")
+    plain = isinstance(sequence, FolderSequence) and type(sequence).load_depth is FolderSequence.load_depth
+    if not plain or not sequence.has_depth:
+        raise InputError(f"`{sequence.name}` has no depth files whose unit could be another")
+    assert isinstance(sequence, FolderSequence)
+    return replace(sequence, depth_format=replace(sequence.depth_format, units_per_metre=units_per_metre))
 
 
 def without_depth(sequence: Sequence) -> Sequence:

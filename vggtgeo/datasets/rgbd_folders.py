@@ -1,0 +1,127 @@
+"""Two folders side by side, colour and depth, as recorders and scripts write them: `rgb/0.png` and `depth/0.png`.
+
+Open3D's recorders write `color/`, `depth/` and `intrinsic.json`; many of one's own write `rgb/` and `depth/`, and no
+camera. Depth is in millimetres, as Open3D, RealSense and Kinect have it, unless `with_depth_scale` says otherwise.
+"""
+
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.image_files import MILLIMETRES
+from vggtgeo.datasets.images import image_files, times_by_name
+from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, partners_in_time
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+
+COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
+DEPTH = ("depth", "depths")
+
+
+@dataclass(frozen=True)
+class RgbdFolders(FolderSequence):
+    """Images in one folder and, where there is a second one, their depth. Truth: `groundtruth.txt` (TUM format).
+
+    A depth belongs to the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), of the nearest
+    time within 0.02 s where names are times, or of the same place in the list. Times are as in a folder of images.
+    """
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has images in a folder named as one of `COLOUR`, and none of its own."""
+        colour = _folder(folder, COLOUR)
+        return colour is not None and not image_files(folder)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Lists the images and finds their depths; InputError where the two cannot be paired."""
+        colour, depth = _folder(folder, COLOUR), _folder(folder, DEPTH)
+        if colour is None:
+            raise InputError(f"`{folder}` has no folder of images named {', '.join(f'`{name}`' for name in COLOUR)}")
+        images = image_files(colour)
+        times = times_by_name(images)
+        depths = [] if depth is None else image_files(depth)
+        partners = _partners(folder, images, depths) if depths else [None] * len(images)
+        alone = partners.count(None)
+        if depths and alone:
+            _warn(f"`{folder}`: {alone} of {len(images)} images have no depth")
+        rows = sorted(zip(times, images, partners, strict=True), key=lambda row: row[0])
+        files = tuple(FrameFile(index, time, image, partner) for index, (time, image, partner) in enumerate(rows))
+        width, height = common_size(str(folder), files)
+        camera = (
+            camera_from_folder(folder, width, height)
+            or camera_from_folder(colour, width, height)
+            or guess_with_warning(str(folder), width, height)
+        )
+        has_depth = depth_is_usable(str(folder), files, MILLIMETRES, width, height)
+        return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses, if the folder has them."""
+        file = self.folder / "groundtruth.txt"
+        return Trajectory.load_tum(file) if file.exists() else None
+
+
+def _folder(folder: Path, names: Sequence[str]) -> Path | None:
+    """The first of the folders `names`, in small or capital letters, that has images."""
+    there = {path.name.lower(): path for path in folder.iterdir() if path.is_dir()}
+    return next((there[name] for name in names if name in there and image_files(there[name])), None)
+
+
+def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path | None]:
+    """The depth of each image, None where it has none."""
+    for key in (_stem, _number):
+        found = _by(key, images, depths)
+        if found is not None:
+            return found
+    image_times, depth_times = _seconds(images), _seconds(depths)
+    if image_times is not None and depth_times is not None:
+        order = sorted(range(len(depths)), key=lambda row: depth_times[row])
+        listed = [(depth_times[row], depths[row]) for row in order]
+        rows = partners_in_time(list(zip(image_times, images, strict=True)), listed)
+        if any(row is not None for row in rows):
+            return [None if row is None else listed[row][1] for row in rows]
+    if len(images) == len(depths):
+        _warn(f"`{folder}`: the names of images and depths have nothing in common; they are paired in their order")
+        return list(depths)
+    raise InputError(
+        f"`{folder}`: the {len(images)} images ({images[0].name}, ...) and the {len(depths)} depths ({depths[0].name}, "
+        f"...) cannot be paired: give both the same names or numbers, or times no more than {MAX_DEPTH_DELAY} s apart"
+    )
+
+
+def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path]) -> list[Path | None] | None:
+    """Pairs by a key of the names; None where it does not tell files apart, or pairs less than half of them."""
+    keys = [[key(path) for path in paths] for paths in (images, depths)]
+    if any(None in own or len(set(own)) < len(own) for own in keys):
+        return None
+    known = dict(zip(keys[1], depths, strict=True))
+    found = [known.get(one) for one in keys[0]]
+    paired = len(found) - found.count(None)
+    return found if paired >= 0.5 * min(len(images), len(depths)) else None
+
+
+def _stem(path: Path) -> str:
+    return path.stem
+
+
+def _number(path: Path) -> str | None:
+    """The last number in a name that is no time."""
+    numbers = re.findall(r"\d+", path.stem)
+    return str(int(numbers[-1])) if numbers and _seconds([path]) is None else None
+
+
+def _seconds(paths: list[Path]) -> list[float] | None:
+    """Times of files named `1305031102.175304.png`."""
+    if not all(re.fullmatch(r"\d+\.\d+", path.stem) for path in paths):
+        return None
+    return [float(path.stem) for path in paths]
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, InputWarning, stacklevel=4)
