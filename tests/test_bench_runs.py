@@ -59,9 +59,9 @@ def test_no_child_outlives_its_run(tmp_path: Path) -> None:
     code = (
         "import subprocess, sys, time; c = subprocess.Popen(['sleep', '60']); print(c.pid, flush=True); time.sleep(60)"
     )
-    run_limited(_python(code), tmp_path / "log.txt", Limits(0.5, 2.0))
+    run_limited(_python(code), tmp_path / "log.txt", Limits(2.0, 2.0))
     child = int((tmp_path / "log.txt").read_text())
-    deadline = time.monotonic() + 2
+    deadline = time.monotonic() + 10
     while _runs(child) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not _runs(child)
@@ -90,7 +90,7 @@ if job["setting"] == "bare" and job["seed"] == 0 and job["sequence"] == "walk": 
 if job["setting"] == "bare" and job["seed"] == 1 and job["sequence"] == "walk": os.kill(os.getpid(), 6)
 if job["setting"] == "bare" and job["seed"] == 2 and job["sequence"] == "walk": time.sleep(60)
 """
-    store, limits = Store(tmp_path, "tiny", "source"), Limits(1.0, 2.0)
+    store, limits = Store(tmp_path, "tiny", "source"), Limits(5.0, 2.0)
     rows = all_rows(tiny.jobs(), store, limits, workers=3, command=tiny.worker(before))
     found = {(row["sequence"], row["setting"], row["seed"]): row for row in rows}
     assert Counter(row["status"] for row in rows) == {"ok": 9, "crash": 2, "timeout": 1}
