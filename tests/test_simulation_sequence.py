@@ -71,7 +71,9 @@ def test_walks_are_smooth_closed_and_hand_held(world: str) -> None:
     assert home < 0.25 + 0.2 * motion.length, f"{home=}"
 
 
-SLOW_WORLDS = [pytest.param(world, marks=pytest.mark.slow) for world in ("corridor", "room", "office", "hall")]
+SLOW_WORLDS = [
+    pytest.param(world, marks=pytest.mark.slow) for world in ("corridor", "room", "office", "hall", "building")
+]
 
 
 @pytest.mark.parametrize("world", ["staircase", *SLOW_WORLDS])

@@ -15,7 +15,7 @@ from vggtgeo.cli.settings_file import SettingsOption
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("runs/demo"),
     settings: SettingsOption = None,
-    scene: Annotated[str, typer.Option(help="Synthetic scene: office, hall, corridor, staircase, room.")] = "office",
+    scene: Annotated[str, typer.Option(help="Scene: office, hall, corridor, staircase, building, room.")] = "office",
     frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 60,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the scene and its noise.")] = 0,
     assignments: AssignmentsOption = None,

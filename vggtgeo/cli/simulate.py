@@ -11,7 +11,7 @@ from vggtgeo.io.errors import InputError
 
 
 def simulate(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="room, office, hall, corridor or staircase.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="room, office, hall, corridor, staircase or building.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder for the sequence.")],
     frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 300,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Decides everything that is random.")] = 0,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from vggtgeo.simulation.building import BUILDING_WALK, build_building
 from vggtgeo.simulation.corridor import CORRIDOR_WALK, build_corridor
 from vggtgeo.simulation.hall import HALL_WALK, build_hall
 from vggtgeo.simulation.office import OFFICE_WALK, build_office
@@ -18,4 +19,5 @@ WORLDS: dict[str, tuple[Callable[[int], Scene], Walk]] = {
     "hall": (build_hall, HALL_WALK),
     "corridor": (build_corridor, CORRIDOR_WALK),
     "staircase": (build_staircase, STAIRCASE_WALK),
+    "building": (build_building, BUILDING_WALK),
 }
