@@ -71,3 +71,15 @@ def test_the_reference_has_every_public_name_once() -> None:
     # Proves that a new public name is in the reference. Oracle: `vggtgeo.__all__`.
     text = "".join(page.read_text() for page in (ROOT / "docs" / "reference").glob("*.md"))
     assert sorted(re.findall(r"^::: vggtgeo\.(\w+)$", text, re.MULTILINE)) == vg.__all__
+
+
+def test_checksums_of_the_weights_are_those_that_fetch_checks() -> None:
+    # Proves that the page and the program speak of the same files. Oracle: the registry; the length of a SHA-256.
+    from vggtgeo.models.onnx.registry import NETWORKS
+
+    page = (ROOT / "docs" / "models.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("|") and "`model.onnx`" in line]
+    held = {network.hub.sha256: network.hub.repository for network in NETWORKS.values() if network.hub}
+    found = {re.findall(r"`([0-9a-f]{64})`", row)[0]: re.findall(r"\[([^\]]+)\]", row)[0] for row in rows}
+    assert found == held
+    assert {len(digits) for digits in re.findall(r"`([0-9a-f]{30,})`", page)} <= {40, 64}
