@@ -9,7 +9,7 @@ COUNT   ?= 2000
 TIME    ?= 60
 LOWEST  := .cache/lowest
 
-.PHONY: help venv demo test test-long test-slow test-lowest fuzz fuzz-parsers audit sbom lint types format lock clean
+.PHONY: help venv demo test test-long test-slow test-lowest fuzz fuzz-parsers docs audit sbom lint types format lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -51,6 +51,13 @@ test-lowest: $(READY)  ## test the core with the lowest versions that pyproject.
 	$(LOWEST)/bin/python -m pytest -o filterwarnings=ignore $(or $(ARGS),tests/test_packing.py tests/test_solve.py \
 		tests/test_properties.py tests/test_report.py tests/test_point_cloud.py tests/test_plots.py tests/test_settings_file.py)
 
+# The reference is read from an installed copy, where `vggtgeo.solvers` and `vggtgeo.models` are in place.
+docs: $(READY)  ## build the documentation site into site/ (open site/index.html); broken links are errors
+	$(BIN)/python -m pip install --quiet --no-build-isolation --editable ".[docs]"
+	rm -rf build
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/docs .
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
 audit: $(READY)  ## ask a public database for known vulnerabilities of what requirements.lock holds (network)
 	$(BIN)/python -m pip install --quiet "pip-audit>=2.7"
 	$(BIN)/pip-audit --requirement requirements.lock --require-hashes --disable-pip
@@ -81,5 +88,5 @@ lock: $(READY)  ## renew requirements.lock for all supported Pythons and platfor
 		--output-file requirements.lock pyproject.toml
 
 clean:  ## remove what was built, keep .venv and runs
-	rm -rf build dist .cache .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf build dist site .cache .mypy_cache .pytest_cache .ruff_cache *.egg-info
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

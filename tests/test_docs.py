@@ -3,18 +3,28 @@
 import re
 import runpy
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from conftest import ROOT
 
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+import vggtgeo as vg
+
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+
+
+@pytest.fixture(scope="module")
+def hooks() -> dict[str, Any]:
+    """What the site does beside MkDocs."""
+    return runpy.run_path(str(ROOT / "docs" / "site_hooks.py"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_named_files_exist(page: Path) -> None:
     # Proves that no document points to a file that is gone. Oracle: the files.
     text = page.read_text()
-    links = {page.parent / link for link in re.findall(r"\]\(([^):#]+)\)", text)}
+    links = {page.parent / link for link in re.findall(r"\]\(([^):#\s]+)(?:#[^)]*)?\)", text)}
     named = {ROOT / name for name in re.findall(r"`((?:vggtgeo|solvers|models|docs|tests)/[\w./]*)`", text)}
     assert {path for path in links | named if not path.exists()} == set()
 
@@ -33,3 +43,43 @@ def test_the_committed_picture_is_the_drawn_one() -> None:
     # Proves that the picture was redrawn after its script changed. Oracle: the script.
     draw = runpy.run_path(str(ROOT / "docs" / "draw_architecture.py"))["draw"]
     assert (ROOT / "docs" / "architecture.svg").read_text() == draw()
+
+
+def test_the_site_has_every_page_once(hooks: dict[str, Any]) -> None:
+    # Proves that no page is left out of the site's menu, or is there twice. Oracle: the files.
+    def pages(entry: Any) -> list[str]:
+        if isinstance(entry, str):
+            return [entry]
+        return [page for part in (entry.values() if isinstance(entry, dict) else entry) for page in pages(part)]
+
+    listed = pages(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
+    there = [page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")]
+    assert sorted(listed) == sorted([*there, *hooks["PAGES"].values()])
+
+
+def test_code_beside_the_mathematics_exists(hooks: dict[str, Any]) -> None:
+    # Proves that each function named beside an equation is there, and no such line is misspelt. Oracle: the sources.
+    for page in PAGES:
+        text = page.read_text()
+        named = [hooks["source_of"](found["file"], found["name"]) for found in hooks["CODE"].finditer(text)]
+        assert all("def " in code or "class " in code for code in named)
+        assert len(named) == len(re.findall(r"^Code: ", text, re.MULTILINE)), page
+    assert len(hooks["CODE"].findall((ROOT / "docs" / "mathematics.md").read_text())) > 30
+
+
+def test_the_reference_has_every_public_name_once() -> None:
+    # Proves that a new public name is in the reference. Oracle: `vggtgeo.__all__`.
+    text = "".join(page.read_text() for page in (ROOT / "docs" / "reference").glob("*.md"))
+    assert sorted(re.findall(r"^::: vggtgeo\.(\w+)$", text, re.MULTILINE)) == vg.__all__
+
+
+def test_checksums_of_the_weights_are_those_that_fetch_checks() -> None:
+    # Proves that the page and the program speak of the same files. Oracle: the registry; the length of a SHA-256.
+    from vggtgeo.models.onnx.registry import NETWORKS
+
+    page = (ROOT / "docs" / "models.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("|") and "`model.onnx`" in line]
+    held = {network.hub.sha256: network.hub.repository for network in NETWORKS.values() if network.hub}
+    found = {re.findall(r"`([0-9a-f]{64})`", row)[0]: re.findall(r"\[([^\]]+)\]", row)[0] for row in rows}
+    assert found == held
+    assert {len(digits) for digits in re.findall(r"`([0-9a-f]{30,})`", page)} <= {40, 64}
