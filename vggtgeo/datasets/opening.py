@@ -98,6 +98,8 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
         raise InputError(f"`{place}` is empty; give a folder with images")
     if kind is not None:
         return FOLDER_KINDS[kind].open(place)
+    if all((place / name).is_file() for name in ("summary.json", "trajectory.txt")):
+        raise InputError(f"`{place}` holds the result of a run; give the recording that it was made of")
     for reader in FOLDER_KINDS.values():
         if reader.matches(place):
             return reader.open(place)
