@@ -170,6 +170,8 @@ RUN = rows(
         ("`--set` without a value", good, flags("--set", "nonsense")),
         ("`--set` of a setting that is none", good, flags("--set", "tracking.least_inlier=3")),
         ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=-3")),
+        ("`--set` of a number of 5000 digits", good, flags("--set", "tracking.least_inliers=1" + "0" * 5000)),
+        ("`--set` of ten thousand brackets", good, flags("--set", "tracking.least_inliers=" + "[" * 10_000)),
         ("`--rerun` to a text file", good, flags("--rerun", "run.txt")),
         ("`--seed -1`", good, flags("--seed", "-1")),
         ("`--seed` beyond 32 bits", good, flags("--seed", "99999999999")),
@@ -189,6 +191,7 @@ SETTINGS = rows(
         ("a number out of range", None, settings("stride = 0")),
         ("an unknown group", None, settings("[trackin]\nleast_inliers = 3")),
         ("ten thousand brackets", None, settings("a = " + "[" * 10_000)),
+        ("a number of 5000 digits", None, settings("stride = 1" + "0" * 5000)),
     ],
 )
 OUTPUT = rows(

@@ -298,6 +298,11 @@ ARGUMENTS = rows(
     "`vggtgeo solve`",
     [
         ("`--max-steps 0`", bad.problem(), {"argv": solve_with("--max-steps", "0")}),
+        (
+            "`--dtype float32` of a number beyond it",
+            bad.problem(T_init=bad.put((1, 4), 1e60)),
+            {"argv": solve_with("--dtype", "float32"), "slack": 20.0},
+        ),
         ("`--dtype float16`", bad.problem(), {"argv": solve_with("--dtype", "float16")}),
         ("`--repeat 0`", bad.problem(), {"argv": solve_with("--repeat", "0")}),
     ],
