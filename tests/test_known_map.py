@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS
 from same_leaves import differences
+from test_state_file import rewritten
 from typer.testing import CliRunner
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
 from vggtgeo.results import Result
+from vggtgeo.results.files import write_trajectories
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.known_map import as_map, save_map
@@ -68,9 +70,43 @@ def test_a_map_comes_back_to_the_bit(known: Slam) -> None:
     count = len(first_half().keyframes)
     assert [keyframe.frame for keyframe in known.keyframes] == list(range(-count, 0))
     for before, after in zip(first_half().keyframes, known.keyframes, strict=True):
-        assert (
-            list(differences(replace(before.compressed(), frame=after.frame, timestamp=after.timestamp), after)) == []
-        )
+        moved = replace(before.compressed(), frame=after.frame, timestamp=after.timestamp, recorded=before.timestamp)
+        assert list(differences(moved, after)) == []
+
+
+def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: Path) -> None:
+    """The time stamps of two runs in one map are those of their clocks, through two files and in the run's folder,
+    where each line belongs to one keyframe; oracle: the time stamps of the runs. A map of version 1 has none.
+    """
+    first = [keyframe.timestamp for keyframe in first_half().keyframes]
+    slam = run(HALF, known_map=known)
+    second = [keyframe.timestamp for keyframe in slam.keyframes[len(known.keyframes) :]]
+    assert second
+    save_map(tmp_path / "both.map", slam)
+    both = vg.load_map(tmp_path / "both.map")
+    assert [keyframe.recorded for keyframe in both.keyframes] == [*first, *second]
+    write_trajectories(tmp_path, slam)
+    written = np.loadtxt(tmp_path / "map-times.txt")
+    assert written.tolist() == [[k.timestamp, k.recorded] for k in slam.keyframes[: len(known.keyframes)]]
+    listed = np.loadtxt(tmp_path / "keyframes.txt", ndmin=2)[:, 0]
+    assert set(written[:, 0]) < set(listed)
+    assert len(set(listed)) == len(listed)
+    write_trajectories(tmp_path / "alone", first_half())
+    assert not (tmp_path / "alone/map-times.txt").exists()
+
+    def older(header: dict[str, Any]) -> None:
+        place = [name for name, _ in header["classes"]].index("Keyframe")
+        header["version"] = 1
+        header["classes"][place][1].remove("recorded")
+        for keyframe in header["tree"]["v"][4]:
+            assert keyframe["c"] == place
+            keyframe["v"].pop()
+
+    old = vg.load_map(rewritten(tmp_path / "both.map", older))
+    plain = replace(both, keyframes=tuple(replace(keyframe, recorded=None) for keyframe in both.keyframes))
+    assert list(differences(plain, old)) == []
+    with pytest.raises(vg.InputError, match="is no map that vggtgeo wrote, or was changed since"):
+        vg.load_map(rewritten(tmp_path / "both.map", lambda header: header.update(version=1, classes=5)))
 
 
 def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:

@@ -31,7 +31,7 @@ from vggtgeo.results.summary import versions
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.state_file import STATE_CLASSES, checked_state
+from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
 from vggtgeo.slam.trust.evidence import EvidenceSoFar, FrameEvidence
 from vggtgeo.slam.window_recorder import WindowRecord
 
@@ -110,9 +110,8 @@ class RunSoFar:
                 setattr(refusals[role], entry.name, value)
 
 
-CHECKPOINT = Layout(
-    "checkpoint", 1, by_name((*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, WindowRecord))
-)
+KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, WindowRecord)
+CHECKPOINT = Layout("checkpoint", VERSION, by_name(KEPT_CLASSES), UPGRADES)
 
 
 def identity(

@@ -44,6 +44,7 @@ NAMES = (
     "keyframes-[0-9]*.txt",
     "uncertainty.txt",
     "uncertainty-[0-9]*.txt",
+    "map-times.txt",
     "map.ply",
     "mesh.ply",
     "scene.npz",
