@@ -14,10 +14,14 @@ from recorded_run import ROLES, SETTINGS
 from same_leaves import differences
 from test_state_file import rewritten
 from typer.testing import CliRunner
+from vggtgeo.models.classical import NoDepth
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
+from vggtgeo.datasets import without_depth
+from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.results import Result
 from vggtgeo.results.files import write_trajectories
 from vggtgeo.simulation.tum_folder import write_tum_folder
@@ -38,8 +42,9 @@ def sequence(seed: int = 0) -> Any:
 
 def run(start: int = 0, end: int | None = None, seed: int = 0, **options: Any) -> Slam:
     """The last state of a run over some frames."""
-    given = {"settings": SETTINGS, **options}
-    *_, slam = vg.run(sequence(seed), ROLES, **given, start=start, end=end)
+    given = {"roles": ROLES, "settings": SETTINGS, **options}
+    frames = sequence(seed) if given["roles"].metric else without_depth(sequence(seed))
+    *_, slam = vg.run(frames, **given, start=start, end=end)
     return settled(slam)
 
 
@@ -168,6 +173,37 @@ def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
     object.__setattr__(read, "record", None)
     with pytest.raises(vg.InputError, match="this one was read from a folder"):
         read.save_map(tmp_path / "map")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("localise_only", [False, True])
+def test_a_map_without_a_unit_serves_with_and_without_depth(localise_only: bool, tmp_path: Path) -> None:
+    """A map made of images alone places later frames, of images alone or with depth, in its own unit, and the depth
+    that is not used is told; oracle: the truth after Sim(3) alignment, the warning.
+    """
+    roles = replace(ROLES, depth=NoDepth())
+    settings = FIXED if localise_only else SETTINGS
+    *_, slam = vg.run(without_depth(sequence()), roles, SETTINGS, end=HALF)
+    save_map(tmp_path / "free.map", slam)
+    known = vg.load_map(tmp_path / "free.map")
+    assert not known.metric
+    given = {"settings": settings, "dense": "none", "end": HALF + 3, "known_map": known}
+    alone = vg.reconstruct(without_depth(sequence()), roles, **given)
+    with pytest.warns(InputWarning, match="the depth of these frames, in metres, is not used"):
+        with_depth = vg.reconstruct(sequence(), ROLES, **given)
+    for result in (alone, with_depth):
+        assert not result.metric
+        assert len(result.trajectory) >= HALF
+        error = evaluate_trajectory(result.trajectory, sequence().ground_truth()).sim3.statistics.rmse
+        assert error < 0.02, error
+
+
+@pytest.mark.long
+def test_a_run_without_depth_is_metric_in_a_metric_map(known: Slam) -> None:
+    """Images alone are placed in metres; oracle: the truth, without any scale."""
+    slam = run(0, HALF, roles=replace(ROLES, depth=NoDepth()), known_map=known)
+    assert all(record.tracked for record in slam.frames)
+    assert worst_error(slam) < 0.03
 
 
 @pytest.mark.long

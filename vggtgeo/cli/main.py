@@ -17,6 +17,7 @@ from vggtgeo.cli.jax_flags import set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.interruption import end_on_signals
+from vggtgeo.io.one_line import one_line
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1
@@ -202,7 +203,7 @@ def _leave(error: BaseException) -> NoReturn:
     else:
         message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`)"
         code = EXIT_INTERNAL
-    typer.echo(" ".join(message.split()), err=True)
+    typer.echo(one_line(message), err=True)
     raise typer.Exit(code) from None
 
 
@@ -272,7 +273,7 @@ def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
         line: str | None = None,
     ) -> None:
         if issubclass(category, InputWarning):
-            print(f"warning: {message}", file=file or sys.stderr)
+            print(f"warning: {one_line(str(message))}", file=file or sys.stderr)
         else:
             show_others(message, category, filename, lineno, file, line)
 
