@@ -139,6 +139,8 @@ RUN = rows(
     "`vggtgeo run`",
     [
         ("no path", nothing, {"argv": line("run")}),
+        ("an empty path", nothing, {"argv": line("run", "")}),
+        ("an empty `-o`", good, {"argv": lambda made: ["run", made, "-o", ""]}),
         ("a path that is not there", nothing, {"argv": line("run", "no/such/clip")}),
         ("`--stride 0`", good, flags("--stride", "0")),
         ("`--stride -2`", good, flags("--stride", "-2")),
