@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import bad_files as bad
 import cv2
@@ -20,7 +21,7 @@ from conftest import ROOT
 from decoders import ANY
 
 from vggtgeo.datasets import open_sequence, video
-from vggtgeo.io.errors import InputError, LeftOutWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 Change = Callable[[bytes], bytes]
 
@@ -83,15 +84,27 @@ def test_answers_that_lost_some_bytes_are_computed_again(tmp_path: Path) -> None
         shutil.rmtree(tmp_path / "made")
 
 
-class Broken(cv2.VideoCapture):
-    """A decoder that hands back an empty frame, then one of another size, then those of the file."""
+_CAPTURE = cv2.VideoCapture
 
-    handed = 0
+
+class Decoder:
+    """OpenCV's, with methods of one's own; it cannot be a base class: the collector of garbage then crashes."""
+
+    def __init__(self, path: str) -> None:
+        self.inside = _CAPTURE(path)
+        self.handed = self.grabbed = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inside, name)
+
+
+class Broken(Decoder):
+    """A decoder that hands back an empty frame, then one of another size, then those of the file."""
 
     def retrieve(self) -> tuple[bool, np.ndarray]:
         """Said to be decoded each time, as OpenCV does."""
         self.handed += 1
-        readable, image = super().retrieve()
+        readable, image = self.inside.retrieve()
         return readable, (image[:0], image[:20])[self.handed - 1] if self.handed < 3 else image
 
 
@@ -106,6 +119,26 @@ def test_frames_of_a_video_that_are_empty_or_of_another_size(tmp_path: Path, mon
     texts = [str(entry.message) for entry in told]
     assert texts[0] == "`clip.mp4`: frame 0 cannot be decoded; it is skipped"
     assert texts[1] == "`clip.mp4`: frame 1 is 64 x 20 pixels, the first 64 x 48; it is skipped"
+
+
+class Ending(Decoder):
+    """A container whose third frame cannot be read, as OpenCV's own reader of AVI has it: an exception."""
+
+    def grab(self) -> bool:
+        """Two frames."""
+        self.grabbed += 1
+        if self.grabbed > 2:
+            raise cv2.error("chunk.m_size <= 67108864")
+        return bool(self.inside.grab())
+
+
+def test_a_video_whose_reader_raises_ends_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is before it is used, and the user is told; oracle: the frames and the warning."""
+    (tmp_path / "calibration.txt").write_text("55 55 31.5 23.5")
+    sequence = open_sequence(bad.video(tmp_path / "clip.mp4", 5), "video")
+    monkeypatch.setattr(video.cv2, "VideoCapture", Ending)
+    with pytest.warns(InputWarning, match=r"`clip.mp4` ends after 2 frames; its header says 5: is the file cut off\?"):
+        assert [frame.index for frame in sequence.frames()] == [0, 1]
 
 
 @pytest.mark.long

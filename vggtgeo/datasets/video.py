@@ -3,11 +3,11 @@
 import math
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -44,7 +44,7 @@ class VideoFile:
     def open(cls, path: Path) -> Self:
         """Reads the header and the first frame; InputError where OpenCV can decode no video."""
         with _capture(path) as capture:
-            readable, image = capture.read()
+            readable, image = _decoded(capture.read)
             if not readable or image is None or not image.size:  # a damaged stream may be decoded to nothing
                 raise InputError(f"`{path}` has no frame that can be decoded")
             rate = capture.get(cv2.CAP_PROP_FPS)
@@ -73,10 +73,10 @@ class VideoFile:
         time = -math.inf
         index = 0
         with _capture(self.path) as capture:
-            while (end is None or index < end) and capture.grab():
+            while (end is None or index < end) and _grabbed(capture):
                 time = self._time(capture, index, time)
                 if index >= start and (index - start) % stride == 0:
-                    readable, image = capture.retrieve()
+                    readable, image = _decoded(capture.retrieve)
                     wrong = self._wrong(image if readable else None)
                     if wrong:
                         _warn(f"`{self.name}`: frame {index} {wrong}; it is skipped", LeftOutWarning)
@@ -96,7 +96,7 @@ class VideoFile:
         size = (self.camera.width, self.camera.height)
         return "" if (width, height) == size else f"is {width} x {height} pixels, the first {size[0]} x {size[1]}"
 
-    def _time(self, capture: cv2.VideoCapture, index: int, previous: float) -> float:
+    def _time(self, capture: Any, index: int, previous: float) -> float:
         """The container's time where it increases (frames of phones come at a varying rate), else by the rate."""
         if index == 0:
             return 0.0
@@ -104,6 +104,21 @@ class VideoFile:
             return index / self.given_rate
         time = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         return time if math.isfinite(time) and time > previous else previous + 1.0 / self.rate
+
+
+def _grabbed(capture: Any) -> bool:
+    """Whether there is a further frame; a container that OpenCV itself reads may end in an exception."""
+    try:
+        return bool(capture.grab())
+    except cv2.error:
+        return False
+
+
+def _decoded(decode: Callable[[], tuple[bool, np.ndarray | None]]) -> tuple[bool, np.ndarray | None]:
+    try:
+        return decode()
+    except cv2.error:
+        return False, None
 
 
 def _is_text(path: Path) -> bool:
@@ -116,11 +131,13 @@ def _is_text(path: Path) -> bool:
 
 
 @contextmanager
-def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+def _capture(path: Path) -> Iterator[Any]:
     if _is_text(path):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
     try:
         capture = cv2.VideoCapture(str(path))
+    except cv2.error as error:
+        raise InputError(f"`{path}` cannot be opened as a video: {error.err}") from None
     except UnicodeError:
         raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
     try:
