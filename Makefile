@@ -9,7 +9,7 @@ COUNT   ?= 2000
 TIME    ?= 60
 LOWEST  := .cache/lowest
 
-.PHONY: help venv demo test test-long test-slow test-lowest fuzz fuzz-parsers docs audit sbom lint types format lock clean
+.PHONY: help venv demo test test-long test-slow test-lowest fuzz fuzz-parsers fuzz-decoders docs audit sbom lint types format lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -42,6 +42,9 @@ fuzz: $(READY)  ## try COUNT=2000 random problems, geometries and damaged files 
 fuzz-parsers: $(READY)  ## fuzz each parser for TIME=60 seconds, guided by coverage (Linux); ARGS='"EuRoC camera" problem' for some
 	$(BIN)/python -m pip install --quiet "atheris>=3"
 	$(BIN)/python tests/fuzz_parsers.py --seconds $(TIME) $(ARGS)
+
+fuzz-decoders: $(READY)  ## damage images, videos, bags and networks for TIME=60 seconds each (Linux); ARGS='TIFF bag' for some
+	$(BIN)/python tests/fuzz_decoders.py --seconds $(TIME) $(ARGS)
 
 # Newer packages below ours warn of what older ones of ours do: those warnings are not what is asked here.
 test-lowest: $(READY)  ## test the core with the lowest versions that pyproject.toml allows, in an environment of its own

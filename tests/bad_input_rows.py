@@ -3,6 +3,7 @@
 from bad_row import Row
 from bad_rows_commands import COMMANDS
 from bad_rows_files import FILES
+from bad_rows_strangers import STRANGERS
 
-ROWS: list[Row] = [*COMMANDS, *FILES]
+ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS]
 __all__ = ["ROWS", "Row"]

@@ -139,6 +139,8 @@ RUN = rows(
     "`vggtgeo run`",
     [
         ("no path", nothing, {"argv": line("run")}),
+        ("an empty path", nothing, {"argv": line("run", "")}),
+        ("an empty `-o`", good, {"argv": lambda made: ["run", made, "-o", ""]}),
         ("a path that is not there", nothing, {"argv": line("run", "no/such/clip")}),
         ("`--stride 0`", good, flags("--stride", "0")),
         ("`--stride -2`", good, flags("--stride", "-2")),
@@ -170,9 +172,12 @@ RUN = rows(
         ("`--set` without a value", good, flags("--set", "nonsense")),
         ("`--set` of a setting that is none", good, flags("--set", "tracking.least_inlier=3")),
         ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=-3")),
+        ("`--set` of a number of 5000 digits", good, flags("--set", "tracking.least_inliers=1" + "0" * 5000)),
+        ("`--set` of ten thousand brackets", good, flags("--set", "tracking.least_inliers=" + "[" * 10_000)),
         ("`--rerun` to a text file", good, flags("--rerun", "run.txt")),
         ("`--seed -1`", good, flags("--seed", "-1")),
         ("`--seed` beyond 32 bits", good, flags("--seed", "99999999999")),
+        ("`--depth-scale 0`", good, flags("--depth-scale", "0")),
         ("a reader that is none", good, flags("--kind", "photos")),
         ("the reader of videos on a folder", good, flags("--kind", "video")),
         ("the reader of folders on a file", bad.file("clip.mp4", b"no"), flags("--kind", "tum")),
@@ -189,6 +194,7 @@ SETTINGS = rows(
         ("a number out of range", None, settings("stride = 0")),
         ("an unknown group", None, settings("[trackin]\nleast_inliers = 3")),
         ("ten thousand brackets", None, settings("a = " + "[" * 10_000)),
+        ("a number of 5000 digits", None, settings("stride = 1" + "0" * 5000)),
     ],
 )
 OUTPUT = rows(

@@ -199,6 +199,8 @@ VIDEOS = rows(
         ("no bytes", bad.file("clip.mp4", b"")),
         ("cut off", cut_video),
         ("no regular file", lambda folder: Path("/dev/null")),
+        ("text: FFmpeg draws its letters", bad.file("clip.mp4", "1305031102.175 rgb/1.png\n" * 99)),
+        ("a list of other files for FFmpeg", bad.file("clip.mp4", "ffconcat version 1.0\nfile /etc/passwd\n")),
         ("a sound", bad.file("clip.wav", b"RIFF\x24\0\0\0WAVEfmt " + NUL)),
     ],
     call=read_frames,
@@ -298,6 +300,11 @@ ARGUMENTS = rows(
     "`vggtgeo solve`",
     [
         ("`--max-steps 0`", bad.problem(), {"argv": solve_with("--max-steps", "0")}),
+        (
+            "`--dtype float32` of a number beyond it",
+            bad.problem(T_init=bad.put((1, 4), 1e60)),
+            {"argv": solve_with("--dtype", "float32"), "slack": 20.0},
+        ),
         ("`--dtype float16`", bad.problem(), {"argv": solve_with("--dtype", "float16")}),
         ("`--repeat 0`", bad.problem(), {"argv": solve_with("--repeat", "0")}),
     ],

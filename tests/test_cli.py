@@ -236,3 +236,17 @@ def test_the_version_is_that_of_the_package() -> None:
     result = invoke("--version")
     assert result.exit_code == 0
     assert result.stdout == f"vggtgeo {importlib.metadata.version('vggtgeo')}\n"
+
+
+def test_a_device_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`JAX_PLATFORMS` of a device that JAX does not find was an internal error; oracle: the line."""
+
+    def raising(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
+    monkeypatch.setattr(jax, "devices", raising)
+    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
+    assert result.exit_code == 2
+    assert result.stderr == "error: JAX finds no device for JAX_PLATFORMS=cuda; unset it, or use cpu\n"

@@ -12,12 +12,18 @@ import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS
 from same_leaves import differences
+from test_state_file import rewritten
 from typer.testing import CliRunner
+from vggtgeo.models.classical import NoDepth
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
+from vggtgeo.datasets import without_depth
+from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.results import Result
+from vggtgeo.results.files import write_trajectories
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.known_map import as_map, save_map
@@ -36,8 +42,9 @@ def sequence(seed: int = 0) -> Any:
 
 def run(start: int = 0, end: int | None = None, seed: int = 0, **options: Any) -> Slam:
     """The last state of a run over some frames."""
-    given = {"settings": SETTINGS, **options}
-    *_, slam = vg.run(sequence(seed), ROLES, **given, start=start, end=end)
+    given = {"roles": ROLES, "settings": SETTINGS, **options}
+    frames = sequence(seed) if given["roles"].metric else without_depth(sequence(seed))
+    *_, slam = vg.run(frames, **given, start=start, end=end)
     return settled(slam)
 
 
@@ -68,9 +75,43 @@ def test_a_map_comes_back_to_the_bit(known: Slam) -> None:
     count = len(first_half().keyframes)
     assert [keyframe.frame for keyframe in known.keyframes] == list(range(-count, 0))
     for before, after in zip(first_half().keyframes, known.keyframes, strict=True):
-        assert (
-            list(differences(replace(before.compressed(), frame=after.frame, timestamp=after.timestamp), after)) == []
-        )
+        moved = replace(before.compressed(), frame=after.frame, timestamp=after.timestamp, recorded=before.timestamp)
+        assert list(differences(moved, after)) == []
+
+
+def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: Path) -> None:
+    """The time stamps of two runs in one map are those of their clocks, through two files and in the run's folder,
+    where each line belongs to one keyframe; oracle: the time stamps of the runs. A map of version 1 has none.
+    """
+    first = [keyframe.timestamp for keyframe in first_half().keyframes]
+    slam = run(HALF, known_map=known)
+    second = [keyframe.timestamp for keyframe in slam.keyframes[len(known.keyframes) :]]
+    assert second
+    save_map(tmp_path / "both.map", slam)
+    both = vg.load_map(tmp_path / "both.map")
+    assert [keyframe.recorded for keyframe in both.keyframes] == [*first, *second]
+    write_trajectories(tmp_path, slam)
+    written = np.loadtxt(tmp_path / "map-times.txt")
+    assert written.tolist() == [[k.timestamp, k.recorded] for k in slam.keyframes[: len(known.keyframes)]]
+    listed = np.loadtxt(tmp_path / "keyframes.txt", ndmin=2)[:, 0]
+    assert set(written[:, 0]) < set(listed)
+    assert len(set(listed)) == len(listed)
+    write_trajectories(tmp_path / "alone", first_half())
+    assert not (tmp_path / "alone/map-times.txt").exists()
+
+    def older(header: dict[str, Any]) -> None:
+        place = [name for name, _ in header["classes"]].index("Keyframe")
+        header["version"] = 1
+        header["classes"][place][1].remove("recorded")
+        for keyframe in header["tree"]["v"][4]:
+            assert keyframe["c"] == place
+            keyframe["v"].pop()
+
+    old = vg.load_map(rewritten(tmp_path / "both.map", older))
+    plain = replace(both, keyframes=tuple(replace(keyframe, recorded=None) for keyframe in both.keyframes))
+    assert list(differences(plain, old)) == []
+    with pytest.raises(vg.InputError, match="is no map that vggtgeo wrote, or was changed since"):
+        vg.load_map(rewritten(tmp_path / "both.map", lambda header: header.update(version=1, classes=5)))
 
 
 def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:
@@ -132,6 +173,37 @@ def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
     object.__setattr__(read, "record", None)
     with pytest.raises(vg.InputError, match="this one was read from a folder"):
         read.save_map(tmp_path / "map")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("localise_only", [False, True])
+def test_a_map_without_a_unit_serves_with_and_without_depth(localise_only: bool, tmp_path: Path) -> None:
+    """A map made of images alone places later frames, of images alone or with depth, in its own unit, and the depth
+    that is not used is told; oracle: the truth after Sim(3) alignment, the warning.
+    """
+    roles = replace(ROLES, depth=NoDepth())
+    settings = FIXED if localise_only else SETTINGS
+    *_, slam = vg.run(without_depth(sequence()), roles, SETTINGS, end=HALF)
+    save_map(tmp_path / "free.map", slam)
+    known = vg.load_map(tmp_path / "free.map")
+    assert not known.metric
+    given = {"settings": settings, "dense": "none", "end": HALF + 3, "known_map": known}
+    alone = vg.reconstruct(without_depth(sequence()), roles, **given)
+    with pytest.warns(InputWarning, match="the depth of these frames, in metres, is not used"):
+        with_depth = vg.reconstruct(sequence(), ROLES, **given)
+    for result in (alone, with_depth):
+        assert not result.metric
+        assert len(result.trajectory) >= HALF
+        error = evaluate_trajectory(result.trajectory, sequence().ground_truth()).sim3.statistics.rmse
+        assert error < 0.02, error
+
+
+@pytest.mark.long
+def test_a_run_without_depth_is_metric_in_a_metric_map(known: Slam) -> None:
+    """Images alone are placed in metres; oracle: the truth, without any scale."""
+    slam = run(0, HALF, roles=replace(ROLES, depth=NoDepth()), known_map=known)
+    assert all(record.tracked for record in slam.frames)
+    assert worst_error(slam) < 0.03
 
 
 @pytest.mark.long

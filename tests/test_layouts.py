@@ -102,6 +102,15 @@ def test_folders_that_cannot_be_paired_are_named(tmp_path: Path) -> None:
         with_depth_scale(alone, 5000.0)
 
 
+def test_the_result_of_a_run_is_no_recording(tmp_path: Path) -> None:
+    # Proves that a run's folder, which has a picture and images of keyframes, is not taken for a sequence.
+    folder = tiny.rgbd(tmp_path / "result", "images/{}.png")
+    for name in ("summary.json", "trajectory.txt", "trajectory.png"):
+        (folder / name).write_text("")
+    with pytest.raises(InputError, match="holds the result of a run; give the recording that it was made of"):
+        open_sequence(folder)
+
+
 def test_scannet_brings_images_to_the_depth_camera(tmp_path: Path) -> None:
     # Proves that a pixel of the image shows what the depth of that pixel measures, that lost poses are left out with a
     # word, and that depth is in millimetres. Oracle: the place that each pixel of the large image has as colour.

@@ -224,6 +224,25 @@ def test_the_folder_of_a_killed_run(tmp_path: Path) -> None:
     assert not kept.exists()
 
 
+def test_a_saved_result_leaves_the_state_of_a_killed_run(undisturbed: Run, tmp_path: Path) -> None:
+    """`Result.save` into the folder of a killed run loses neither the result nor the state, and says so; oracle: the
+    files, and the warning. A run that goes on afterwards replaces both.
+    """
+    keep(tmp_path)
+    kept = tmp_path / "unfinished/checkpoint.npz"
+    before = kept.read_bytes()
+    with pytest.warns(InputWarning, match="holds a run that was killed: its state is kept"):
+        undisturbed.result.save(tmp_path)
+    assert kept.read_bytes() == before
+    assert sorted(path.name for path in kept.parent.iterdir()) == ["README.txt", "checkpoint.npz"]
+    with pytest.warns(InputWarning, match="`vggtgeo run --resume` goes on with it"):
+        assert Result.load(tmp_path).summary["frames"] == FRAMES
+    with taken(tmp_path, resume=True) as place:
+        (place.stage / "summary.json").write_text("{}")
+        place.publish()
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
+
+
 @pytest.mark.usefixtures("uncompiled")
 def test_the_command_says_what_it_does(tmp_path: Path) -> None:
     """Without a word the folder of a killed run is refused; `--resume` in an empty one begins and says so; oracle: what

@@ -186,6 +186,8 @@ def box(tmp_path: Path, value: Any = 1.5) -> Path:
 BAD_HEADERS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "another kind": (lambda h: h.update(vggtgeo="state"), "is a state; expected a box"),
     "a later version": (lambda h: h.update(version=3), "is a box of version 3; this program reads version 2"),
+    "a version that is a list": (lambda h: h.update(version=[]), "is no box that vggtgeo wrote"),
+    "facts that are none": (lambda h: h.update(facts=5), "is no box that vggtgeo wrote"),
     "no version": (lambda h: h.pop("version"), "is no box that vggtgeo wrote"),
     "no object": (lambda h: ["text"], "is no box that vggtgeo wrote"),
     "an unknown class": (lambda h: h["classes"].append(["Popen", []]), "holds a `Popen`, which this version"),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
+import struct
 import zipfile
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +18,13 @@ import numpy as np
 from vggtgeo.models.onnx.session import Session
 
 Outputs = dict[str, np.ndarray]
+_NAMES = "names of all arrays"
+"""An array beside the answer: of a file whose list of members is damaged, some may be missing."""
+_UNREADABLE = (
+    *(OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, struct.error, NotImplementedError, MemoryError),
+    *(SyntaxError, TypeError, AttributeError, KeyError, OverflowError, RecursionError),
+)
+"""What numpy and zipfile raise of files that are damaged, whatever bit of them is."""
 
 
 @runtime_checkable
@@ -96,14 +105,16 @@ def key_of(networks: Sequence[str], settings: tuple[object, ...], images: Sequen
 def _read(path: Path) -> Outputs | None:
     try:
         with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (FileNotFoundError, EOFError, ValueError, zipfile.BadZipFile):
+            found = {name: file[name] for name in file.files}
+            named = found.pop(_NAMES).tolist()
+            return found if sorted(found) == named else None
+    except _UNREADABLE:
         return None
 
 
 def _write(path: Path, outputs: Outputs) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays: dict[str, Any] = dict(outputs)  # Else mypy takes a value for the option `allow_pickle`.
+    arrays: dict[str, Any] = {**outputs, _NAMES: np.array(sorted(outputs), str)}
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.npz")
     try:
         with temporary.open("wb") as file:

@@ -14,8 +14,15 @@ from vggtgeo.models.onnx.contracts import METADATA_WEIGHTS, RANDOM_WEIGHTS
 
 def external_files(path: Path) -> list[Path]:
     """The files of external data that the graph in `path` names and that are there, in the order of their names."""
-    names = sorted(set(_values(path, "location")))
-    return [file for name in names if (file := path.parent / name).is_file() and file.parent == path.parent]
+    files = [path.parent / name for name in sorted(set(_values(path, "location")))]
+    return [file for file in files if file.parent == path.parent and _is_there(file)]
+
+
+def _is_there(file: Path) -> bool:
+    try:
+        return file.is_file()
+    except OSError:  # a damaged name may be longer than a file system takes
+        return False
 
 
 def has_random_weights(path: Path) -> bool:

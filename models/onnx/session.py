@@ -189,18 +189,16 @@ def open_session(
             "`provider` is cuda, but onnxruntime could not start CUDA: is there a GPU and its driver?"
         )
     _announce(used)
-    inputs, outputs = (_signatures(nodes) for nodes in (opened.get_inputs(), opened.get_outputs()))
+    inputs, outputs, metadata = _described(path, opened)
     check_signature(path, contract, inputs, outputs)
-    return Session(path, contract, used, inputs, outputs, opened.get_modelmeta().custom_metadata_map, opened)
+    return Session(path, contract, used, inputs, outputs, metadata, opened)
 
 
 def read_signature(path: str | Path) -> tuple[Signatures, Signatures, Mapping[str, str]]:
     """Inputs, outputs and metadata of any ONNX file; raises `NetworkFileError` for anything else."""
     path = Path(path)
     check_looks_like_onnx(path)
-    opened = _open(path, "cpu", None, None)
-    metadata = opened.get_modelmeta().custom_metadata_map
-    return _signatures(opened.get_inputs()), _signatures(opened.get_outputs()), metadata
+    return _described(path, _open(path, "cpu", None, None))
 
 
 def choose_provider(provider: Provider) -> str:
@@ -244,8 +242,19 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
         providers.insert(0, (_PROVIDERS["cuda"], {"arena_extend_strategy": "kSameAsRequested", **limit}))
     try:
         return onnxruntime.InferenceSession(str(path), options, providers)
-    except _RUNTIME_ERRORS as error:
+    except (*_RUNTIME_ERRORS, UnicodeError) as error:  # of a name that is no UTF-8, in the file or of it
         raise NetworkFileError(_why_not_opened(path, str(error))) from None
+
+
+def _described(path: Path, opened: onnxruntime.InferenceSession) -> tuple[Signatures, Signatures, Mapping[str, str]]:
+    """Inputs, outputs and metadata of an open file."""
+    try:
+        inputs, outputs = (_signatures(nodes) for nodes in (opened.get_inputs(), opened.get_outputs()))
+        return inputs, outputs, opened.get_modelmeta().custom_metadata_map
+    except UnicodeDecodeError as error:
+        raise NetworkFileError(
+            f"`{path}` is damaged: its names or metadata are no text ({error}); export or fetch it again"
+        ) from None
 
 
 def _why_not_opened(path: Path, message: str) -> str:

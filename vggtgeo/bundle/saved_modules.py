@@ -18,6 +18,7 @@ import jaxlie
 import numpy as np
 from jax.typing import DTypeLike
 
+from vggtgeo.bundle.precision import check_precision
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.cameras import AbstractCamera
@@ -67,8 +68,10 @@ def restore(
         if content not in arrays:
             raise InputError(f"the array `{content}` is missing")
         values = arrays[content]
-        with np.errstate(over="ignore"):  # what single precision cannot hold becomes infinite, and is refused as such
-            return jnp.asarray(values, dtype if np.issubdtype(values.dtype, np.floating) else None)
+        floating = np.issubdtype(values.dtype, np.floating)
+        if floating:
+            check_precision({content: values}, dtype)
+        return jnp.asarray(values, dtype if floating else None)
     if kind == "value":
         return content
     if kind in ("list", "tuple"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import io
+import os
 import sys
 import warnings
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from vggtgeo.cli.jax_flags import set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.interruption import end_on_signals
+from vggtgeo.io.one_line import one_line
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1
@@ -137,6 +139,10 @@ class _LazyGroup(TyperGroup):
     """Lists stand-ins of its commands, and loads the one that is called; an error of any kind is one line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if any(not word or (word.startswith("-") and word.endswith("=")) for word in args):
+            _leave(
+                InputError("an argument is empty, which would mean this folder; is a variable of the shell not set?")
+            )
         try:
             return super().parse_args(ctx, args)
         except Exception as error:
@@ -199,11 +205,25 @@ def _leave(error: BaseException) -> NoReturn:
         message, code = f"error: there is not enough memory ({error}); give fewer or smaller images", EXIT_INPUT
     elif _is_usage_error(error):
         message, code = f"error: {_usage_message(error)}", EXIT_INPUT
+    elif _lacks_platform():
+        message = f"error: JAX finds no device for JAX_PLATFORMS={os.environ['JAX_PLATFORMS']}; unset it, or use cpu"
+        code = EXIT_INPUT
     else:
         message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`)"
         code = EXIT_INTERNAL
-    typer.echo(" ".join(message.split()), err=True)
+    typer.echo(one_line(message), err=True)
     raise typer.Exit(code) from None
+
+
+def _lacks_platform() -> bool:
+    """Whether the environment asks JAX for a device that is not there: what it raises then is of any kind."""
+    jax = sys.modules.get("jax")
+    if jax is None or "JAX_PLATFORMS" not in os.environ:
+        return False
+    try:
+        return not jax.devices()
+    except Exception:  # noqa: BLE001 - of any kind
+        return True
 
 
 def _usage_message(error: Any) -> str:
@@ -272,7 +292,7 @@ def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
         line: str | None = None,
     ) -> None:
         if issubclass(category, InputWarning):
-            print(f"warning: {message}", file=file or sys.stderr)
+            print(f"warning: {one_line(str(message))}", file=file or sys.stderr)
         else:
             show_others(message, category, filename, lineno, file, line)
 

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from vggtgeo.datasets import Frame
+from vggtgeo.io.one_line import one_line
 from vggtgeo.results import Result
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
@@ -67,7 +68,7 @@ class ProgressBar(Callback):
         self._print(message)
 
     def _print(self, line: str) -> None:
-        self._progress.console.print(line, markup=False, highlight=False)
+        self._progress.console.print(one_line(line), markup=False, highlight=False)
 
 
 def _state(slam: Slam) -> str:

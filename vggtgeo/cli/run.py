@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from vggtgeo.cli import run_options as options
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
+from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def run(
     localise_only: options.LocaliseOption = False,
     save_map: options.SaveMapOption = None,
     resume: options.ResumeOption = None,
-    checkpoint_every: options.CheckpointOption = 10.0,
+    checkpoint_every: options.CheckpointOption = EVERY,
     seed: options.SeedOption = 0,
     quiet: QuietOption = False,
     as_json: JsonOption = False,

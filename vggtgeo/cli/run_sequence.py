@@ -16,9 +16,10 @@ from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.progress import ProgressBar, print_result
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence
+from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.network_errors import as_input_errors
-from vggtgeo.results.checkpoints import EVERY, Checkpoints
+from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.run_folder import RESERVE, RunFolder, taken

@@ -83,7 +83,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(
             f"`--settings` is `{path}`, which cannot be read ({error.strerror}); give a TOML file"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
         raise InputError(f"`{path}` is no TOML file: {error}; a line is `key = value`, text in quotes") from None
 
 

@@ -84,7 +84,9 @@ class RosBag:
         if not self.poses:
             return None
         with _reader(self.path) as reader:
-            rows = np.array([(time, *_pose(message)) for time, message in _messages(reader, self.poses)])
+            rows = np.array([(time, *_pose(message)) for time, message in _messages(reader, self.poses)]).reshape(-1, 8)
+        if not len(rows):
+            raise InputError(f"`{self.path}` has no pose in its topic `{self.poses}`")
         rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
         return trajectory_of(rows[:, 0], poses_of(rows[:, 1:4], rows[:, 4:]), self.path)
 

@@ -11,6 +11,8 @@ import struct
 
 import numpy as np
 
+from vggtgeo.datasets import image_sizes
+
 MOST_PIXELS = 100_000_000
 """Pixels of an image that are decoded: 0.3 GB."""
 _BLOCK = 8
@@ -67,7 +69,7 @@ def orientation(content: bytes) -> int:
 
 
 def declared_size(content: bytes) -> tuple[int, int]:
-    """Width and height that a PNG or a JPEG declares; (0, 0) for others."""
+    """Width and height that the header of an image declares; (0, 0) for what is none that is known."""
     if content.startswith(b"\x89PNG") and len(content) >= 24:
         width, height = struct.unpack(">II", content[16:24])
         return width, height
@@ -75,7 +77,7 @@ def declared_size(content: bytes) -> tuple[int, int]:
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(part) >= 5:
             height, width = struct.unpack(">HH", part[1:5])
             return width, height
-    return 0, 0
+    return image_sizes.declared_size(content)
 
 
 def _chunks_fit(content: bytes) -> bool:

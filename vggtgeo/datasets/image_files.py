@@ -85,6 +85,8 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
 def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
     """The file's bytes, and the image in them."""
     try:
+        if path.exists() and not path.is_file():  # a list may name a pipe, which has no end
+            raise InputError(f"`{path}` is no regular file")
         content = path.read_bytes()
     except (OSError, ValueError) as error:  # a name from a list may be none that a file system takes
         raise InputError(f"`{path}` cannot be read: {getattr(error, 'strerror', None) or error}") from None

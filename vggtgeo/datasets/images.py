@@ -51,12 +51,17 @@ class ImageFolder(FolderSequence):
 
 def natural_key(name: str) -> list[int | str]:
     """Sorts digits in `name` as numbers: `a2` before `a10`."""
-    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"([0-9]+)", name)]
+    # The groups of the pattern are every second part; `isdigit` also holds of signs that are no numbers, as in `m²`.
+    return [int(part) if row % 2 else part.lower() for row, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images in `folder`, in natural order."""
-    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    """The images in `folder`, in natural order.
+
+    Hidden files are none of them: macOS puts one beside each file that it copies to another disk (`._1.png`).
+    """
+    names = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != ".")
+    found = (path for path in names if path.is_file())
     return sorted(found, key=lambda path: (natural_key(path.name), path.name))
 
 

@@ -18,6 +18,10 @@ FARTHEST_CENTRE = 10.0
 LEAST_VALID = 0.5
 """Share of the undistorted image that must come from the image: of the lenses of docs and benchmarks the worst keeps
 more than 0.8."""
+MOST_ASPECT = 4.0
+"""Ratio of the focal lengths, either way: pixels of cameras are square; of interlaced and anamorphic ones, 1 to 2."""
+MOST_BYTES = 100_000
+"""Of a file with a few numbers and comments."""
 CALIBRATION = "calibration.txt"
 MATRIX = "camera-intrinsics.txt"
 JSON = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
@@ -81,6 +85,10 @@ def check_plausible(where: str, camera: Camera) -> None:
         angle = widest if widest > WIDEST else narrowest
         raise InputError(
             f"{where}: fx {fx:g} and fy {fy:g} make a field of view of {angle:.3g} deg {size}; they must be in pixels"
+        )
+    if max(fx, fy) > MOST_ASPECT * min(fx, fy):
+        raise InputError(
+            f"{where}: fx {fx:g} and fy {fy:g} differ by more than a factor of {MOST_ASPECT:g}; give pixels"
         )
     if abs(cx) > FARTHEST_CENTRE * width or abs(cy) > FARTHEST_CENTRE * height:
         raise InputError(f"{where}: the principal point ({cx:g}, {cy:g}) is far outside {size}; give pixels")
@@ -180,12 +188,23 @@ def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
 
 
 def _without_comments(file: Path) -> str:
+    if file.stat().st_size > MOST_BYTES:
+        raise InputError(f"`{file}` has {file.stat().st_size} bytes; expected a few numbers")
     lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     return " ".join(line.split("#", 1)[0] for line in lines)
 
 
 def _warn_of_other_size(file: Path, camera: Camera) -> None:
     fx, fy, cx, cy = camera.intrinsics
+    near = lambda x, y: abs(cx - x) < 0.05 * camera.width and abs(cy - y) < 0.05 * camera.height
+    middle = 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)
+    if near(*middle[::-1]) and not near(*middle):
+        warnings.warn(
+            f"`{file}`: the principal point ({cx:g}, {cy:g}) is the middle of images of {camera.height} x "
+            f"{camera.width}; these are {camera.width} x {camera.height}: are cx and cy in each other's place?",
+            InputWarning,
+            stacklevel=3,
+        )
     centred = 0 <= cx < camera.width and 0 <= cy < camera.height
     field_of_view = math.degrees(2 * math.atan(0.5 * max(camera.width / fx, camera.height / fy)))
     if not centred or field_of_view < 10:

@@ -24,6 +24,8 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 MAX_DEPTH_DELAY = 0.02
 """Seconds between an image and its depth."""
 
+LATEST = 1e11
+"""Seconds of a time stamp, 3,000 years: nanoseconds since 1970 are 1e18."""
 _TRUTH = "groundtruth.txt"
 _Entry = tuple[float, Path]
 
@@ -79,13 +81,15 @@ def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
 
 
 def _parse_entry(file: Path, number: int, text: str) -> _Entry:
-    time, _, name = text.partition(" ")
+    time, _, name = text.replace("\t", " ").replace(",", " ", 1).partition(" ")
     try:
         seconds = float(time)
     except ValueError:
         seconds = math.nan
     if not name.strip() or not math.isfinite(seconds):
         raise InputError(f"`{file}`, line {number}: found {text!r}; expected `timestamp file`")
+    if abs(seconds) > LATEST:
+        raise InputError(f"`{file}`, line {number}: the time {time[:30]} is beyond all clocks; it must be in seconds")
     return seconds, file.parent / name.strip()
 
 

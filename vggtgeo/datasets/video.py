@@ -1,14 +1,16 @@
 """A video file, decoded frame by frame by OpenCV."""
 
 import math
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import cv2
+import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
@@ -17,6 +19,9 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 _FALLBACK_RATE = 30.0
+_LOOKED_AT = 4096
+_NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
+"""Control characters other than those of text and terminals; no container of videos is without them."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +44,12 @@ class VideoFile:
     def open(cls, path: Path) -> Self:
         """Reads the header and the first frame; InputError where OpenCV can decode no video."""
         with _capture(path) as capture:
-            readable, image = capture.read()
-            if not readable:
+            readable, image = _decoded(capture.read)
+            if not readable or image is None or not image.size:  # a damaged stream may be decoded to nothing
                 raise InputError(f"`{path}` has no frame that can be decoded")
             rate = capture.get(cv2.CAP_PROP_FPS)
-            count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            count = int(stated) if math.isfinite(stated) else 1
         height, width = image.shape[:2]
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height)
         known_rate = math.isfinite(rate) and 0 < rate < 1000
@@ -67,26 +73,30 @@ class VideoFile:
         time = -math.inf
         index = 0
         with _capture(self.path) as capture:
-            while (end is None or index < end) and capture.grab():
+            while (end is None or index < end) and _grabbed(capture):
                 time = self._time(capture, index, time)
                 if index >= start and (index - start) % stride == 0:
-                    readable, image = capture.retrieve()
-                    if readable:
-                        yield Frame(
-                            index,
-                            time,
-                            cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image),
-                            None,
-                            f"{self.name}, frame {index}",
-                        )
+                    readable, image = _decoded(capture.retrieve)
+                    wrong = self._wrong(image if readable else None)
+                    if wrong:
+                        _warn(f"`{self.name}`: frame {index} {wrong}; it is skipped", LeftOutWarning)
                     else:
-                        _warn(f"`{self.name}`: frame {index} cannot be decoded; it is skipped", LeftOutWarning)
+                        colour = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+                        yield Frame(index, time, colour, None, f"{self.name}, frame {index}")
                 index += 1
         wanted = self.count if end is None else min(end, self.count)
         if index < wanted:
             _warn(f"`{self.name}` ends after {index} frames; its header says {self.count}: is the file cut off?")
 
-    def _time(self, capture: cv2.VideoCapture, index: int, previous: float) -> float:
+    def _wrong(self, image: np.ndarray | None) -> str:
+        """What is wrong with a decoded frame, as the end of a sentence; empty for nothing."""
+        if image is None or not image.size:
+            return "cannot be decoded"
+        height, width = image.shape[:2]
+        size = (self.camera.width, self.camera.height)
+        return "" if (width, height) == size else f"is {width} x {height} pixels, the first {size[0]} x {size[1]}"
+
+    def _time(self, capture: Any, index: int, previous: float) -> float:
         """The container's time where it increases (frames of phones come at a varying rate), else by the rate."""
         if index == 0:
             return 0.0
@@ -96,10 +106,38 @@ class VideoFile:
         return time if math.isfinite(time) and time > previous else previous + 1.0 / self.rate
 
 
+def _grabbed(capture: Any) -> bool:
+    """Whether there is a further frame; a container that OpenCV itself reads may end in an exception."""
+    try:
+        return bool(capture.grab())
+    except cv2.error:
+        return False
+
+
+def _decoded(decode: Callable[[], tuple[bool, np.ndarray | None]]) -> tuple[bool, np.ndarray | None]:
+    try:
+        return decode()
+    except cv2.error:
+        return False, None
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file is text: FFmpeg draws the letters of some as pictures, and others are lists of files and addresses
+    that it would open (`ffconcat`, `m3u8`, `sdp`).
+    """
+    with path.open("rb") as file:
+        start = file.read(_LOOKED_AT)
+    return bool(start) and not _NO_TEXT.search(start)
+
+
 @contextmanager
-def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+def _capture(path: Path) -> Iterator[Any]:
+    if _is_text(path):
+        raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
     try:
         capture = cv2.VideoCapture(str(path))
+    except cv2.error as error:
+        raise InputError(f"`{path}` cannot be opened as a video: {error.err}") from None
     except UnicodeError:
         raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
     try:

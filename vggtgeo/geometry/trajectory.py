@@ -17,6 +17,8 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
+_FARTHEST, _LATEST = 1e15, 1e20
+"""Lengths and times in a file, far beyond any: squares of them are numbers, and nanoseconds since 1970 are less."""
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -152,6 +154,10 @@ def _parse_row(where: str, text: str) -> list[float]:
         raise InputError(f"{where}: found {text!r}; expected 8 numbers: `timestamp tx ty tz qx qy qz qw`") from None
     if not np.isfinite(row).all():
         raise InputError(f"{where}: found a NaN or an infinity in {text!r}; leave such poses out of the file")
+    if max(map(abs, row[1:4])) > _FARTHEST or abs(row[0]) > _LATEST:
+        raise InputError(
+            f"{where}: found a number that is no time or place in {text!r}; leave such poses out of the file"
+        )
     if np.linalg.norm(row[4:]) < 1e-6:
         raise InputError(f"{where}: the quaternion has length zero; expected a unit quaternion `qx qy qz qw`")
     return row

@@ -87,7 +87,7 @@ class Layout:
             return {}
 
         read_archive(Path(path), f"a {self.kind}", look)
-        return dict(found[0]["facts"])
+        return found[0]["facts"]
 
     def _arrays(self, path: Path) -> tuple[Header, np.ndarray]:
         found: list[Header] = []
@@ -108,19 +108,25 @@ class Layout:
         try:
             header = json.loads(text)
             kind, version = header["vggtgeo"], header["version"]
-            header["facts"], header["tree"], header["classes"], header["arrays"]
+            header["tree"], header["classes"], header["arrays"]
+            header["facts"] = dict(header["facts"])
+            known = version == self.version or version in self.upgrades
         except _NO_HEADER as error:
             raise InputError(f"`{archive.path}` is no {self.kind} that vggtgeo wrote: {error}") from None
         if kind != self.kind:
             raise InputError(f"`{archive.path}` is a {kind}; expected a {self.kind}")
-        while version != self.version:
-            if version not in self.upgrades:
-                raise InputError(
-                    f"`{archive.path}` is a {self.kind} of version {version}; this program reads version "
-                    f"{self.version}: use the program that wrote it"
-                )
-            header = self.upgrades[version](header)
-            version = header["version"]
+        if not known:
+            raise InputError(
+                f"`{archive.path}` is a {self.kind} of version {version}; this program reads version "
+                f"{self.version}: use the program that wrote it"
+            )
+        try:
+            for number in range(version, self.version):
+                header = {**self.upgrades[number](header), "version": number + 1}
+        except _NO_HEADER as error:
+            raise InputError(
+                f"`{archive.path}` is no {self.kind} that vggtgeo wrote, or was changed since: {error}"
+            ) from None
         return header
 
     def _check_members(self, archive: Archive) -> None:

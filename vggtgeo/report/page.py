@@ -211,7 +211,10 @@ def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: fl
         depth = figures.picture(figures.depth_colours(depth_map.depth, low, high), _SAMPLE_WIDTH)
         shades = np.rint(255 * depth_map.confidence).astype(np.uint8)
         confidence = figures.picture(figures.confidence_colours(shades), _SAMPLE_WIDTH)
-    return Sample(f"frame {keyframe.frame}, {keyframe.timestamp:.2f} s", image, depth, confidence)
+    title = f"frame {keyframe.frame}, {keyframe.timestamp:.2f} s"
+    if keyframe.recorded is not None:
+        title = f"of the map, recorded at {keyframe.recorded:.2f} s"
+    return Sample(title, image, depth, confidence)
 
 
 def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | None:

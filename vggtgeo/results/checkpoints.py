@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.io.checkpoint_pace import EVERY, SHARE
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.record_file import Layout
 from vggtgeo.io.records import by_name
@@ -30,14 +31,9 @@ from vggtgeo.results.summary import versions
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.state_file import STATE_CLASSES, checked_state
+from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
 from vggtgeo.slam.trust.evidence import EvidenceSoFar, FrameEvidence
 from vggtgeo.slam.window_recorder import WindowRecord
-
-EVERY = 10.0
-"""Seconds between two states that are kept."""
-SHARE = 0.025
-"""Most of a run's time that keeping its state may take."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +110,8 @@ class RunSoFar:
                 setattr(refusals[role], entry.name, value)
 
 
-CHECKPOINT = Layout(
-    "checkpoint", 1, by_name((*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, WindowRecord))
-)
+KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, WindowRecord)
+CHECKPOINT = Layout("checkpoint", VERSION, by_name(KEPT_CLASSES), UPGRADES)
 
 
 def identity(

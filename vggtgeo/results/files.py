@@ -37,7 +37,8 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
     """`trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world.
 
     Of a map in pieces they hold the one of most frames, `trajectory-2.txt` and `keyframes-2.txt` the next, and so on.
-    Those of pieces that have been joined since they were last written are taken away.
+    Those of pieces that have been joined since they were last written are taken away. Of a run in a known map
+    `map-times.txt` says when the keyframes of the map were recorded.
     """
     for name in ("trajectory", "keyframes", "uncertainty"):
         for old in folder.glob(f"{name}-[0-9]*.txt"):
@@ -48,6 +49,16 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
         uncertainty = frame_uncertainty(slam, piece)
         if uncertainty is not None:
             write_uncertainty(folder / piece_file("uncertainty", piece), uncertainty)
+    _write_map_times(folder / "map-times.txt", slam)
+
+
+def _write_map_times(path: Path, slam: Slam) -> None:
+    """When the keyframes of a known map were recorded, where there are any."""
+    known = [keyframe for keyframe in slam.keyframes if keyframe.recorded is not None]
+    if known:
+        head = "# time in keyframes.txt, and in the run that recorded the keyframe, by the clock of that run; s\n"
+        rows = "".join(f"{keyframe.timestamp:.9f} {keyframe.recorded:.9f}\n" for keyframe in known)
+        write_text(path, head + rows)
 
 
 def write_uncertainty(path: Path, found: PoseUncertainty) -> None:

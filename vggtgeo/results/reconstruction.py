@@ -54,6 +54,10 @@ from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.window import warm_up
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
+FREE_MAP = (
+    "`known_map` was made without depth, so that its lengths have no unit: the depth of these frames, in metres, is "
+    "not used; begin a new map to have it in metres"
+)
 LEAST_SIDE = 32
 """Pixels: windows of features and of the image pyramid do not fit into less."""
 
@@ -120,7 +124,7 @@ def reconstruct(
         perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric)
         selection = (start, end, stride)
-        first = _first_state(known_map, source.camera, settings)
+        first = _first_state(known_map, source, settings)
         wanted = identity(
             *(settings, perception.roles, source.known(selection)),
             {name: session.digest for name, session in perception.networks.items()},
@@ -271,10 +275,12 @@ def _truth(sequence: Sequence) -> Trajectory | None:
         return None
 
 
-def _first_state(known: Slam | None, camera: Camera, settings: SlamSettings) -> Slam | None:
+def _first_state(known: Slam | None, source: _Source, settings: SlamSettings) -> Slam | None:
     """Before the first frame, in a map that is known; InputError for one of another camera, or where one is needed."""
     if known is not None:
-        return entered(known, camera)
+        if source.has_depth and not known.metric:
+            warnings.warn(FREE_MAP, InputWarning, stacklevel=4)
+        return entered(known, source.camera)
     if settings.keyframes.localise_only:
         raise InputError("`keyframes.localise_only` needs a map to place frames in: give `known_map` (`--map FILE`)")
     return None

@@ -29,7 +29,7 @@ from vggtgeo.results.files import (
     write_trajectories,
     write_uncertainty,
 )
-from vggtgeo.results.run_folder import RunFolder, check_finished, taken
+from vggtgeo.results.run_folder import RunFolder, check_finished, taken_beside
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise, with_writing
 from vggtgeo.slam.known_map import save_map
@@ -166,7 +166,8 @@ class Result:
         """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (where there is dense
         depth), `images/`, `scene.npz`, `trajectory.png`, `report.html`, `summary.json` and `settings.toml`;
         `vggtgeo.read` reads it. They are written beside and take their places
-        together; what an earlier run left there is replaced as a whole.
+        together; what an earlier run left there is replaced as a whole. The state of a run into that folder that was
+        killed stays, with a warning.
 
         A result that was read from a folder has neither images nor windows, so it is saved without page and depth.
 
@@ -183,7 +184,7 @@ class Result:
                 in use by a run, or holds a sequence of images.
 
         """
-        with taken(folder) as place:
+        with taken_beside(folder) as place:
             return self.save_into(place, depth=depth, settings=settings)
 
     def save_into(

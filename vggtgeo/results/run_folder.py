@@ -16,14 +16,15 @@ import glob
 import os
 import shutil
 import tomllib
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import LockedError, locked
@@ -43,6 +44,7 @@ NAMES = (
     "keyframes-[0-9]*.txt",
     "uncertainty.txt",
     "uncertainty-[0-9]*.txt",
+    "map-times.txt",
     "map.ply",
     "mesh.ply",
     "scene.npz",
@@ -66,9 +68,13 @@ _MARKS = ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "camera-
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A folder that is taken: `stage` is where to write, `publish` makes it the folder's content."""
+    """A folder that is taken: `stage` is where to write, `publish` makes it the folder's content.
+
+    keeps: whether the state in `stage` is of another run, and stays when this one is published.
+    """
 
     folder: Path
+    keeps: bool = False
 
     @property
     def stage(self) -> Path:
@@ -88,8 +94,9 @@ class RunFolder:
         """Replaces what an earlier run left by what is in `stage`; a signal waits until it is done."""
         with interruption():
             self.release_reserve()
-            (self.stage / _NOTE).unlink(missing_ok=True)
-            written = (path for path in self.stage.iterdir() if path.name != CHECKPOINT)
+            if not self.keeps:
+                (self.stage / _NOTE).unlink(missing_ok=True)
+            written = (path for path in self.stage.iterdir() if path.name not in (CHECKPOINT, _NOTE))
             new = sorted(written, key=lambda path: path.name == SUMMARY)
             strange = [path.name for path in new if not _is_known(path.name)]
             if strange:
@@ -101,7 +108,26 @@ class RunFolder:
                     _remove(path)
             for path in new:
                 os.replace(path, self.folder / path.name)
-            self.checkpoint.unlink(missing_ok=True)
+            if not self.keeps:
+                self.checkpoint.unlink(missing_ok=True)
+
+
+@contextmanager
+def taken_beside(folder: str | os.PathLike[str]) -> Iterator[RunFolder]:
+    """As `taken`, for a result that was not made in this folder: the state of a killed run that is there stays, and a
+    warning says so. A result may be of hours that nobody can give back, and so may the state be.
+    """
+    checkpoint = RunFolder(Path(folder)).checkpoint
+    with taken(folder, resume=True) as place:
+        keeps = checkpoint.is_file()
+        if keeps:
+            warnings.warn(
+                f"`{folder}` holds a run that was killed: its state is kept, beside the files of this result; "
+                "`vggtgeo run --resume` goes on with it, and replaces them",
+                InputWarning,
+                stacklevel=4,
+            )
+        yield replace(place, keeps=keeps)
 
 
 @contextmanager
@@ -240,7 +266,7 @@ def _old_recording(folder: Path) -> list[str]:
     """The recording that an earlier run into `folder` made there, by its settings."""
     try:
         target = tomllib.loads((folder / "settings.toml").read_text(encoding="utf-8")).get("rerun")
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return []
     path = Path(str(target))
     inside = path.suffix == ".rrd" and path.parent.resolve() == folder.resolve()

@@ -37,6 +37,7 @@ class Keyframe:
     """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; its images;
     what the roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each
     sample); and place, what it looks like as a whole, float32 [n] of unit length, None = not known.
+    recorded: of a keyframe of a known map its time stamp in the run that made it, s, by the clock of that run.
 
     A map lives as long as the run, so what it holds is small: see `KeyframeImages`.
     """
@@ -53,6 +54,7 @@ class Keyframe:
     samples: Slots
     sample_segment: np.ndarray
     place: np.ndarray | None = None
+    recorded: float | None = None
 
     @property
     def image(self) -> np.ndarray:

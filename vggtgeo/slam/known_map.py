@@ -2,7 +2,8 @@
 
 A map is a state that no frame has been tracked in: keyframes with all that was measured in them, their matches, what
 ties them, the camera. Its keyframes are of no frame of the run that uses it, so their frames and times (s) count up to
--1: before the first frame of any run, in their order.
+-1: before the first frame of any run, in their order. Clocks of two runs may show the same time (a video begins at 0),
+so that times alone would not tell their keyframes apart: the one at which a keyframe was recorded is kept beside.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from vggtgeo.io.records import by_name
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.state_file import STATE_CLASSES, checked_state
+from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
 
-MAP = Layout("map", 1, by_name(STATE_CLASSES))
+MAP = Layout("map", VERSION, by_name(STATE_CLASSES), UPGRADES)
 SAME_CAMERA = 0.02
 """Relative difference of focal lengths and principal point up to which a calibration is that of a map's camera: two
 calibrations of one camera differ by up to 1.6 % (redkitchen: 525 px as given, 534 as adjusted)."""
@@ -33,7 +34,12 @@ def as_map(slam: Slam) -> Slam:
     slam = settled(slam)
     count = len(slam.keyframes)
     keyframes = tuple(
-        replace(keyframe.compressed(), frame=keyframe.number - count, timestamp=float(keyframe.number - count))
+        replace(
+            keyframe.compressed(),
+            frame=keyframe.number - count,
+            timestamp=float(keyframe.number - count),
+            recorded=keyframe.timestamp if keyframe.recorded is None else keyframe.recorded,
+        )
         for keyframe in slam.keyframes
     )
     first = Slam(slam.intrinsics, slam.given_intrinsics, slam.intrinsics_sigma, slam.metric)

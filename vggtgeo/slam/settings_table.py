@@ -67,6 +67,8 @@ def parsed(assignment: str) -> Tables:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
+    except (ValueError, RecursionError) as error:  # more digits or brackets than Python reads
+        raise InputError(f"`{name}` cannot be read: {error}") from None
     return {group: {field: value}}
 
 

@@ -25,8 +25,8 @@ from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
 from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.record_file import Layout
-from vggtgeo.io.records import by_name
+from vggtgeo.io.record_file import Header, Layout
+from vggtgeo.io.records import by_name, with_field
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.mast3r import Mast3rView
@@ -53,8 +53,18 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 1
-STATE = Layout("state", VERSION, by_name(STATE_CLASSES))
+VERSION = 2
+
+
+def _with_recorded_times(header: Header) -> Header:
+    """Version 1 did not know when a map's keyframes were recorded."""
+    tree, classes = with_field(header["tree"], header["classes"], "Keyframe", "recorded")
+    return {**header, "tree": tree, "classes": classes}
+
+
+UPGRADES = {1: _with_recorded_times}
+"""Of states, and of maps and checkpoints, which hold them."""
+STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)
 
 
 def save_state(path: str | os.PathLike[str], slam: Slam) -> None:

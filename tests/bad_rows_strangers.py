@@ -1,0 +1,178 @@
+"""Rows of the table of bad inputs: what is in folders that others made, from rare kinds of images to pipes in lists."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bad_files as bad
+import cv2
+import numpy as np
+import picture_bytes as bytes_of
+import tiny_sequences as tiny
+from bad_row import Row, read_frames, rows
+from bad_rows_files import OPENED
+
+SIZE = (bad.WIDTH, bad.HEIGHT)
+PICTURE = bad.picture(1)
+
+
+def image(content: bytes, suffix: str = ".png") -> Callable[[Path], Path]:
+    """Good images, of which the second is this file."""
+    return bad.with_image(lambda: content, suffix)
+
+
+def beside(change: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """Good images, and something that `change` does in their folder."""
+
+    def make(folder: Path) -> Path:
+        change(bad.frames(folder / "frames"))
+        return folder / "frames"
+
+    return make
+
+
+def renamed(name: str | bytes, content: bytes | None = None) -> Callable[[Path], Path]:
+    """Good images, of which one has another name; and other content."""
+
+    def change(folder: Path) -> None:
+        old, new = os.fsencode(folder / "1.png"), os.fsencode(folder) + b"/" + os.fsencode(name)
+        os.rename(old, new)
+        if content is not None:
+            Path(os.fsdecode(new)).write_bytes(content)
+
+    return beside(change)
+
+
+def other_kinds(folder: Path) -> None:
+    """The second image is grey, the third has 16 bits."""
+    cv2.imwrite(str(folder / "1.png"), PICTURE[..., 0])
+    cv2.imwrite(str(folder / "2.png"), PICTURE.astype(np.uint16) << 8)
+
+
+def depths(suffix: str, array: np.ndarray) -> Callable[[Path], Path]:
+    """A TUM folder with depth of another kind of file."""
+
+    def change(folder: Path) -> None:
+        for file in sorted((folder / "depth").iterdir()):
+            file.unlink()
+            if suffix == ".npy":
+                np.save(file.with_suffix(suffix), array)
+            else:
+                cv2.imwrite(str(file.with_suffix(suffix)), array)
+        listed = folder / "depth.txt"
+        listed.write_text(listed.read_text().replace(".png", suffix))
+
+    return bad.rgbd(change)
+
+
+def without_half(folder: Path) -> None:
+    """Half of the depth images are empty."""
+    for file in sorted((folder / "depth").iterdir())[:2]:
+        cv2.imwrite(str(file), np.zeros((tiny.HEIGHT, tiny.WIDTH), np.uint16))
+
+
+def listed(change: Callable[[str], str], file: str = "rgb.txt") -> Callable[[Path], Path]:
+    """A TUM folder with a changed list."""
+    return bad.rgbd(lambda folder: (folder / file).write_text(change((folder / file).read_text())))
+
+
+def pipe_in_list(folder: Path) -> None:
+    """The list names a pipe that nobody writes into."""
+    os.mkfifo(folder / "pipe.png")
+    (folder / "rgb.txt").write_text("9.0 pipe.png\n" + (folder / "rgb.txt").read_text())
+
+
+def pipe_for(name: str) -> Callable[[Path], None]:
+    """A pipe in the place of a file."""
+
+    def change(folder: Path) -> None:
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+
+    return change
+
+
+def calibrated(content: str | bytes) -> Callable[[Path], Path]:
+    """Good images with this `calibration.txt`."""
+    return lambda folder: bad.frames(folder / "frames", calibration=content)
+
+
+GREATEST = np.full((tiny.HEIGHT, tiny.WIDTH), 1.5, np.float32)
+NEGATIVE = np.full((tiny.HEIGHT, tiny.WIDTH), -5, np.int16)
+IMAGES = rows(
+    "Images",
+    [
+        ("interlaced PNG", image(bytes_of.interlaced_png(PICTURE))),
+        ("palette PNG with transparency", image(bytes_of.palette_png(SIZE))),
+        ("PNG of one bit a pixel", image(bytes_of.two_colours_png(SIZE))),
+        ("16-bit PNG with transparency", image(bytes_of.deep_png(PICTURE))),
+        ("CMYK JPEG", image(bytes_of.cmyk_jpeg(SIZE), ".jpg")),
+        ("TIFF of several pages: the first", image(cv2.imencodemulti(".tiff", [PICTURE] * 2)[1].tobytes(), ".tiff")),
+        ("a JPEG that is called .png", image(bad.encoded(".jpg"))),
+        ("colour, grey and 16 bits mixed", beside(other_kinds)),
+        ("what macOS puts beside an image (`._1.png`)", beside(lambda folder: (folder / "._1.png").write_bytes(b"\0"))),
+        ("a pipe that is called 3.png", beside(lambda folder: os.mkfifo(folder / "3.png"))),
+        ("a folder that is called 3.png", beside(lambda folder: (folder / "3.png").mkdir())),
+        ("a link to /dev/zero", beside(lambda folder: (folder / "3.png").symlink_to("/dev/zero"))),
+        ("a name with a superscript (`1²2.png`)", renamed("1²2.png")),
+        ("a name that is no UTF-8", renamed(b"1\xff\xfe.png")),
+        ("a damaged one whose name is no UTF-8", renamed(b"1\xff\xfe.png", b"no")),
+        ("a damaged one whose name has a line break", renamed("1\n.png", b"no")),
+        ("a TIFF's header of 30000 x 30000 pixels", image(bytes_of.tiff_header(30000, 30000), ".tiff")),
+        ("a WebP's header of 16000 x 16000 pixels", image(bytes_of.webp_header(16000, 16000), ".webp")),
+        ("a BMP's header of 30000 x 30000 pixels", image(bytes_of.bmp_header(30000, 30000), ".bmp")),
+        ("a PPM's header of 30000 x 30000 pixels", image(b"P6 30000 30000 255\n" + b"\0" * 99, ".ppm")),
+        ("half a TIFF", image(bad.encoded(".tiff")[:3000], ".tiff")),
+        ("half a WebP", image(bad.encoded(".webp")[:300], ".webp")),
+        ("half a BMP", image(bad.encoded(".bmp")[:3000], ".bmp")),
+        ("half a PNG, filled up with zeros", image(bad.encoded(".png")[:3000] + b"\0" * 5000)),
+    ],
+    call=read_frames,
+)
+DEPTH = rows(
+    "Depth images",
+    [
+        ("floating-point TIFF", depths(".tiff", GREATEST)),
+        ("TIFF of negative numbers", depths(".tiff", NEGATIVE)),
+        ("`.npy`", depths(".npy", GREATEST)),
+        ("half of them all zero", bad.rgbd(without_half)),
+    ],
+    call=read_frames,
+)
+LISTS = rows(
+    "Lists and poses",
+    [
+        ("tabs", listed(lambda text: text.replace(" rgb/", "\trgb/"))),
+        ("commas", listed(lambda text: text.replace(" rgb/", ", rgb/"))),
+        ("a pipe that nobody writes into", bad.rgbd(pipe_in_list)),
+        ("/dev/zero", listed(lambda text: "9.0 /dev/zero\n" + text)),
+        ("a name with a NUL", listed(lambda text: "9.0 a\0b.png\n" + text)),
+        ("names with backslashes", listed(lambda text: text.replace("rgb/", "rgb\\"))),
+        ("a time of 1e300", listed(lambda text: text + "1e300 rgb/10.000000.png\n")),
+        ("times in nanoseconds", listed(lambda text: "1403636579763555584 rgb/10.000000.png\n")),
+        ("truth of 1e300 metres", listed(lambda text: "1 1e300 0 0 0 0 0 1\n", "groundtruth.txt"), OPENED),
+        ("truth that is a pipe", bad.rgbd(pipe_for("groundtruth.txt")), OPENED),
+    ],
+    call=read_frames,
+)
+CALIBRATION = rows(
+    "Calibration",
+    [
+        ("focal lengths of 55 and 5500", calibrated("55 5500 31.5 23.5")),
+        ("cx and cy in each other's place", calibrated("55 55 23.5 31.5")),
+        ("a principal point left of the image", calibrated("55 55 -300 23.5")),
+        ("an infinite focal length", calibrated("inf 55 31.5 23.5")),
+        ("a focal length of 1e300", calibrated("1e300 1e300 31.5 23.5")),
+        ("distortion with a NaN", calibrated("55 55 31.5 23.5 nan 0 0 0")),
+        ("distortion of 1e300", calibrated("55 55 31.5 23.5 1e300 0 0 0")),
+        ("semicolons", calibrated("55; 55; 31.5; 23.5")),
+        ("names before the numbers", calibrated("fx: 55\nfy: 55\ncx: 31.5\ncy: 23.5")),
+        ("five million numbers", calibrated("5 " * 5_000_000)),
+        ("a pipe", beside(pipe_for("calibration.txt"))),
+    ],
+    call=read_frames,
+)
+STRANGERS: list[Row] = [*IMAGES, *DEPTH, *LISTS, *CALIBRATION]

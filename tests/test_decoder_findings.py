@@ -1,0 +1,150 @@
+"""What fuzzing of decoders found (`fuzz_decoders.py`), once each: files that ended in a traceback.
+
+Oracle: `InputError` with a sentence that names the file, or a warning that a frame is skipped, or, of a cache, the
+answer, computed again. Each failed before.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bad_files as bad
+import cv2
+import numpy as np
+import pytest
+from conftest import ROOT
+from decoders import ANY
+
+from vggtgeo.datasets import open_sequence, video
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+
+Change = Callable[[bytes], bytes]
+
+
+def replaced(old: bytes, new: bytes, count: int = -1) -> Change:
+    """Places of the file written anew."""
+
+    def change(whole: bytes) -> bytes:
+        assert old in whole
+        return whole.replace(old, new, count)
+
+    return change
+
+
+def put(name: str, change: Change, folder: Path) -> Path:
+    """The damaged file, and what else is in its folder."""
+    kind = ANY[name]
+    content = change(kind.content(folder))
+    (folder / kind.file).parent.mkdir(parents=True, exist_ok=True)
+    (folder / kind.file).write_bytes(content)
+    return folder / kind.file
+
+
+NETWORKS: dict[str, tuple[Change, str]] = {
+    "an output's name": (replaced(b"\x04mask", b"\x04mas\xff"), "its names or metadata are no text"),
+    "its metadata": (replaced(b"random", b"rando\xff"), "its names or metadata are no text"),
+    "a name of weights beside it that is too long for a file": (
+        lambda whole: whole + b"\x0a\x08location\x12" + b"\xff" * 256,
+        "is not an ONNX file that can be read",
+    ),
+    "a node's input": (replaced(b"value of mask", b"value of mas\xff", 1), "is not an ONNX file that can be read"),
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_network_with_bytes_that_are_no_text(name: str, tmp_path: Path) -> None:
+    """Names and metadata that are no UTF-8, and messages of onnxruntime about them."""
+    change, sentence = NETWORKS[name]
+    file = put("network", change, tmp_path)
+    with pytest.raises(InputError, match=sentence) as caught:
+        ANY["network"].read(file)
+    assert str(file) in str(caught.value)
+
+
+def test_a_bag_without_a_pose_in_its_topic_of_truth(tmp_path: Path) -> None:
+    """The topic is listed, and nothing is in it."""
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    file = put("bag 2 metadata", replaced(b"/mocap/pose", b"/mocap/posf"), tmp_path)
+    with pytest.raises(InputError, match=r"has no pose in its topic `/mocap/posf`"):
+        open_sequence(file.parent).ground_truth()
+
+
+def test_answers_that_lost_some_bytes_are_computed_again(tmp_path: Path) -> None:
+    """A cached answer from which bytes were taken out at any place, or that was put there by somebody."""
+    whole = ANY["cached answer"].content(tmp_path)
+    shortened = [whole[:place] + whole[place + 24 :] for place in range(0, len(whole) - 24, 12)]
+    for content in (*shortened, b"\x93NUMPY\x01\x00\x00\x00", b"\x80\x04.", b""):
+        file = put("cached answer", lambda _, content=content: content, tmp_path / "made")
+        ANY["cached answer"].read(file)
+        shutil.rmtree(tmp_path / "made")
+
+
+_CAPTURE = cv2.VideoCapture
+
+
+class Decoder:
+    """OpenCV's, with methods of one's own; it cannot be a base class: the collector of garbage then crashes."""
+
+    def __init__(self, path: str) -> None:
+        self.inside = _CAPTURE(path)
+        self.handed = self.grabbed = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inside, name)
+
+
+class Broken(Decoder):
+    """A decoder that hands back an empty frame, then one of another size, then those of the file."""
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        """Said to be decoded each time, as OpenCV does."""
+        self.handed += 1
+        readable, image = self.inside.retrieve()
+        return readable, (image[:0], image[:20])[self.handed - 1] if self.handed < 3 else image
+
+
+def test_frames_of_a_video_that_are_empty_or_of_another_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are skipped, and counted as left out; the rest is used."""
+    (tmp_path / "calibration.txt").write_text("55 55 31.5 23.5")
+    sequence = open_sequence(bad.video(tmp_path / "clip.mp4", 5), "video")
+    monkeypatch.setattr(video.cv2, "VideoCapture", Broken)
+    with pytest.warns(LeftOutWarning) as told:
+        found = [frame.index for frame in sequence.frames()]
+    assert found == [2, 3, 4]
+    texts = [str(entry.message) for entry in told]
+    assert texts[0] == "`clip.mp4`: frame 0 cannot be decoded; it is skipped"
+    assert texts[1] == "`clip.mp4`: frame 1 is 64 x 20 pixels, the first 64 x 48; it is skipped"
+
+
+class Ending(Decoder):
+    """A container whose third frame cannot be read, as OpenCV's own reader of AVI has it: an exception."""
+
+    def grab(self) -> bool:
+        """Two frames."""
+        self.grabbed += 1
+        if self.grabbed > 2:
+            raise cv2.error("chunk.m_size <= 67108864")
+        return bool(self.inside.grab())
+
+
+def test_a_video_whose_reader_raises_ends_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is before it is used, and the user is told; oracle: the frames and the warning."""
+    (tmp_path / "calibration.txt").write_text("55 55 31.5 23.5")
+    sequence = open_sequence(bad.video(tmp_path / "clip.mp4", 5), "video")
+    monkeypatch.setattr(video.cv2, "VideoCapture", Ending)
+    with pytest.warns(InputWarning, match=r"`clip.mp4` ends after 2 frames; its header says 5: is the file cut off\?"):
+        assert [frame.index for frame in sequence.frames()] == [0, 1]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ANY)
+def test_damaged_files_end_no_process(name: str) -> None:
+    """Two hundred damaged files of each kind, in a process of its own; oracle: `fuzz_decoders.py` finds nothing."""
+    command = [sys.executable, str(ROOT / "tests/fuzz_decoders.py"), name, "--count", "200", "--seed", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+    assert done.returncode == 0, done.stdout
