@@ -34,7 +34,7 @@ def _cut(file: Path, share: float) -> None:
         (lambda path: None, "does not exist"),
         (lambda path: path.mkdir(), "is empty"),
         (lambda path: tiny.images(path, ()), "holds `calibration.txt`; expected a 7-Scenes folder"),
-        (lambda path: path.write_text("hello"), "cannot be opened as a video"),
+        (lambda path: path.write_text("hello"), "is a text file"),
         (lambda path: path.write_bytes(b""), "cannot be opened as a video"),
     ],
 )
