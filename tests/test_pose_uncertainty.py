@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
+from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 
 import vggtgeo as vg
 from vggtgeo.cli.progress import print_result
 from vggtgeo.geometry import rigid
+from vggtgeo.simulation.loop import simulate_loop
 from vggtgeo.slam import pose_uncertainty
 from vggtgeo.slam.evidence import tangent
-from vggtgeo.slam.pose_uncertainty import keyframe_sigma
+from vggtgeo.slam.pose_uncertainty import keyframe_sigma, sparse_worst
 
 
 def test_keyframes_have_the_deviations_of_their_covariances() -> None:
@@ -31,6 +33,35 @@ def test_keyframes_have_the_deviations_of_their_covariances() -> None:
     for column, part in enumerate((slice(0, 3), slice(3, 6))):
         worst = np.linalg.eigvalsh(np.asarray(known.poses)[:3, part, part])[:, -1]
         np.testing.assert_allclose(sigma[:, column], np.sqrt(factor * np.maximum(worst, 0.0)), rtol=1e-9, atol=1e-15)
+
+
+def test_a_sparse_factor_gives_the_same_deviations() -> None:
+    """Of a ring of keyframes with surfaces, whose information has no band, and of one that is held; oracle: the
+    covariances by a dense matrix.
+    """
+    window, surfaces = simulate_loop(30, points=10, reach=2)
+    problem, state, _ = window.pack(terms=(surfaces,))
+    known = vg.covariances(problem, state)
+    asked = np.array([0, 3, 16, 29])
+    worst, factor = sparse_worst(problem, state, asked)
+    assert factor == pytest.approx(float(known.variance_factor), rel=1e-9)
+    for column, part in enumerate((slice(0, 3), slice(3, 6))):
+        expected = np.linalg.eigvalsh(np.asarray(known.poses)[asked, part, part])[:, -1]
+        np.testing.assert_allclose(worst[:, column], expected, rtol=1e-6, atol=1e-15)
+
+
+def test_a_large_graph_without_a_band_is_asked_in_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keyframes between those that are asked get what lies between them. Oracle: the dense covariances."""
+    window, surfaces = simulate_loop(30, points=10, reach=2)
+    problem, state, _ = window.pack(terms=(surfaces,))
+    exact = keyframe_sigma(problem, state, 30)
+    monkeypatch.setattr(pose_uncertainty, "DENSE_KEYFRAMES", 20)
+    monkeypatch.setattr(pose_uncertainty, "choose_reduced_solver", lambda problem: ConjugateGradients())
+    monkeypatch.setattr(pose_uncertainty, "SPREAD", 15)
+    found = keyframe_sigma(problem, state, 30)
+    assert exact is not None
+    assert found is not None
+    np.testing.assert_allclose(found, exact, rtol=0.25, atol=1e-12)
 
 
 @pytest.mark.long

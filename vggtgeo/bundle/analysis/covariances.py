@@ -26,7 +26,7 @@ from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
-from vggtgeo.solvers.covariance import ArrowCovariance, covariance
+from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600
@@ -150,7 +150,7 @@ def _covariances_jit(
         intrinsics=found.shared,
         inverse_depth=found.landmarks,
         neighbours=found.neighbours,
-        variance_factor=_variance_factor(ready, state, found),
+        variance_factor=variance_factor(ready, state, found.rank),
         parameters=problem.parameter_names,
     )
 
@@ -169,10 +169,10 @@ def _check_size(solver: AbstractReducedSolver, keyframes: int, asked: int) -> No
         )
 
 
-def _variance_factor(problem: Problem, state: State, found: ArrowCovariance) -> Float[Array, ""]:
-    """`2 E / (m - u)`: `m` rows that may change, `u` unknowns that they determine."""
+def variance_factor(problem: Problem, state: State, rank: Int[Array, ""]) -> Float[Array, ""]:
+    """`2 E / (m - u)`: `m` rows that may change, `u` unknowns that they determine, `rank`. problem: prepared."""
     terms = tuple(changing(problem, term, state) for term in problem.terms)
     rows = jnp.asarray(sum(count_rows(problem, term, state) for term in terms))
-    redundancy = rows - found.rank
+    redundancy = rows - rank
     factor = 2 * prepared_energy(problem.with_terms(terms), state) / jnp.maximum(redundancy, 1)
     return jnp.where(redundancy > 0, factor, jnp.ones_like(factor))

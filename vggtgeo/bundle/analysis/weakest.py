@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from vggtgeo.solvers.arrow import Blocks
 from vggtgeo.solvers.block_sparse import SparseLayout
@@ -44,12 +44,17 @@ def weakest(matrix: sp.csr_array, count: int) -> tuple[Float[np.ndarray, " v"], 
     if size <= 2 * count:
         values, vectors = np.linalg.eigh(matrix.toarray())
         return values[:count], vectors[:, :count]
-    shifted = sp.csc_matrix(matrix + SHIFT * sp.eye_array(size))
-    # Definite, so without pivots off the diagonal, which would fill the factor.
-    factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factor = definite_factor(matrix + SHIFT * sp.eye_array(size))
     inverse = LinearOperator(matrix.shape, matvec=factor.solve, dtype=float)
     start = np.random.default_rng(0).normal(size=size)
     found = eigsh(matrix, k=count, sigma=-SHIFT, OPinv=inverse, v0=start)[1]
     basis = np.linalg.qr(found)[0]
     values, turn = np.linalg.eigh(basis.T @ (matrix @ basis))
     return values, basis @ turn
+
+
+def definite_factor(matrix: sp.csr_array) -> SuperLU:
+    """A sparse factor of a positive definite matrix: without pivots off the diagonal, which would fill it."""
+    return splu(
+        sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
