@@ -8,14 +8,10 @@ import pytest
 from conftest import ROOT
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-PAGES = [
-    "docs/extending.md",
-    pytest.param("README.md", marks=pytest.mark.long),
-    pytest.param("docs/own-residual.md", marks=pytest.mark.long),
-    pytest.param("docs/gradients.md", marks=pytest.mark.long),
-]
+PAGES = ["docs/extending.md", "README.md", "docs/own-residual.md", "docs/gradients.md"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", PAGES)
 def test_the_blocks_of_a_page_run_in_order(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pasted one after the other into an empty folder's session, no block raises. Oracle: Python, and their asserts."""
