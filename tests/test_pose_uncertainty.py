@@ -48,6 +48,10 @@ def test_a_sparse_factor_gives_the_same_deviations() -> None:
     for column, part in enumerate((slice(0, 3), slice(3, 6))):
         expected = np.linalg.eigvalsh(np.asarray(known.poses)[asked, part, part])[:, -1]
         np.testing.assert_allclose(worst[:, column], expected, rtol=1e-6, atol=1e-15)
+    # All ties to one keyframe taken away: nothing determines it, and that is said, not raised.
+    alone, _, _ = window.pack()
+    unseen = alone.with_term(alone.points.reweighted(0.0 * alone.points.weight))
+    assert sparse_worst(unseen, state, np.array([16]))[0].max() > 1e3 * worst.max()
 
 
 def test_a_large_graph_without_a_band_is_asked_in_places(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,6 +39,9 @@ apart. Nothing in a run can see that, and no residual shows what every pose has 
 SPREAD = 64
 """Keyframes, evenly spread, that stand for the others where no band serves: six solves with a sparse factor each."""
 
+FLOOR = 1e-12
+"""Of an information whose diagonal is one: above its rounding errors, far below what a map determines."""
+
 
 class PoseUncertainty(NamedTuple):
     """Standard deviations of the poses of a piece of the map in their worst direction, relative to its first keyframe.
@@ -119,32 +122,40 @@ def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.
 
     Conjugate gradients would solve a system for each column, which had not ended for 957 keyframes after ten minutes.
     """
-    system, factor = _linearised_jit(problem, state)
+    system, landmarks = _linearised_jit(problem, state)
     layout = sparse_layout(system)
     information = sparse_matrix(_reduced_jit(system, layout), layout)
-    diagonal = information.diagonal()
-    free = np.flatnonzero(np.asarray(system.free) & (diagonal > 0))
-    scale = sp.diags_array(1 / np.sqrt(diagonal[free]))
-    inverse = definite_factor(scale @ information[free][:, free] @ scale)
+    if not np.isfinite(information.data).all():
+        return np.full((len(asked), 2), np.nan), 1.0
+    free = np.flatnonzero(np.asarray(system.free))
+    diagonal = information.diagonal()[free]
+    unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scale = sp.diags_array(unit)
+    # What nothing determines comes out as very uncertain, where the factor of a singular matrix would be an error.
+    inverse = definite_factor(scale @ information[free][:, free] @ scale + FLOOR * sp.eye_array(len(free)))
     worst = np.zeros((len(asked), 2))
     for row, keyframe in enumerate(asked):
         at = np.flatnonzero(free // lie.TANGENT == keyframe)
         if len(at) < lie.TANGENT:  # held, or a part of it: it is where it is said to be
             continue
-        unit = np.zeros((len(free), lie.TANGENT))
-        unit[at, np.arange(lie.TANGENT)] = 1 / np.sqrt(diagonal[free[at]])
-        block = inverse.solve(unit)[at] / np.sqrt(diagonal[free[at]])[:, None]
+        columns = np.zeros((len(free), lie.TANGENT))
+        columns[at, np.arange(lie.TANGENT)] = unit[at]
+        block = inverse.solve(columns)[at] * unit[at, None]
         worst[row] = [np.linalg.eigvalsh(block[part, part])[-1] for part in (slice(0, 3), slice(3, 6))]
-    return worst, float(factor)
+    determined = landmarks + np.count_nonzero(diagonal > 0)
+    return worst, float(_factor_jit(problem, state, determined))
 
 
 @eqx.filter_jit
 def _linearised_jit(problem: Problem, state: State) -> tuple[ArrowSystem, Array]:
-    """The system, and the variance factor of its residuals, all that is free counted as determined."""
-    ready = prepared(problem)
-    system = linearise(ready, state)
-    determined = jnp.sum(system.free) + jnp.sum(moving_landmarks(system))
-    return system, variance_factor(ready, state, determined)
+    """The system, and how many landmarks it determines."""
+    system = linearise(prepared(problem), state)
+    return system, jnp.sum(moving_landmarks(system))
+
+
+@eqx.filter_jit
+def _factor_jit(problem: Problem, state: State, determined: Array) -> Array:
+    return variance_factor(prepared(problem), state, determined)
 
 
 _reduced_jit = eqx.filter_jit(reduced_blocks)
