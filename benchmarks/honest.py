@@ -50,7 +50,11 @@ def main() -> None:
         print(WHOLE)
         for path in options.clips:
             source = path if path.exists() else vg.simulate(path.name, 80, rate=6.0)
-            print(_whole_row(path.name, vg.reconstruct(source)), flush=True)
+            result = vg.reconstruct(source)
+            assert result.record is not None
+            truth = vg.Trajectory.load_tum(options.truth) if options.truth else result.record.truth
+            assert truth is not None, f"{path} has no truth"
+            print(_whole_row(path.name, result, truth), flush=True)
         return
     print(HEADER)
     for path in options.clips:
@@ -90,12 +94,9 @@ def _row(name: str, slam: Slam, true: np.ndarray, row_of: dict[int, int]) -> str
     return "| " + " | ".join((name, str(len(moved)), *cells)) + " |"
 
 
-def _whole_row(name: str, result: vg.Result) -> str:
+def _whole_row(name: str, result: vg.Result, truth: vg.Trajectory) -> str:
     stated = result.uncertainty
     assert stated is not None
-    assert result.record is not None
-    assert result.record.truth is not None
-    truth = result.record.truth
     rows = [int(np.argmin(np.abs(truth.timestamps - time))) for time in result.trajectory.timestamps]
     found, true = result.trajectory.poses, truth.poses[rows]
     against_first = [rigid.invert(poses[0])[None] @ poses for poses in (found, true)]
@@ -124,6 +125,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--whole", action="store_true")
+    parser.add_argument("--truth", type=Path, help="poses to compare with in place of a clip's own, TUM's layout")
     return parser.parse_args()
 
 

@@ -36,6 +36,10 @@ MOMENT = 0.01
 """Seconds, standard deviation: a pose is that of a moment, and an image is none. Shutters of phones and depth cameras
 roll over it for up to 1/30 s (uniform: 0.0096 s), and on TUM's freiburg1 the times of images and truth are 0.013 s
 apart. Nothing in a run can see that, and no residual shows what every pose has taken up."""
+CALIBRATION = 0.01
+"""Of the angle that the camera has turned since the first pose: standard deviation of the focal length, relative, by
+which every turn that is seen is too large or too small. Makers and calibration tools reach it (`slam/calibration.py`);
+two runs with one camera refined it to 482.6 and 488.4 px."""
 SPREAD = 64
 """Keyframes, evenly spread, that stand for the others where no band serves: six solves with a sparse factor each."""
 
@@ -76,7 +80,8 @@ def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
     # What turns while it is read out is sheared and stretched, which looks like a motion at the scene's distance.
     sheared = rate * _median_depths(slam)[[record.reference for record in records]]
     moved = np.sqrt(moved**2 + MOMENT**2 * (speed**2 + sheared**2))
-    return PoseUncertainty(times, moved, np.hypot(turned, MOMENT * rate))
+    turned = np.sqrt(turned**2 + MOMENT**2 * rate**2 + CALIBRATION**2 * _angles(poses) ** 2)
+    return PoseUncertainty(times, moved, turned)
 
 
 def _median_depths(slam: Slam) -> np.ndarray:
@@ -84,6 +89,11 @@ def _median_depths(slam: Slam) -> np.ndarray:
     each = [keyframe.points.inverse_depth[np.isfinite(keyframe.points.inverse_depth)] for keyframe in slam.keyframes]
     every = float(np.median(np.concatenate(each))) if any(map(len, each)) else 1.0
     return 1 / np.array([float(np.median(values)) if len(values) else every for values in each])
+
+
+def _angles(poses: np.ndarray) -> np.ndarray:
+    """By which each of [n, 4, 4] is turned against the first, rad."""
+    return Rotation.from_matrix(poses[:, :3, :3] @ poses[:1, :3, :3].mT).magnitude() if len(poses) else np.zeros(0)
 
 
 def _speeds(times: np.ndarray, poses: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
