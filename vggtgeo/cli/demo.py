@@ -11,12 +11,15 @@ from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, Reru
 from vggtgeo.cli.run_options import ResumeOption
 from vggtgeo.cli.settings_file import SettingsOption
 
+SIZE = (480, 360)
+"""Pixels: large enough for a map one likes to look at; most of the time of a demo with 640 x 480 was their rendering."""
+
 
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("runs/demo"),
     settings: SettingsOption = None,
     scene: Annotated[str, typer.Option(help="Scene: office, hall, corridor, staircase, building, room.")] = "office",
-    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 60,
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 45,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the scene and its noise.")] = 0,
     assignments: AssignmentsOption = None,
     rerun: RerunOption = None,
@@ -33,7 +36,7 @@ def demo(
 
     rerun = check_target(rerun) if rerun else None
     slam_settings = pipeline_settings(settings, assignments or (), {})
-    sequence = simulate(scene, frames, seed, rate=10.0)
+    sequence = simulate(scene, frames, seed, rate=10.0, size=SIZE)
     if not (quiet or as_json):
         typer.echo(f"simulated scene `{scene}`: all numbers below are of a simulation")
     run_and_write(

@@ -65,10 +65,14 @@ def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | 
 
 @in_double_precision
 def compile_global(shape: GlobalShape, settings: SlamSettings) -> None:
-    """Compile the adjustment of maps of a shape, on a problem that holds one observation."""
+    """Compile the adjustment of maps of a shape and their uncertainties, on a problem that holds one observation: both
+    programs at once, on two cores.
+    """
     nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
     surfaces = surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing)
     terms = (*factor_terms((), {}, shape.room), *([surfaces] if settings.depth_terms.surface_points > 0 else []))
     problem, initial = smallest_problem(shape.size, settings, terms)
-    solve_jit(problem, initial, solver=global_solver(problem, settings)).energy.block_until_ready()
-    keyframe_sigma(problem, initial, 1)
+    with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
+        sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)
+        solve_jit(problem, initial, solver=global_solver(problem, settings)).energy.block_until_ready()
+        sigma.result()
