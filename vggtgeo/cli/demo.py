@@ -12,7 +12,7 @@ from vggtgeo.cli.run_options import ResumeOption
 from vggtgeo.cli.settings_file import SettingsOption
 
 SIZE = (480, 360)
-"""Pixels: large enough for a map one likes to look at; most of the time of a demo with 640 x 480 was their rendering."""
+"""Pixels: large enough for a map one likes to look at; most of the time of 640 x 480 was rendering."""
 
 
 def demo(
