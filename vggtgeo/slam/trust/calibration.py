@@ -42,8 +42,10 @@ BETTER_HALF = 0.85
 with the right camera at most 0.76 (corridor-office, redkitchen, freiburg1/rpy)."""
 MOST_SHIFT = 0.05
 """Of the principal point, in image widths."""
-MOST_WARP = 0.02
-"""Of the corners, in image diagonals."""
+MOST_WARP = 0.03
+"""Of the corners, in image diagonals. Redkitchen's lens moves them by 7 px (0.9 %) and is found to move them by 16 and
+17 where its frames are played twice; 65 px that nobody told (8 %) cost 1.3 cm in 40 frames of corridor-office and 0.2
+in those of redkitchen. What is sure and smaller is a note of the run."""
 MOST_ASIDE = 0.06
 """Of the given principal point from the middle of the images, in their width or height. A sensor sits behind its lens:
 published calibrations of TUM RGB-D, EuRoC, KITTI and ICL-NUIM are 0.014 off (root mean square), at most 0.033. Images
