@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -87,7 +88,7 @@ class RadialTangential(AbstractCamera):
         return self.parameters[:2] * self._distort(_flat(point)) + self.parameters[2:4]
 
     def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-        return _ray(_inverted(self._distort, (pixel - self.parameters[2:4]) / self.parameters[:2]))
+        return _ray(_inverted(type(self)._distort, self, (pixel - self.parameters[2:4]) / self.parameters[:2]))
 
     def _distort(self, flat: Float[Array, "2"]) -> Float[Array, "2"]:
         k1, k2, p1, p2 = self.parameters[4:]
@@ -122,7 +123,7 @@ class KannalaBrandt(AbstractCamera):
     def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
         drawn = (pixel - self.parameters[2:4]) / self.parameters[:2]
         radius = _norm(drawn)
-        angle = _inverted(lambda angle: angle * self._stretch(angle), radius)
+        angle = _inverted(_drawn_radius, self, radius)
         near = radius < 1e-4
         # tan(t) / (t stretch) near the axis is 1 + (1/3 - k1) t^2, and the radius may be zero there.
         straight = jnp.tan(angle) / jnp.where(near, 1.0, radius)
@@ -140,6 +141,11 @@ class KannalaBrandt(AbstractCamera):
         k1, k2, k3, k4 = self.parameters[4:]
         t2 = angle * angle
         return 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+
+
+def _drawn_radius(camera: KannalaBrandt, angle: Float[Array, ""]) -> Float[Array, ""]:
+    """Where a fisheye draws a ray at this angle from its axis, in focal lengths."""
+    return angle * camera._stretch(angle)
 
 
 class SquarePixels(AbstractCamera):
@@ -253,22 +259,32 @@ def _norm(flat: Float[Array, "2"]) -> Float[Array, ""]:
     return jnp.where(somewhere, jnp.sqrt(jnp.where(somewhere, squared, 1.0)), 0.0)
 
 
-def _inverted(function: Callable[[Array], Array], value: Float[Array, "*d"]) -> Float[Array, "*d"]:
-    """`x` with `function(x) = value`, by Newton's method from `x = value`.
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _inverted(
+    function: Callable[[Any, Array], Array], camera: AbstractCamera, value: Float[Array, "*d"]
+) -> Float[Array, "*d"]:
+    """`x` with `function(camera, x) = value`, a number or two, by Newton's method from `x = value`."""
 
-    The iterations carry no derivative; two more steps from where they end give the first and second derivatives of the
-    inverse exactly (each step of Newton's method doubles the order that is right).
-    """
+    def step(_: Int[Array, ""] | int, x: Array) -> Array:
+        return x - _divided(function(camera, x) - value, jax.jacfwd(function, 1)(camera, x))
 
-    def step(x: Array, function: Callable[[Array], Array], value: Array) -> Array:
-        jacobian = jax.jacfwd(function)(x)
-        off = function(x) - value
-        return x - (off / jacobian if off.ndim == 0 else jnp.linalg.solve(jacobian, off))
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, step, value)
 
-    x = value
-    for _ in range(_NEWTON_STEPS):
-        x = step(x, function, value)
-    x = jax.lax.stop_gradient(x)
-    for _ in range(2):
-        x = step(x, function, value)
-    return x
+
+@_inverted.defjvp
+def _inverted_jvp(
+    function: Callable[[Any, Array], Array], at: tuple[Any, Array], along: tuple[Any, Array]
+) -> tuple[Array, Array]:
+    """The implicit function theorem, in which `x` is again an inverse: exact to any order."""
+    camera, value = at
+    x = _inverted(function, camera, value)
+    _, moved = jax.jvp(lambda camera: function(camera, x), (camera,), along[:1])
+    return x, _divided(along[1] - moved, jax.jacfwd(function, 1)(camera, x))
+
+
+def _divided(vector: Float[Array, "*d"], matrix: Float[Array, "*d *d"]) -> Float[Array, "*d"]:
+    """`matrix^-1 vector`, written out: a factorisation for each of many thousand pixels takes many times as long."""
+    if vector.ndim == 0:
+        return vector / matrix
+    (a, b), (c, d) = matrix
+    return jnp.stack([d * vector[0] - b * vector[1], a * vector[1] - c * vector[0]]) / (a * d - b * c)
