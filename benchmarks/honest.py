@@ -125,8 +125,11 @@ def _options() -> argparse.Namespace:
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--whole", action="store_true")
-    parser.add_argument("--truth", type=Path, help="poses to compare with in place of a clip's own, TUM's layout")
-    return parser.parse_args()
+    parser.add_argument("--truth", type=Path, help="poses to compare one clip with, TUM's layout")
+    options = parser.parse_args()
+    if options.truth and not (options.whole and len(options.clips) == 1):
+        parser.error("--truth goes with --whole and one clip")
+    return options
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a run. ATE in metres; given, written, tracked: frames; placed: those in `trajectory.txt`, which
+    """What came of a run. ATE in metres; given, written, tracked: frames, tracked those in `trajectory.txt`, which
     holds one part of a map in several.
     """
 
@@ -73,7 +73,6 @@ class Outcome:
     given: int = 0
     written: int = 0
     tracked: int = 0
-    placed: int = 0
     seconds: float = 0.0
     reasons: tuple[str, ...] = ()
 
@@ -108,7 +107,7 @@ def judge(outcome: Outcome, base: float) -> str:
     if outcome.code not in (0, 3):
         return "error" if outcome.code == 2 else "crash"
     told = outcome.level != "good"
-    complete = outcome.written >= 0.98 * outcome.given and min(outcome.tracked, outcome.placed) >= 0.9 * outcome.written
+    complete = outcome.written >= 0.98 * outcome.given and outcome.tracked >= 0.9 * outcome.written
     complete = complete and not outcome.turn > MOST_TURN
     if outcome.ate <= max(2 * base, 0.04) and complete:
         return "alarm" if told else "good"
@@ -156,8 +155,7 @@ def _measured(case: Case, folder: Path, truth: Path, run: Path, code: int | None
             "reasons": tuple(summary["verdict"]["reasons"]),
             "scale": summary["scale"],
             "written": summary["frames"],
-            "tracked": summary["frames_tracked"],
-            "placed": len(estimate),
+            "tracked": len(estimate),
         }
     return Outcome(case.source, case.name, code, **facts)
 
@@ -219,12 +217,11 @@ def _base(outcomes: list[Outcome], source: str) -> float:
 
 def _row(outcome: Outcome, word: str) -> str:
     reasons = "; ".join(outcome.reasons)
-    placed = f"{min(outcome.tracked, outcome.placed)}/{outcome.given}"
     reasons = reasons if len(reasons) < 160 else reasons[:157] + "..."
     name = f"**{word}**" if word in ("SILENT", "crash", "hang") else word
     return (
         f"| {outcome.source} | {outcome.name} | {name} | {outcome.level or '-'} | {100 * outcome.ate_se3:.1f} | "
-        f"{100 * outcome.ate_sim3:.1f} | {placed} | {reasons.replace('|', '/')} |"
+        f"{100 * outcome.ate_sim3:.1f} | {outcome.tracked}/{outcome.given} | {reasons.replace('|', '/')} |"
     )
 
 

@@ -12,7 +12,7 @@ from vggtgeo.cli.run_options import ResumeOption
 from vggtgeo.cli.settings_file import SettingsOption
 
 SIZE = (480, 360)
-"""Pixels: large enough for a map one likes to look at; most of the time of 640 x 480 was rendering."""
+"""Pixels: large enough for a map one likes to look at, smaller than usual because frames are rendered on the spot."""
 
 
 def demo(
