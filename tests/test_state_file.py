@@ -20,6 +20,7 @@ from same_leaves import differences
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.record_file import DATA, HEADER, Layout
 from vggtgeo.io.records import by_name
@@ -70,6 +71,7 @@ def full(slam: Slam) -> Slam:
         notes=("a note",),
         pose_sigma=np.ones((2, 2)),
         pending=PendingWindow(7, slam, under_way),
+        lens=Camera((140.0, 140.0, 80.0, 60.0), 160, 120, (-0.1, 0.0, 0.0, 0.0), known=False),
     )
 
 

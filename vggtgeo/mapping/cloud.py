@@ -12,7 +12,7 @@ from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe import Keyframe, read_at
 from vggtgeo.slam.threads import map_in_threads
 
 STEP = 3
@@ -70,8 +70,8 @@ def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray) -> _Points:
     slots = keyframe.points
     known = np.isfinite(slots.inverse_depth) & (slots.inverse_depth > 0.02)
     points = rigid.unproject(slots.pixels[known], slots.inverse_depth[known], keyframe.pose, intrinsics)
-    columns, rows = np.rint(slots.pixels[known]).astype(int).T
-    return _Points(points, keyframe.image[rows, columns], np.zeros((len(points), 3)), slots.confidence[known])
+    colours = read_at(keyframe.image, slots.pixels[known])
+    return _Points(points, colours, np.zeros((len(points), 3)), slots.confidence[known])
 
 
 def _dense_points(

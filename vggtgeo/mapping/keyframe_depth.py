@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe import Keyframe, read_at
 from vggtgeo.slam.threads import map_in_threads
 
 CELL = 24.0
@@ -93,14 +93,14 @@ def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray,
     """Pixels, log depth corrections and weights of the slots that have both an estimate and a prior."""
     slots = keyframe.points
     height, width = log_depth.shape
-    columns, rows = np.rint(slots.pixels).astype(int).T
-    here = log_depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    here = read_at(log_depth, slots.pixels)
+    inside = np.all((slots.pixels > -0.5) & (slots.pixels < (width - 0.5, height - 0.5)), axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         estimate = -np.log(slots.inverse_depth)
         correction = estimate - here
         # A slot that stands at its prior has taken no part in an adjustment.
         adjusted = estimate != -np.log(slots.prior)
-    good = np.isfinite(correction) & adjusted & (np.abs(correction) < LARGEST_CORRECTION)
+    good = inside & np.isfinite(correction) & adjusted & (np.abs(correction) < LARGEST_CORRECTION)
     return slots.pixels[good], correction[good], slots.confidence[good] * slots.prior_confidence[good]
 
 

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe import Keyframe, read_at
 
 GATE = 4.0
 """Largest reprojection error of an observation, pixels: two standard deviations of the adjustment's Cauchy kernel."""
@@ -167,7 +167,5 @@ def _colours(keyframes: Sequence[Keyframe], view: np.ndarray, pixel: np.ndarray)
     colours = np.zeros((len(view), 3), np.uint8)
     for number in np.unique(view):
         here = view == number
-        image = keyframes[number].image
-        columns, rows = np.rint(pixel[here]).astype(int).T
-        colours[here] = image[rows.clip(0, image.shape[0] - 1), columns.clip(0, image.shape[1] - 1)]
+        colours[here] = read_at(keyframes[number].image, pixel[here])
     return colours

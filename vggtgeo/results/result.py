@@ -68,7 +68,7 @@ class Result:
         trajectory: camera -> world of every frame that has a pose.
         keyframes: those of the keyframes.
         cloud: the map, world frame.
-        intrinsics: fx, fy, cx, cy, pixels, as adjusted.
+        intrinsics: fx, fy, cx, cy, pixels, as adjusted, of undistorted images.
         metric: whether lengths are metres; without metric depth they have no unit.
         verdict: how far all this can be trusted, by segment of time.
         summary: counts, times and settings, as `summary.json` has them.

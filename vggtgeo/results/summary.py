@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.cameras import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.results.files import piece_file
@@ -61,6 +63,7 @@ def summarise(
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
         **stated_uncertainty(slam),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
+        **({} if slam.lens is None else {"lens": lens_of(slam.lens)}),
         "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
         "notes": list(slam.notes),
         **counts,
@@ -104,6 +107,11 @@ def with_writing(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
     whole = stages.pop("all") + seconds
     stages |= {"write": round(seconds, 3), "all": round(whole, 3)}
     return {**summary, "seconds_by_stage": stages, "frames_per_second_whole_run": round(summary["frames"] / whole, 2)}
+
+
+def lens_of(lens: Camera) -> dict[str, float]:
+    """The camera of the images as they were read, OpenCV's model; `intrinsics` are those of the undistorted ones."""
+    return dict(zip(RadialTangential.names, (*lens.intrinsics, *lens.distortion), strict=True))
 
 
 SCALE_BASIS = "the depth alone: images do not tell a constant factor on it"

@@ -13,6 +13,7 @@ from vggtgeo.bundle.padding import PaddedSize, SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.covisibility import Directed
 from vggtgeo.slam.keyframe import Keyframe, Slots
@@ -22,6 +23,21 @@ from vggtgeo.slam.settings import SlamSettings
 
 LEAST_INVERSE_DEPTH = 1e-3
 """1/m; a landmark starts no farther than a kilometre away."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPrior:
+    """What is known of the camera before an adjustment. mean, sigma: float64 [4] of fx, fy, cx, cy, pixels. kind: its
+    model, a pinhole; that of a guessed camera has square pixels.
+    """
+
+    mean: np.ndarray
+    sigma: np.ndarray
+    kind: type[Pinhole | SquarePinhole] = Pinhole
+
+    def parameters(self, intrinsics: np.ndarray) -> np.ndarray:
+        """Those of the model, of fx, fy, cx, cy (or their deviations)."""
+        return np.array([np.mean(intrinsics[:2]), *intrinsics[2:]]) if self.kind is SquarePinhole else intrinsics
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +63,14 @@ def build(
     settings: SlamSettings,
     *,
     size: PaddedSize | None,
-    given_intrinsics: np.ndarray,
-    intrinsics_sigma: np.ndarray,
+    camera: CameraPrior,
     fixed_pose: np.ndarray,
     terms: Sequence[AbstractTerm] = (),
 ) -> Adjustment:
     """Pack `keyframes` (at most `size.keyframes`) and the directed edges between them.
 
-    terms: what else is known, of poses and pairs, by the position of a keyframe in `keyframes`.
+    terms: what else is known, of poses and pairs, by the position of a keyframe in `keyframes`. camera: where its prior
+    holds it; it starts from `intrinsics`, fx, fy, cx, cy.
 
     Of each host at most `point_slots` key points (those with the most observations) and `line_slots` line samples
     (of the segments with the most) take part.
@@ -66,11 +82,12 @@ def build(
     problem, initial, index = pack(
         observations,
         rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
-        intrinsics,
+        camera.parameters(intrinsics),
         np.maximum(depths, LEAST_INVERSE_DEPTH),
         size=size,
-        intrinsics_mean=given_intrinsics,
-        intrinsics_sigma=intrinsics_sigma,
+        intrinsics_mean=camera.parameters(camera.mean),
+        intrinsics_sigma=camera.parameters(camera.sigma),
+        camera=camera.kind,
         fixed_pose=fixed_pose,
         kernel=settings.window.kernel,
         terms=terms,
@@ -133,7 +150,9 @@ def write_back(
         points = _updated(keyframe.points, adjustment, depths, here & ~adjustment.is_line)
         samples = _updated(keyframe.samples, adjustment, depths, here & adjustment.is_line)
         updated.append(replace(keyframe, pose=poses[i], points=points, samples=samples))
-    return tuple(updated), np.asarray(state.intrinsics, np.float64)
+    parameters = np.asarray(state.intrinsics, np.float64)
+    square = adjustment.problem.camera is SquarePinhole
+    return tuple(updated), np.array([parameters[0], *parameters]) if square else parameters
 
 
 def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.ndarray) -> Slots:

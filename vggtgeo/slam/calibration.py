@@ -25,11 +25,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2 as chi_square
-from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera_gain import CHANCE, gain
 from vggtgeo.slam.camera_of_pairs import CameraOpinion, CameraPair, camera_of_pairs
 from vggtgeo.slam.covisibility import Directed
 from vggtgeo.slam.state import Slam
@@ -41,13 +40,10 @@ CENTRE = 0.002
 px, and the second lost by it (corridor-office 1.82 cm, now 1.46)."""
 SHARE = 0.5
 """Most variance of a direction by the pairs, of the prior's, for it to be moved at all."""
-CHANCE = 1e-3
-"""Of taking a camera that is no better."""
 SET_ASIDE = 0.2
 """Of the matches of key points that are seen often enough."""
 LEAST_SEEN = 2
 """Matches that each key point keeps."""
-LEAST_HOSTS = 3
 SEED = 0
 MOST_PAIRS = 120
 LEAST_MATCHES = 15
@@ -57,7 +53,6 @@ BLOCK = 3
 """Keyframes in a row whose errors count as shared."""
 
 Solve = Callable[[Problem, State], State]
-_residuals_jit = eqx.filter_jit(residuals_at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +101,9 @@ def try_camera(pairs: list[CameraPair], problem: Problem, state: State, solve: S
     held = solve(training, state)
     start = eqx.tree_at(lambda s: s.intrinsics, held, jnp.asarray(wanted))
     moved = solve(camera_held_at(training, wanted), start)
-    gain, needed = _gain(problem, aside, held, moved)
-    return Refinement(given, wanted, distortion, moved, gain, needed)
+    # The weights that count are those of the whole problem: training saw none of these matches.
+    found, needed = gain((problem, held), (problem, moved), aside)
+    return Refinement(given, wanted, distortion, moved, found, needed)
 
 
 def camera_held_at(problem: Problem, intrinsics: np.ndarray) -> Problem:
@@ -162,24 +158,3 @@ def _set_aside(problem: Problem) -> np.ndarray:
 def _without_surfaces(problem: Problem) -> Problem:
     surfaces = [term for term in problem.terms if term.name == "surfaces"]
     return problem.with_term(surfaces[0].reweighted(jnp.zeros_like(surfaces[0].weight))) if surfaces else problem
-
-
-def _gain(problem: Problem, aside: np.ndarray, before: State, after: State) -> tuple[float, float]:
-    """How much the robust energy of a match set aside falls on average, and how much it has to fall."""
-    kernel, weight = problem.points.kernel, problem.points.weight
-    energies = []
-    for state in (before, after):
-        residual = _residuals_jit(problem, state)["points"]
-        energies.append(np.asarray(kernel.rho(weight * jnp.sum(residual**2, -1)) / 2, np.float64))
-    fall = np.where(aside, energies[0] - energies[1], 0.0)
-    source = np.asarray(problem.edges.source)
-    sums, counts = np.zeros(problem.num_keyframes), np.zeros(problem.num_keyframes)
-    np.add.at(sums, source, fall.sum(1))
-    np.add.at(counts, source, aside.sum(1))
-    total, hosts = counts.sum(), np.count_nonzero(counts)
-    if hosts < LEAST_HOSTS:
-        return 0.0, float("inf")
-    mean = sums.sum() / total
-    by_keyframe = np.sqrt(hosts / (hosts - 1) * np.sum((sums - mean * counts) ** 2)) / total
-    by_match = np.sqrt(np.sum((fall[aside] - mean) ** 2)) / total
-    return float(mean), float(student_t.isf(CHANCE, hosts - 1) * max(by_keyframe, by_match))

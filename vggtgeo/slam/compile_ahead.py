@@ -7,8 +7,10 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.factors import factor_terms, surface_term
+from vggtgeo.slam.global_adjustment import camera_of
 from vggtgeo.slam.global_shape import LARGEST_DENSE, GlobalShape, global_solver, padded_count, shape_for
 from vggtgeo.slam.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.precision import in_double_precision
@@ -43,7 +45,7 @@ class CompileAhead(Callback):
         padded = padded_count(count)
         if padded <= LARGEST_DENSE and padded not in self._asked:
             shape = shape_for(padded, self._settings)
-            self._asked[padded] = self._pool.submit(compile_global, shape, self._settings)
+            self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, camera_of(slam))
 
     def on_adjust(self, slam: Slam) -> None:
         """Waits for what is needed now."""
@@ -64,14 +66,14 @@ def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | 
 
 
 @in_double_precision
-def compile_global(shape: GlobalShape, settings: SlamSettings) -> None:
+def compile_global(shape: GlobalShape, settings: SlamSettings, camera: type[Pinhole | SquarePinhole] = Pinhole) -> None:
     """Compile the adjustment of maps of a shape and their uncertainties, on a problem that holds one observation: both
     programs at once, on two cores.
     """
     nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
     surfaces = surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing)
     terms = (*factor_terms((), {}, shape.room), *([surfaces] if settings.depth_terms.surface_points > 0 else []))
-    problem, initial = smallest_problem(shape.size, settings, terms)
+    problem, initial = smallest_problem(shape.size, settings, terms, camera)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)
         solve_jit(problem, initial, solver=global_solver(problem, settings)).energy.block_until_ready()

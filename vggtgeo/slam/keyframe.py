@@ -146,16 +146,17 @@ def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineF
 
 
 def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) -> Slots:
-    z, sigma_rel, trust = (_read(image, pixels) for image in (depth.depth, depth.sigma_rel, depth.confidence))
-    inverse = 1.0 / z
-    return Slots(pixels, inverse, inverse, sigma_rel * inverse, np.nan_to_num(trust), _read(confidence, pixels))
+    measured = depth.depth, depth.sigma_rel, depth.confidence
+    z, sigma_rel, trust = (read_at(image, pixels).astype(np.float64) for image in measured)
+    inverse, seen = 1.0 / z, read_at(confidence, pixels).astype(np.float64)
+    return Slots(pixels, inverse, inverse, sigma_rel * inverse, np.nan_to_num(trust), seen)
 
 
-def _read(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """The nearest pixel's value, float64 [m]."""
-    height, width = image.shape
+def read_at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """The nearest pixel's value, [m] or [m, 3]; beyond the border, where a lens may have moved it, the border's."""
+    height, width = image.shape[:2]
     columns, rows = np.rint(pixels).astype(int).T
-    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
+    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
 
 
 def _along_segments(line_depths: np.ndarray, segment: np.ndarray, fraction: np.ndarray) -> np.ndarray:

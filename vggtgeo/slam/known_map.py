@@ -50,6 +50,7 @@ def as_map(slam: Slam) -> Slam:
         factors=slam.factors,
         origins=slam.origins,
         pose_sigma=slam.pose_sigma,
+        lens=slam.lens,
     )
 
 

@@ -94,7 +94,8 @@ def run_frames(
 ) -> Iterator[Slam]:
     """The same over any iterable of frames of one camera, on from a state that is known."""
     slam = begin(camera, roles, settings) if known is None else known
-    for frame, description in _described(frames, camera, roles, clock):
+    # Frames of a map whose camera's lens was found are as that lens drew them.
+    for frame, description in _described(frames, slam.lens or camera, roles, clock):
         slam = step(slam, frame, description, roles, settings, clock)
         yield slam
 

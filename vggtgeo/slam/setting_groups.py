@@ -169,7 +169,8 @@ class CameraSettings(CheckedSettings):
     """Of guessed ones."""
     refine_intrinsics: str = one_of("auto", "always", "never")
     """Whether the last adjustment may move known intrinsics: "auto", where the images ask for it and it pays (see
-    `slam/calibration.py`); "always", where the images ask for it; "never"."""
+    `slam/calibration.py`); "always", where the images ask for it; "never". Guessed ones are always estimated, and
+    their lens is sought (`slam/lens.py`) unless it says "never"."""
 
 
 _KERNEL = "a kernel of a width above 0, such as `cauchy 2.0` (`vggtgeo.Cauchy(2.0)`)"

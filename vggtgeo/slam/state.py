@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vggtgeo.bundle.problem import State
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.adjustment import Adjustment
 from vggtgeo.slam.covisibility import Pair
@@ -83,7 +84,9 @@ class Slam:
     metric: whether lengths are metres. axes: the perpendicular directions of the world's lines, float64 [3, 3] (axes ->
     world), as the first keyframes saw them. notes: what the user should know.
     pose_sigma: of each keyframe after the last adjustment, see `pose_uncertainty.keyframe_sigma`. pending: the
-    adjustment of the newest keyframe's window, while it goes on.
+    adjustment of the newest keyframe's window, while it goes on. lens: the distorting camera of the images as they were
+    read, where the last adjustment found one: pixels and images of all keyframes, and `intrinsics`, are of images that
+    it no longer distorts (`lens.py`).
     """
 
     intrinsics: np.ndarray
@@ -109,6 +112,7 @@ class Slam:
     notes: tuple[str, ...] = ()
     pose_sigma: np.ndarray | None = None
     pending: PendingWindow | None = None
+    lens: Camera | None = None
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)

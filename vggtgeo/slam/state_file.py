@@ -23,6 +23,7 @@ from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
 from vggtgeo.bundle.terms.rotation import RotationPrior
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.record_file import Header, Layout
@@ -45,7 +46,7 @@ from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(Slam, PendingWindow, FramePose, Waiting, Evidence, Keyframe, Slots, KeyframeImages, CompressedImage),
+    *(Slam, Camera, PendingWindow, FramePose, Waiting, Evidence, Keyframe, Slots, KeyframeImages, CompressedImage),
     *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
     *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, WindowPrior, MarginalPrior),
     *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
@@ -53,7 +54,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 2
+VERSION = 3
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -62,7 +63,13 @@ def _with_recorded_times(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
-UPGRADES = {1: _with_recorded_times}
+def _with_lens(header: Header) -> Header:
+    """Version 2 did not know lenses that a run found."""
+    tree, classes = with_field(header["tree"], header["classes"], "Slam", "lens")
+    return {**header, "tree": tree, "classes": classes}
+
+
+UPGRADES = {1: _with_recorded_times, 2: _with_lens}
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)
 

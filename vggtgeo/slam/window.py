@@ -18,8 +18,9 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
 from vggtgeo.models.classical import can_search
-from vggtgeo.slam.adjustment import Adjustment, build, write_back
+from vggtgeo.slam.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
 from vggtgeo.slam.gauge import Gauge, gauge_notes, with_one_gauge
@@ -75,7 +76,9 @@ def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, Sta
     return smallest_problem(window_size(settings), settings, terms)
 
 
-def smallest_problem(size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm]) -> tuple[Problem, State]:
+def smallest_problem(
+    size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm], camera: type[AbstractCamera] = Pinhole
+) -> tuple[Problem, State]:
     """A problem of the given shape that holds one observation, and where it starts: to compile for that shape."""
     one = Observations(
         edges=np.array([[0, 1]]),
@@ -88,9 +91,9 @@ def smallest_problem(size: PaddedSize, settings: SlamSettings, terms: Sequence[A
         segment=np.full(1, -1) if settings.line.two_ends_lines else None,
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
-    intrinsics = np.array([100.0, 100.0, 50.0, 50.0])
+    intrinsics = np.array([100.0, 100.0, 50.0, 50.0])[-len(camera.names) :]
     kernel = settings.window.kernel
-    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=size, kernel=kernel, terms=terms)
+    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=size, camera=camera, kernel=kernel, terms=terms)
     return problem, initial
 
 
@@ -179,8 +182,7 @@ def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) 
         slam.intrinsics,
         settings,
         size=window_size(settings),
-        given_intrinsics=slam.given_intrinsics,
-        intrinsics_sigma=slam.intrinsics_sigma,
+        camera=CameraPrior(slam.given_intrinsics, slam.intrinsics_sigma),
         fixed_pose=_held(numbers, slam),
         terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric))),
     )

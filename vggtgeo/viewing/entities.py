@@ -12,7 +12,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe import Keyframe, read_at
 from vggtgeo.slam.window_recorder import WindowRecord
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
@@ -155,8 +155,7 @@ def log_points(stream: Any, keyframes: list[Keyframe], intrinsics: np.ndarray) -
         inverse = keyframe.points.inverse_depth
         known = np.nonzero(np.isfinite(inverse) & (inverse > 0.1))[0]
         points.append(rigid.unproject(keyframe.points.pixels[known], inverse[known], keyframe.pose, intrinsics))
-        columns, rows = np.rint(keyframe.points.pixels[known]).astype(int).T
-        colours.append(keyframe.image[rows, columns])
+        colours.append(read_at(keyframe.image, keyframe.points.pixels[known]))
     stream.log("world/points", rr.Points3D(np.concatenate(points), colors=np.concatenate(colours), radii=-1.5))
 
 

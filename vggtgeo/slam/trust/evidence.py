@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -56,6 +56,10 @@ class FrameEvidence:
     depth_median: float
     depth_changed: float
     contrast: float
+
+    def through(self, lens: Camera) -> FrameEvidence:
+        """The same corners in images that the lens does not distort."""
+        return replace(self, pixels=lens.undistorted(self.pixels).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +144,7 @@ class EvidenceRecorder(Callback):
         full = (self._pixels + 0.5) * scale - 0.5
         changed, median = self._compare_depth(frame.depth)
         depth = np.full(len(full), np.nan, np.float32) if frame.depth is None else _read(frame.depth, full)
-        ideal = _undistorted(full, self._camera).astype(np.float32)
+        ideal = self._camera.undistorted(full).astype(np.float32)
         self._frames.append(
             FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth, median, changed, contrast)
         )
@@ -211,16 +215,6 @@ def _read(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     columns, rows = np.rint(pixels).astype(int).T
     height, width = depth.shape
     return depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float32)
-
-
-def _undistorted(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    if not any(camera.distortion) or not len(pixels):
-        return pixels
-    matrix = camera.matrix
-    flat = cv2.undistortPoints(
-        pixels.reshape(-1, 1, 2).astype(np.float64), matrix, np.array(camera.distortion), P=matrix
-    )
-    return np.asarray(flat).reshape(-1, 2)
 
 
 def common(first: FrameEvidence, second: FrameEvidence) -> tuple[np.ndarray, np.ndarray]:

@@ -33,6 +33,8 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     estimate = Estimate.of(slam)
     by_frame = {noted.frame: noted for noted in evidence}
     aligned = [by_frame[frame] for frame in estimate.frames if frame in by_frame]
+    if slam.lens is not None:
+        aligned = [noted.through(slam.lens) for noted in aligned]
     known = frame_uncertainty(slam) if slam.keyframes else None
     found = [*input_findings, *check_record(estimate)]
     found += check_extent(estimate, None if known is None else known.translation)

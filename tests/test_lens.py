@@ -1,0 +1,200 @@
+"""The lens of a camera that nobody calibrated is found, and taken out of the map. Truth: what pixels were bent by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from recorded_run import ROLES, SETTINGS
+from vggtgeo.models import pinhole
+from vggtgeo.models.classical import NoDepth
+
+import vggtgeo as vg
+from vggtgeo.datasets import Frame
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.cameras import SquarePinhole
+from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.evidence import FrameEvidence
+
+WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
+_solve = eqx.filter_jit(vg.solve)
+
+
+def bent(window: vg.SimulatedWindow, *distortion: float) -> vg.SimulatedWindow:
+    """Its key points and matches as a lens draws them."""
+    lens = vg.RadialTangential(jnp.asarray([*window.intrinsics, *distortion, 0.0, 0.0]))
+    straight = vg.Pinhole(jnp.asarray(window.intrinsics))
+    curve = lambda pixels: np.asarray(
+        jax.vmap(lambda pixel: lens.project(straight.unproject(pixel)))(jnp.asarray(pixels))
+    )
+    seen = window.observations
+    return replace(window, observations=replace(seen, point_target=curve(seen.point_target), pixel=curve(seen.pixel)))
+
+
+def found_in(window: vg.SimulatedWindow, focal: float) -> FoundLens:
+    """Adjusted as a pinhole that begins `focal` times too long, as a guess does, then sought."""
+    _, _, cx, cy = window.intrinsics
+    guess = np.array([focal * window.intrinsics[0], cx, cy])
+    packed = vg.pack(
+        window.observations,
+        window.start,
+        guess,
+        1.0 / window.observations.depth_mean,
+        intrinsics_sigma=np.full(3, 0.3 * guess[0]),
+        camera=SquarePinhole,
+    )
+    problem = packed[0]
+    size = (round(2 * cy + 1), round(2 * cx + 1))
+    solve = lambda problem, state: _solve(problem, state).state
+    return find_lens(problem, solve(problem, packed[1]), size, solve)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_lens_is_found(seed: int) -> None:
+    # Proves that distortion that nobody told is found beside a focal length that begins 10 % off, and how far it moves
+    # pixels. Oracle: the lens that the pixels were bent with.
+    window = vg.simulate_window(seed=seed, **WINDOW)
+    found = found_in(bent(window, -0.15, 0.05), 1.1)
+    f, _, cx, cy = found.camera.intrinsics
+    assert f == pytest.approx(window.intrinsics[0], rel=0.01)
+    assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.camera}"
+    corner = np.hypot(cx, cy) / f
+    drawn = lambda k1, k2, r: f * r * (k1 * r**2 + k2 * r**4)
+    inside = np.linspace(0, 0.7 * corner, 20)
+    k1, k2, *tangential = found.camera.distortion
+    assert np.abs(drawn(k1, k2, inside) - drawn(-0.15, 0.05, inside)).max() < 1.5
+    assert tangential == [0.0, 0.0]
+    assert found.warp == pytest.approx(np.abs(drawn(k1, k2, np.linspace(0, corner * 1.07, 50))).max(), rel=0.3)
+
+
+@pytest.mark.long
+def test_no_lens_is_found_where_there_is_none() -> None:
+    # Proves that noise alone is no lens, in six windows. Oracle: the pinhole that they were drawn with.
+    found = [found_in(vg.simulate_window(seed=seed, **WINDOW), 1.1) for seed in range(6)]
+    assert not any(each.pays for each in found), [(each.gain, each.needed, each.camera) for each in found]
+
+
+def test_a_lens_that_folds_the_image_is_none() -> None:
+    # Proves that coefficients that draw a farther point nearer, as bad data may ask for, move pixels without a bound,
+    # and that a lens that keeps their order does not. Oracle: k1 = -1 folds at a radius of 0.58 focal lengths, and the
+    # corner's is 0.71; 0.1 moves the farthest corner by what solves the cubic.
+    assert largest_shift(replace(LENS, distortion=(-1.0, 0.0, 0.0, 0.0))) == float("inf")
+    f, _, cx, cy = LENS.intrinsics
+    corner = np.hypot(max(cx, 160 - cx), max(cy, 120 - cy)) / f
+    (ideal,) = [root.real for root in np.roots([0.1, 0.0, 1.0, -corner]) if abs(root.imag) < 1e-9]
+    shift = largest_shift(replace(LENS, distortion=(0.1, 0.0, 0.0, 0.0)))
+    assert shift == pytest.approx(f * (corner - ideal), rel=0.02)
+
+
+LENS = Camera((140.0, 140.0, 80.0, 58.0), 160, 120, (-0.2, 0.03, 0.0, 0.0), known=False)
+
+
+@cache
+def run_of_room() -> Slam:
+    *_, slam = vg.run(vg.simulate("room", 6, size=(160, 120), rate=10.0), ROLES, SETTINGS)
+    return slam
+
+
+def redrawn(pixels: np.ndarray) -> np.ndarray:
+    """Ideal pixels as the lens draws them: by this package's model, not by OpenCV."""
+    lens = vg.RadialTangential(jnp.asarray([*LENS.intrinsics, *LENS.distortion]))
+    rays = jnp.asarray(pinhole.rays(pixels.reshape(-1, 2), LENS.intrinsics))
+    return np.asarray(jax.vmap(lens.project)(rays)).reshape(pixels.shape)
+
+
+def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
+    # Proves that key points, matches, segments and samples are where the ideal camera has them, pictures and depth are
+    # resampled alike, and poses and depths stay. Oracle: each goes back through the lens to where it was.
+    before = run_of_room()
+    assert can_undistort(before)
+    after = undistorted(before, LENS)
+    assert after.lens is LENS
+    np.testing.assert_array_equal(after.intrinsics, LENS.intrinsics)
+    for old, new in zip(before.keyframes, after.keyframes, strict=True):
+        for name in ("points", "samples"):
+            moved, place = getattr(new, name), getattr(old, name)
+            np.testing.assert_allclose(redrawn(moved.pixels), place.pixels, atol=1e-3)
+            np.testing.assert_array_equal(moved.inverse_depth, place.inverse_depth)
+        np.testing.assert_allclose(redrawn(new.features.pixels), old.features.pixels, atol=1e-3)
+        ends = new.lines.segments.endpoints
+        np.testing.assert_allclose(redrawn(ends), old.lines.segments.endpoints, atol=1e-3)
+        np.testing.assert_array_equal(new.pose, old.pose)
+        grid = np.stack(np.meshgrid(np.arange(60, 100), np.arange(40, 80)), -1).reshape(-1, 2)
+        columns, rows = np.rint(redrawn(grid.astype(float))).astype(int).T
+        np.testing.assert_array_equal(new.depth[grid[:, 1], grid[:, 0]], old.depth[rows, columns])
+        off = new.image[grid[:, 1], grid[:, 0]].astype(int) - old.image[rows, columns]
+        assert np.median(np.abs(off)) <= 8
+    for old_pair, new_pair in zip(before.pairs, after.pairs, strict=True):
+        np.testing.assert_allclose(redrawn(new_pair.points.pixels_i), old_pair.points.pixels_i, atol=1e-3)
+        np.testing.assert_allclose(redrawn(new_pair.points.pixels_j), old_pair.points.pixels_j, atol=1e-3)
+
+
+def test_corners_of_the_verdict_go_through_the_lens() -> None:
+    # Proves that the witness sees the same camera as the map. Oracle: back through the lens.
+    seen = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]], np.float32)
+    nothing = np.zeros(3, np.float32)
+    noted = FrameEvidence(0, 0.0, np.arange(3), seen, nothing, 1.0, 0.5, 30.0)
+    np.testing.assert_allclose(redrawn(noted.through(LENS).pixels), seen, atol=1e-3)
+
+
+def test_descriptors_that_hold_their_image_keep_the_pinhole() -> None:
+    # Proves that a map whose matcher looks at images of its own is left alone. Oracle: the rule.
+    slam = run_of_room()
+    first = slam.keyframes[0]
+    other = replace(first, features=replace(first.features, descriptors=object()))
+    assert not can_undistort(replace(slam, keyframes=(other, *slam.keyframes[1:])))
+
+
+class Bent:
+    """A simulated sequence as a lens draws it, whose camera nobody knows."""
+
+    def __init__(self, source: Any, distortion: tuple[float, ...]) -> None:
+        self.source, self.name, self.has_depth = source, source.name, False
+        self.lens = replace(source.camera, distortion=distortion)
+        self.camera = Camera.guess(self.lens.width, self.lens.height)
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def ground_truth(self) -> Any:
+        return self.source.ground_truth()
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Any:
+        y, x = np.mgrid[: self.lens.height, : self.lens.width].astype(np.float64)
+        u, v = self.lens.undistorted(np.stack([x, y], -1)).astype(np.float32).transpose(2, 0, 1)
+        for frame in self.source.frames(start, end, stride):
+            image = cv2.remap(frame.image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            yield Frame(frame.index, frame.timestamp, image, None, frame.name)
+
+
+@pytest.mark.long
+def test_a_phone_without_calibration_from_end_to_end(tmp_path: Path) -> None:
+    # Proves that images alone, of an unknown lens that bends corners by many pixels, give its focal length to 3 %, a
+    # word on it, a summary that says it, and a map that frames as they were drawn are found in again. Oracle: the lens
+    # that drew them.
+    frames = Bent(vg.simulate("office", 60, size=(320, 240), rate=10.0), (-0.08, -0.02, 0.0, 0.0))
+    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), dense="none")
+    lens = result.summary["lens"]
+    assert lens["fx"] == pytest.approx(frames.lens.intrinsics[0], rel=0.03)
+    assert result.intrinsics[0] == pytest.approx(lens["fx"], rel=0.01)
+    assert any("its lens distorts" in note for note in result.summary["notes"])
+    result.save_map(tmp_path / "office.map")
+    known = vg.load_map(tmp_path / "office.map")
+    assert known.lens is not None
+    fixed = replace(vg.SlamSettings(), keyframes=replace(vg.SlamSettings().keyframes, localise_only=True))
+    *_, again = vg.run(frames, vg.Roles(depth=NoDepth()), fixed, start=20, end=24, known_map=known)
+    places = [np.linalg.inv(again.pose(record))[:3, 3] for record in again.frames if record.tracked]
+    assert len(places) >= 3
+    own = result.trajectory.poses[20:24, :3, 3][-len(places) :]
+    span = np.linalg.norm(np.ptp(result.trajectory.poses[:, :3, 3], axis=0))
+    assert np.linalg.norm(np.array(places) - own, axis=1).max() < 0.02 * span

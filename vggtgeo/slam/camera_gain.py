@@ -1,0 +1,44 @@
+"""Does another camera explain matches better than chance makes it?"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import t as student_t
+
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.residuals import residuals_at
+
+CHANCE = 1e-3
+"""Of taking a camera that is no better."""
+LEAST_HOSTS = 3
+_residuals_jit = eqx.filter_jit(residuals_at)
+
+
+def gain(before: tuple[Problem, State], after: tuple[Problem, State], chosen: np.ndarray) -> tuple[float, float]:
+    """How much the robust energy of a match falls on average, and how much it has to fall to be no chance.
+
+    Student's t over keyframes, whose matches share a pose; at least the error over matches.
+
+    before, after: a map adjusted with either camera, its points the same. chosen: bool [e, p], which matches count.
+    """
+    fall = np.where(chosen, _energies(*before) - _energies(*after), 0.0)
+    problem = before[0]
+    source = np.asarray(problem.edges.source)
+    sums, counts = np.zeros(problem.num_keyframes), np.zeros(problem.num_keyframes)
+    np.add.at(sums, source, fall.sum(1))
+    np.add.at(counts, source, chosen.sum(1))
+    total, hosts = counts.sum(), np.count_nonzero(counts)
+    if hosts < LEAST_HOSTS:
+        return 0.0, float("inf")
+    mean = sums.sum() / total
+    by_keyframe = np.sqrt(hosts / (hosts - 1) * np.sum((sums - mean * counts) ** 2)) / total
+    by_match = np.sqrt(np.sum((fall[chosen] - mean) ** 2)) / total
+    return float(mean), float(student_t.isf(CHANCE, hosts - 1) * max(by_keyframe, by_match))
+
+
+def _energies(problem: Problem, state: State) -> np.ndarray:
+    residual = _residuals_jit(problem, state)["points"]
+    weight = problem.points.weight
+    return np.asarray(problem.points.kernel.rho(weight * jnp.sum(residual**2, -1)) / 2, np.float64)

@@ -1,0 +1,158 @@
+"""The lens of a camera that nobody calibrated: found once in the last adjustment, and taken out of the map.
+
+A guessed camera is a pinhole until the whole map is adjusted. Where its lens distorts, the focal length takes that up,
+and comes out wrong: redkitchen, images alone, ends at 545 px (COLMAP: 522, with k1 -0.007 and k2 -0.043). So the map is
+adjusted once more with the two radial coefficients of the lens free (518 px, -0.010, -0.041). Where that explains the
+matches better by more than chance, and moves pixels by more than `LEAST_WARP`, images, key points and segments of the
+keyframes are resampled to those of the ideal pinhole, and everything after sees only that.
+
+What every tracked frame was placed by hangs on keyframes, and moves with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.geometry.camera import Camera, Undistorter
+from vggtgeo.geometry.cameras import SquareRadialTangential
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
+from vggtgeo.models.roles import PointMatches
+from vggtgeo.slam.camera_gain import gain
+from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe_images import KeyframeImages
+from vggtgeo.slam.state import Slam
+
+RADIAL = 0.3
+"""Standard deviation of k1 and k2 before anything is seen: lenses of phones and action cameras are within."""
+LEAST_WARP = 1.0
+"""Pixels, the most that the lens moves any pixel: below, images would lose more by being resampled."""
+
+Solve = Callable[[Problem, State], State]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundLens:
+    """A lens as the whole map sees it.
+
+    camera: with its distortion. state: the map that was adjusted with it; its camera is the ideal pinhole. gain: how
+    much the mean robust energy of a match falls by it, and needed: how much it has to fall to be no chance. warp: the
+    most that it moves a pixel, pixels; infinite where it folds the image, as no lens does.
+    """
+
+    camera: Camera
+    state: State
+    gain: float
+    needed: float
+    warp: float
+
+    @property
+    def pays(self) -> bool:
+        """Whether it is there, and worth to be taken out."""
+        return self.gain > self.needed and LEAST_WARP < self.warp < float("inf")
+
+
+def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solve) -> FoundLens:
+    """The lens, from a map that was adjusted with square pixels and no distortion.
+
+    problem, state: that adjustment, its camera a `SquarePinhole`. size: height and width of the images. solve: adjusts
+    any problem.
+    """
+    with_lens = _with_lens(problem)
+    none = jnp.zeros(len(SquareRadialTangential.names) - 3)
+    start = eqx.tree_at(lambda s: s.intrinsics, state, jnp.concatenate([state.intrinsics, none]))
+    found = solve(with_lens, start)
+    f, cx, cy, *distortion = (float(value) for value in found.intrinsics)
+    height, width = size
+    camera = Camera((f, f, cx, cy), width, height, tuple(distortion), known=False)
+    # Both cameras have seen all matches: two numbers for thousands of them are no reason to set some aside.
+    better, needed = gain((problem, state), (with_lens, found), np.asarray(problem.points.present()))
+    ideal = eqx.tree_at(lambda s: s.intrinsics, found, found.intrinsics[:3])
+    return FoundLens(camera, ideal, better, needed, largest_shift(camera))
+
+
+def _with_lens(problem: Problem) -> Problem:
+    """The same problem with a camera whose radial distortion is free."""
+    prior = problem.intrinsics_prior
+    names = SquareRadialTangential.names
+    wider = IntrinsicsPrior(
+        index=jnp.arange(len(names)),
+        mean=jnp.concatenate([prior.mean, jnp.zeros(len(names) - 3)]),
+        weight=jnp.concatenate([prior.weight, jnp.full(len(names) - 3, 1 / RADIAL**2)]),
+    )
+    held = jnp.asarray([name in ("p1", "p2") for name in names])
+    return replace(problem.with_term(wider), camera=SquareRadialTangential, fixed_intrinsics=held)
+
+
+def largest_shift(camera: Camera) -> float:
+    """The most that the lens moves a pixel of its images, pixels; infinite where it folds the image."""
+    fx, _, cx, cy = camera.intrinsics
+    k1, k2, *_ = camera.distortion
+    across = np.hypot(max(cx, camera.width - cx), max(cy, camera.height - cy)) / fx
+    # Ideal radii up to a corner's, and half as far again: a barrel's corner is farther out than it looks.
+    radius = np.linspace(0.0, 1.5 * across, 300)
+    drawn = radius * (1 + k1 * radius**2 + k2 * radius**4)
+    inside = np.maximum.accumulate(drawn) <= across
+    if np.any(np.diff(drawn[inside]) <= 0) or inside.all():
+        return float("inf")
+    return float(fx * np.abs(drawn - radius)[inside].max())
+
+
+def can_undistort(slam: Slam) -> bool:
+    """Whether descriptors stay true when pixels move; those that hold their image in a form of their own do not."""
+    return all(
+        isinstance(keyframe.features.descriptors, PixelDescriptors | np.ndarray | None) for keyframe in slam.keyframes
+    )
+
+
+def undistorted(slam: Slam, lens: Camera) -> Slam:
+    """The map as the ideal pinhole of `lens` sees it; its poses and depths stay."""
+    undistorter = lens.undistorter()
+    keyframes = tuple(_keyframe(keyframe, lens, undistorter) for keyframe in slam.keyframes)
+    pairs = tuple(_pair(pair, lens) for pair in slam.pairs)
+    intrinsics = np.array(lens.intrinsics, np.float64)
+    return replace(slam, keyframes=keyframes, pairs=pairs, intrinsics=intrinsics, solved=None, prior=None, lens=lens)
+
+
+def _keyframe(keyframe: Keyframe, lens: Camera, undistorter: Undistorter) -> Keyframe:
+    features, segments = keyframe.features, keyframe.lines.segments
+    descriptors = features.descriptors
+    if isinstance(descriptors, PixelDescriptors):
+        grey = cv2.cvtColor(undistorter.image(cv2.cvtColor(descriptors.gray, cv2.COLOR_GRAY2RGB)), cv2.COLOR_RGB2GRAY)
+        descriptors = replace(descriptors, gray=grey)
+    moved = replace(
+        keyframe,
+        images=_images(keyframe, undistorter),
+        features=replace(features, pixels=_like(features.pixels, lens), descriptors=descriptors),
+        lines=replace(keyframe.lines, segments=replace(segments, endpoints=_like(segments.endpoints, lens))),
+        points=replace(keyframe.points, pixels=_like(keyframe.points.pixels, lens)),
+        samples=replace(keyframe.samples, pixels=_like(keyframe.samples.pixels, lens)),
+    )
+    return moved.compressed() if keyframe.images.small else moved
+
+
+def _images(keyframe: Keyframe, undistorter: Undistorter) -> KeyframeImages:
+    nearest = lambda image: undistorter.depth(image.astype(np.float32))
+    trust = np.nan_to_num(nearest(keyframe.depth_confidence)).astype(np.uint8)
+    depth, sigma = (nearest(image).astype(np.float16) for image in (keyframe.depth, keyframe.depth_sigma))
+    return KeyframeImages(undistorter.image(keyframe.image), depth, sigma, trust)
+
+
+def _pair(pair: Pair, lens: Camera) -> Pair:
+    points = pair.points
+    moved: PointMatches = replace(points, pixels_i=_like(points.pixels_i, lens), pixels_j=_like(points.pixels_j, lens))
+    return replace(pair, points=moved)
+
+
+def _like(pixels: Float[np.ndarray, "*m 2"], lens: Camera) -> Float[np.ndarray, "*m 2"]:
+    """The undistorted pixels, of the type that they had."""
+    return lens.undistorted(pixels).astype(pixels.dtype)
