@@ -97,7 +97,7 @@ def try_camera(pairs: list[CameraPair], problem: Problem, state: State, solve: S
         return Refinement(given, given, distortion)
     aside = _set_aside(problem)
     weight = jnp.asarray(np.where(aside, 0.0, problem.points.weight))
-    training = _without_surfaces(problem.with_term(problem.points.reweighted(weight)))
+    training = without_surfaces(problem.with_term(problem.points.reweighted(weight)))
     held = solve(training, state)
     start = eqx.tree_at(lambda s: s.intrinsics, held, jnp.asarray(wanted))
     moved = solve(camera_held_at(training, wanted), start)
@@ -155,6 +155,7 @@ def _set_aside(problem: Problem) -> np.ndarray:
     return np.asarray(chosen & (left[source] >= LEAST_SEEN))
 
 
-def _without_surfaces(problem: Problem) -> Problem:
+def without_surfaces(problem: Problem) -> Problem:
+    """The problem in which aligned surfaces say nothing."""
     surfaces = [term for term in problem.terms if term.name == "surfaces"]
     return problem.with_term(surfaces[0].reweighted(jnp.zeros_like(surfaces[0].weight))) if surfaces else problem

@@ -11,7 +11,7 @@ from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
 from vggtgeo.slam.adjustment import Adjustment, CameraPrior, build, write_back
-from vggtgeo.slam.calibration import Refinement, keyframe_pairs, try_camera
+from vggtgeo.slam.calibration import Refinement, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.covisibility import Directed, directions
 from vggtgeo.slam.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.factors import Factor, MeasuredRelativePose, factor_terms
@@ -41,7 +41,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     surfaces, solved = _surfaces(slam), None
     camera = CameraPrior(slam.given_intrinsics, slam.intrinsics_sigma, camera_of(slam))
     for number in range(settings.refinement.global_rounds):
-        factors = _of_any_camera(slam) if number == 0 and not slam.calibrated else slam.factors
+        estimated = number == 0 and not slam.calibrated
         adjustment = build(
             slam.keyframes,
             edges,
@@ -50,8 +50,10 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             size=shape.size,
             camera=camera,
             fixed_pose=fixed,
-            terms=_terms(slam, factors, surfaces, shape, settings),
+            terms=_terms(slam, _of_any_camera(slam) if estimated else slam.factors, surfaces, shape, settings),
         )
+        if estimated:  # surfaces were measured with the camera of that moment, too
+            adjustment = replace(adjustment, problem=without_surfaces(adjustment.problem))
         problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(slam.keyframes), slam.metric)
         adjustment = replace(adjustment, problem=problem)
         told = gauge_notes(gauge, adjustment.keyframes, "global adjustment") if number == 0 else ()
@@ -66,12 +68,12 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         before = slam
         if settings.camera.refine_intrinsics != "never":
             slam = _with_its_camera(slam, adjustment, solution.state, edges, settings)
-        if slam.intrinsics is not before.intrinsics:
+        if estimated or slam.intrinsics is not before.intrinsics:
             edges, surfaces = _edges(slam, settings), _surfaces(slam)
             camera = replace(camera, mean=slam.intrinsics)
-        if not slam.calibrated:  # estimated, and held from here on: see `_of_any_camera`
+        if estimated:  # and held from here on: see `_of_any_camera`
             held = settings.camera.known_intrinsics_sigma * slam.intrinsics[0]
-            camera = replace(camera, mean=slam.intrinsics, sigma=np.full(4, held))
+            camera = replace(camera, sigma=np.full(4, held))
     sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
     return replace(slam, pose_sigma=sigma)
 
