@@ -22,7 +22,9 @@ from vggtgeo.datasets import Frame
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import SquarePinhole
+from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import FrameEvidence
 
@@ -102,7 +104,7 @@ LENS = Camera((140.0, 140.0, 80.0, 58.0), 160, 120, (-0.2, 0.03, 0.0, 0.0), know
 @cache
 def run_of_room() -> Slam:
     *_, slam = vg.run(vg.simulate("room", 6, size=(160, 120), rate=10.0), ROLES, SETTINGS)
-    return slam
+    return settled(slam)
 
 
 def redrawn(pixels: np.ndarray) -> np.ndarray:
@@ -153,6 +155,17 @@ def test_descriptors_that_hold_their_image_keep_the_pinhole() -> None:
     first = slam.keyframes[0]
     other = replace(first, features=replace(first.features, descriptors=object()))
     assert not can_undistort(replace(slam, keyframes=(other, *slam.keyframes[1:])))
+
+
+def test_a_camera_that_was_found_goes_with_its_map() -> None:
+    # Proves that a map of a guessed camera takes the calibration that its run found, and refuses another, such as what
+    # the run began with. Oracle: the rule.
+    guess = np.array([160.0, 160.0, 79.5, 59.5])
+    known = as_map(undistorted(run_of_room(), LENS))
+    known = replace(known, given_intrinsics=guess, intrinsics_sigma=np.full(4, 48.0))
+    entered(known, replace(LENS, known=True))
+    with pytest.raises(vg.InputError, match=r"is of a camera with fx, fy, cx, cy = 140\.0, 140\.0, 80\.0, 58\.0 px"):
+        entered(known, Camera((160.0, 160.0, 79.5, 59.5), 160, 120))
 
 
 class Bent:

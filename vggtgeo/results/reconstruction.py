@@ -133,7 +133,9 @@ def reconstruct(
             known_map=None if first is None else digest_of_map(first),
         )
         before = resumed(source.resumable(checkpoints), wanted)
-        windows, evidence = WindowRecorder(), EvidenceRecorder(source.camera)
+        # The verdict takes the lens of a known map out of these corners, as it does with one that this run finds.
+        seen_by = source.camera if first is None or first.lens is None else source.camera.pinhole
+        windows, evidence = WindowRecorder(), EvidenceRecorder(seen_by)
         hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)

@@ -104,8 +104,9 @@ def entered(known: Slam, camera: Camera) -> Slam:
             f"{camera.height}: a map is used with the camera that it was made with"
         )
     given = np.array(camera.intrinsics, np.float64)
-    if camera.known and np.abs(given - known.given_intrinsics).max() > SAME_CAMERA * known.given_intrinsics[0]:
-        cameras = [", ".join(f"{value:.1f}" for value in values) for values in (known.given_intrinsics, given)]
+    own = known.given_intrinsics if known.calibrated else known.intrinsics
+    if camera.known and np.abs(given - own).max() > SAME_CAMERA * own[0]:
+        cameras = [", ".join(f"{value:.1f}" for value in values) for values in (own, given)]
         raise InputError(
             f"`known_map` is of a camera with fx, fy, cx, cy = {cameras[0]} px; that of this run has {cameras[1]} px: "
             "a map is used with the camera that it was made with"
