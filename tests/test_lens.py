@@ -20,12 +20,14 @@ from vggtgeo.models.classical import NoDepth
 import vggtgeo as vg
 from vggtgeo.datasets import Frame
 from vggtgeo.datasets.views import SequenceView
+from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import SquarePinhole
 from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust import judge as judging
 from vggtgeo.slam.trust.evidence import FrameEvidence
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
@@ -58,7 +60,9 @@ def found_in(window: vg.SimulatedWindow, focal: float) -> FoundLens:
     problem = packed[0]
     size = (round(2 * cy + 1), round(2 * cx + 1))
     solve = lambda problem, state: _solve(problem, state).state
-    return find_lens(problem, solve(problem, packed[1]), size, solve)
+    found = find_lens(problem, solve(problem, packed[1]), size, solve)
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -84,6 +88,17 @@ def test_no_lens_is_found_where_there_is_none() -> None:
     # Proves that noise alone is no lens, in six windows. Oracle: the pinhole that they were drawn with.
     found = [found_in(vg.simulate_window(seed=seed, **WINDOW), 1.1) for seed in range(6)]
     assert not any(each.pays for each in found), [(each.gain, each.needed, each.camera) for each in found]
+
+
+def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
+    # Proves that a focal length below zero, or NaN, as a solver may end with, does not end the run. Oracle: the rule.
+    window = vg.simulate_window(3, 12, 0)
+    _, _, cx, cy = window.intrinsics
+    guess = window.observations, window.start, np.array([window.intrinsics[0], cx, cy])
+    problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, camera=SquarePinhole)
+    for focal in (-1.0, float("nan")):
+        ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[0].set(f))
+        assert find_lens(problem, state, (480, 640), ends_at) is None
 
 
 def test_a_lens_that_folds_the_image_is_none() -> None:
@@ -141,12 +156,17 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_j), old_pair.points.pixels_j, atol=1e-3)
 
 
-def test_corners_of_the_verdict_go_through_the_lens() -> None:
-    # Proves that the witness sees the same camera as the map. Oracle: back through the lens.
+def test_corners_of_the_verdict_go_through_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that the witness sees the same camera as the map. Oracle: what it is given, back through the lens.
+    slam = undistorted(run_of_room(), LENS)
     seen = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]], np.float32)
     nothing = np.zeros(3, np.float32)
-    noted = FrameEvidence(0, 0.0, np.arange(3), seen, nothing, 1.0, 0.5, 30.0)
-    np.testing.assert_allclose(redrawn(noted.through(LENS).pixels), seen, atol=1e-3)
+    noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing, 1.0, 0.5, 30.0) for r in slam.frames]
+    given: list[FrameEvidence] = []
+    monkeypatch.setattr(judging, "_images", lambda estimate, evidence, size: given.extend(evidence) or [])
+    judging.judge(slam, noted)
+    assert len(given) == len(slam.frames) > 1
+    np.testing.assert_allclose(redrawn(given[0].pixels), seen, atol=1e-3)
 
 
 def test_descriptors_that_hold_their_image_keep_the_pinhole() -> None:
@@ -201,6 +221,7 @@ def test_a_phone_without_calibration_from_end_to_end(tmp_path: Path) -> None:
     assert lens["fx"] == pytest.approx(frames.lens.intrinsics[0], rel=0.03)
     assert result.intrinsics[0] == pytest.approx(lens["fx"], rel=0.01)
     assert any("its lens distorts" in note for note in result.summary["notes"])
+    assert evaluate_trajectory(result.trajectory, frames.ground_truth()).sim3.statistics.rmse < 0.02
     result.save_map(tmp_path / "office.map")
     known = vg.load_map(tmp_path / "office.map")
     assert known.lens is not None

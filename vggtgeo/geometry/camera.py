@@ -134,8 +134,8 @@ class Undistorter:
         nearest = np.clip(np.rint(np.stack([x, y], axis=-1)), limits.min, limits.max).astype(np.int16)
         return cls(camera.pinhole, None if inside.all() else inside, (maps[0], maps[1]), nearest)
 
-    def image(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """The undistorted image, bilinear."""
+    def image(self, image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w *c"]:
+        """The undistorted image, RGB or grey, bilinear."""
         if self.maps is None:
             return image
         self._check_size(image)

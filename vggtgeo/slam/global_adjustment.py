@@ -128,9 +128,9 @@ def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, 
     return replace(slam, notes=tuple(notes))
 
 
-def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens) -> Slam:
+def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
     """The state of the run with its lens taken out, if that pays, and a word on it."""
-    if not found.pays:
+    if found is None or not found.pays:
         return slam
     adjusted = undistorted(_taken(slam, adjustment, found.state), found.camera)
     k1, k2, *_ = found.camera.distortion

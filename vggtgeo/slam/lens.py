@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import cv2
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -61,8 +60,9 @@ class FoundLens:
         return self.gain > self.needed and LEAST_WARP < self.warp < float("inf")
 
 
-def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solve) -> FoundLens:
-    """The lens, from a map that was adjusted with square pixels and no distortion.
+def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solve) -> FoundLens | None:
+    """The lens, from a map that was adjusted with square pixels and no distortion; None where what comes out is no
+    camera.
 
     problem, state: that adjustment, its camera a `SquarePinhole`. size: height and width of the images. solve: adjusts
     any problem.
@@ -72,6 +72,8 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
     start = eqx.tree_at(lambda s: s.intrinsics, state, jnp.concatenate([state.intrinsics, none]))
     found = solve(with_lens, start)
     f, cx, cy, *distortion = (float(value) for value in found.intrinsics)
+    if not (f > 0 and np.isfinite([f, cx, cy, *distortion]).all()):
+        return None
     height, width = size
     camera = Camera((f, f, cx, cy), width, height, tuple(distortion), known=False)
     # Both cameras have seen all matches: two numbers for thousands of them are no reason to set some aside.
@@ -127,8 +129,7 @@ def _keyframe(keyframe: Keyframe, lens: Camera, undistorter: Undistorter) -> Key
     features, segments = keyframe.features, keyframe.lines.segments
     descriptors = features.descriptors
     if isinstance(descriptors, PixelDescriptors):
-        grey = cv2.cvtColor(undistorter.image(cv2.cvtColor(descriptors.gray, cv2.COLOR_GRAY2RGB)), cv2.COLOR_RGB2GRAY)
-        descriptors = replace(descriptors, gray=grey)
+        descriptors = replace(descriptors, gray=undistorter.image(descriptors.gray))
     moved = replace(
         keyframe,
         images=_images(keyframe, undistorter),
