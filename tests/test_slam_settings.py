@@ -49,6 +49,8 @@ WRONG = {
     "weights.confidence_floor": (float("nan"),),
     "camera.known_intrinsics_sigma": (0.0,),
     "camera.guessed_intrinsics_sigma": (-0.3,),
+    "camera.guessed_centre_sigma": (0.0, -0.02),
+    "camera.first_pass": (-1, 1.5),
     "camera.refine_intrinsics": ("sometimes", True),
     "window.size": (2, 10.0),
     "window.point_slots": (0,),

@@ -39,6 +39,7 @@ from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
+from vggtgeo.slam.first_pass import begin_with_found_camera
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
@@ -139,6 +140,8 @@ def reconstruct(
         hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
+        if first is None and before is None:
+            first = _first_pass(source, selection, perception, settings, hooks, stop)
         loop = _Loop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
         with loop.keeping(checkpoints, wanted) as keeper:
             tracked = loop.track(keeper)
@@ -286,6 +289,34 @@ def _first_state(known: Slam | None, source: _Source, settings: SlamSettings) ->
     if settings.keyframes.localise_only:
         raise InputError("`keyframes.localise_only` needs a map to place frames in: give `known_map` (`--map FILE`)")
     return None
+
+
+def _first_pass(
+    source: _Source,
+    selection: tuple[int, int | None, int],
+    perception: Perception,
+    settings: SlamSettings,
+    hooks: _Callbacks,
+    stop: Interruption,
+) -> Slam | None:
+    """The state before the first frame, where nobody gave the camera and a first pass over the frames finds it. What it
+    warns of and refuses is told when the run itself comes to it.
+    """
+    start, _, stride = selection
+    count = source.count(*selection)
+    most = settings.camera.first_pass
+    if source.camera.known or not count or not most or not settings.refinement.global_adjustment:
+        return None
+    end = start + min(count, most) * stride
+    hooks.each("on_stage", f"finding the camera in the first {min(count, most)} frames")
+    refused = {role: replace(counts) for role, counts in perception.refusals.items()}
+    with hooks.clock.measure("first pass"), stop.at_once(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        frames = source.frames.frames(start, end, stride)
+        found = begin_with_found_camera(frames, source.camera, perception.roles, settings)
+    for role, counts in refused.items():
+        vars(perception.refusals[role]).update(vars(counts))
+    return found
 
 
 def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:

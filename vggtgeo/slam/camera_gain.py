@@ -16,12 +16,15 @@ LEAST_HOSTS = 3
 _residuals_jit = eqx.filter_jit(residuals_at)
 
 
-def gain(before: tuple[Problem, State], after: tuple[Problem, State], chosen: np.ndarray) -> tuple[float, float]:
+def gain(
+    before: tuple[Problem, State], after: tuple[Problem, State], chosen: np.ndarray, fitted: int = 0
+) -> tuple[float, float]:
     """How much the robust energy of a match falls on average, and how much it has to fall to be no chance.
 
     Student's t over keyframes, whose matches share a pose; at least the error over matches.
 
     before, after: a map adjusted with either camera, its points the same. chosen: bool [e, p], which matches count.
+    fitted: parameters of the camera that were fitted to these very matches; each takes the freedom of a keyframe.
     """
     fall = np.where(chosen, _energies(*before) - _energies(*after), 0.0)
     problem = before[0]
@@ -30,12 +33,13 @@ def gain(before: tuple[Problem, State], after: tuple[Problem, State], chosen: np
     np.add.at(sums, source, fall.sum(1))
     np.add.at(counts, source, chosen.sum(1))
     total, hosts = counts.sum(), np.count_nonzero(counts)
-    if hosts < LEAST_HOSTS:
+    free = hosts - max(fitted, 1)
+    if hosts < LEAST_HOSTS or free < 1:
         return 0.0, float("inf")
     mean = sums.sum() / total
-    by_keyframe = np.sqrt(hosts / (hosts - 1) * np.sum((sums - mean * counts) ** 2)) / total
+    by_keyframe = np.sqrt(hosts / free * np.sum((sums - mean * counts) ** 2)) / total
     by_match = np.sqrt(np.sum((fall[chosen] - mean) ** 2)) / total
-    return float(mean), float(student_t.isf(CHANCE, hosts - 1) * max(by_keyframe, by_match))
+    return float(mean), float(student_t.isf(CHANCE, free) * max(by_keyframe, by_match))
 
 
 def _energies(problem: Problem, state: State) -> np.ndarray:

@@ -126,6 +126,11 @@ class Evidence:
         return self.dense_fair and (self.correlation >= STRONG_CORRELATION or surfaces)
 
     @property
+    def placed_by_surface(self) -> bool:
+        """Whether picture and surfaces alone place the frame: beyond doubt, and in all directions."""
+        return self.dense_strong and self.sigma_translation < BARE_SIGMA
+
+    @property
     def bare_surface(self) -> bool:
         """Whether, in a picture without edges, the surfaces alone determine the pose."""
         seen = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP

@@ -77,7 +77,8 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
     height, width = size
     camera = Camera((f, f, cx, cy), width, height, tuple(distortion), known=False)
     # Both cameras have seen all matches: two numbers for thousands of them are no reason to set some aside.
-    better, needed = gain((problem, state), (with_lens, found), np.asarray(problem.points.present()))
+    present = np.asarray(problem.points.present())
+    better, needed = gain((problem, state), (with_lens, found), present, fitted=len(SquareRadialTangential.names) - 2)
     ideal = eqx.tree_at(lambda s: s.intrinsics, found, found.intrinsics[:3])
     return FoundLens(camera, ideal, better, needed, largest_shift(camera))
 

@@ -46,8 +46,12 @@ NEIGHBOURS = 3
 def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
     """The state before the first frame."""
     intrinsics = np.array(camera.intrinsics, np.float64)
-    relative = settings.camera.known_intrinsics_sigma if camera.known else settings.camera.guessed_intrinsics_sigma
-    sigma = np.full(4, relative * intrinsics[0])
+    if camera.known:
+        sigma = np.full(4, settings.camera.known_intrinsics_sigma * intrinsics[0])
+    else:
+        focal = settings.camera.guessed_intrinsics_sigma * intrinsics[0]
+        centre = settings.camera.guessed_centre_sigma * np.array([camera.width, camera.height])
+        sigma = np.array([focal, focal, *centre])
     return Slam(intrinsics, intrinsics, sigma, roles.metric)
 
 

@@ -166,7 +166,14 @@ class CameraSettings(CheckedSettings):
     """Of known intrinsics: so small that they are held. With 1 % they took up every error of the poses, 495.6 became
     424 on building-walk; with 0.01 % still 493."""
     guessed_intrinsics_sigma: float = positive(0.3)
-    """Of guessed ones."""
+    """Of the focal length of guessed ones."""
+    guessed_centre_sigma: float = positive(0.02)
+    """Of their principal point, in image widths and heights: published calibrations of TUM RGB-D, EuRoC, KITTI and
+    ICL-NUIM are 0.014 off the middle (root mean square). Left as free as the focal length, it took up errors of the
+    poses: 110 px in 40 frames of redkitchen."""
+    first_pass: int = whole(150, at_least=0)
+    """Frames of a first pass that finds a camera which nobody gave; the run begins with what it found. Where frames
+    come once (a live camera, a stream), or with 0, there is none, and a guess is estimated while the run goes on."""
     refine_intrinsics: str = one_of("auto", "always", "never")
     """Whether the last adjustment may move known intrinsics: "auto", where the images ask for it and it pays (see
     `slam/calibration.py`); "always", where the images ask for it; "never". Guessed ones are always estimated, and

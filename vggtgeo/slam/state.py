@@ -86,7 +86,8 @@ class Slam:
     pose_sigma: of each keyframe after the last adjustment, see `pose_uncertainty.keyframe_sigma`. pending: the
     adjustment of the newest keyframe's window, while it goes on. lens: the distorting camera of the images as they were
     read, where the last adjustment found one: pixels and images of all keyframes, and `intrinsics`, are of images that
-    it no longer distorts (`lens.py`).
+    it no longer distorts (`lens.py`). camera_found: `intrinsics` and `lens` come from a first pass over the frames
+    (`first_pass.py`): windows hold them, and the last adjustment estimates the camera once more.
     """
 
     intrinsics: np.ndarray
@@ -113,6 +114,7 @@ class Slam:
     pose_sigma: np.ndarray | None = None
     pending: PendingWindow | None = None
     lens: Camera | None = None
+    camera_found: bool = False
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)

@@ -54,7 +54,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 3
+VERSION = 4
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -69,7 +69,13 @@ def _with_lens(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
-UPGRADES = {1: _with_recorded_times, 2: _with_lens}
+def _with_first_pass(header: Header) -> Header:
+    """Version 3 did not know first passes."""
+    tree, classes = with_field(header["tree"], header["classes"], "Slam", "camera_found", False)
+    return {**header, "tree": tree, "classes": classes}
+
+
+UPGRADES = {1: _with_recorded_times, 2: _with_lens, 3: _with_first_pass}
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)
 

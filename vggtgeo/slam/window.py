@@ -182,12 +182,19 @@ def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) 
         slam.intrinsics,
         settings,
         size=window_size(settings),
-        camera=CameraPrior(slam.given_intrinsics, slam.intrinsics_sigma),
+        camera=CameraPrior(slam.given_intrinsics, _camera_sigma(slam, settings)),
         fixed_pose=_held(numbers, slam),
         terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric))),
     )
     problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(members), slam.metric)
     return replace(adjustment, problem=problem), gauge
+
+
+def _camera_sigma(slam: Slam, settings: SlamSettings) -> np.ndarray:
+    """Of the camera's prior in a window, float64 [4], pixels: what a first pass found is held, as a given one is."""
+    if not slam.camera_found:
+        return slam.intrinsics_sigma
+    return np.full(4, settings.camera.known_intrinsics_sigma * slam.given_intrinsics[0])
 
 
 def _held(numbers: tuple[int, ...], slam: Slam) -> np.ndarray:

@@ -2,7 +2,9 @@
 
 A fast turn, blur or a white wall leave fewer than `LEAST_CORNERS` corners between two frames and those beside them. A
 pose that was tracked with many inliers stands all the same. One with fewer than `LEAST_INLIERS` does not: wrong matches
-agree with a pose by chance, and so a wrong pose has been accepted with 12 inliers of 51.
+agree with a pose by chance, and so a wrong pose has been accepted with 12 inliers of 51. No pose is in doubt that
+picture and surfaces give without any match: in building-walk, blurred by 31 px, six frames have none, a correlation of
+0.42 to 0.53 and 99 % of their surfaces in place, and the step to each is right to 9 mm.
 """
 
 from __future__ import annotations
@@ -37,6 +39,8 @@ def check_blind(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> li
     """Unseen steps that, were they wrong, would displace more than a small part of the run."""
     few = np.array([len(step.agrees) < LEAST_CORNERS for step in taken], bool)
     weak = (estimate.inliers[1:] < LEAST_INLIERS) & estimate.tracked[1:] & estimate.tracked[:-1]
+    if estimate.by_surface is not None:
+        weak &= ~estimate.by_surface[1:]
     unseen = few & weak[: len(taken)]
     for row in np.nonzero(unseen)[0]:
         unseen[row] = not _seen_around(evidence, int(row))

@@ -23,7 +23,8 @@ class Estimate:
     frames: int [n]; times: float64 [n], s; poses: float64 [n, 4, 4], world -> camera; tracked: bool [n].
     intrinsics: fx, fy, cx, cy at the end; given: before the run; sigma: of their prior, pixels. metric: lengths are
     metres. inliers: int [n], matches that agreed with the pose; is_keyframe: bool [n]. pieces: how many parts the map
-    has. started: whether there ever was a map.
+    has. started: whether there ever was a map. by_surface: bool [n], frames that picture and surfaces place beyond
+    doubt, without any match; None: no frame.
     """
 
     frames: np.ndarray
@@ -38,6 +39,7 @@ class Estimate:
     is_keyframe: np.ndarray
     pieces: int = 1
     started: bool = True
+    by_surface: np.ndarray | None = None
 
     @classmethod
     def of(cls, slam: Slam) -> Self:
@@ -57,6 +59,7 @@ class Estimate:
             np.isin([record.frame for record in slam.frames], [keyframe.frame for keyframe in slam.keyframes]),
             max(len(pieces_by_size(slam)), 1),
             known,
+            np.array([record.evidence.placed_by_surface for record in slam.frames], bool),
         )
 
     def __len__(self) -> int:
