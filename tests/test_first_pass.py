@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,9 +42,9 @@ def found(**changed: Any) -> Slam:
 
 def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
     """The state that a first pass gives whose last adjustment ends with `end`."""
-    monkeypatch.setattr(first_pass, "run_frames", lambda *_: iter([end]))
-    monkeypatch.setattr(first_pass, "finish", lambda slam, *_: slam)
-    return first_pass.begin_with_found_camera((), GUESS, ROLES, SETTINGS)
+    monkeypatch.setattr(first_pass, "run_frames", lambda *_: iter([replace(end, lens=None)]))
+    monkeypatch.setattr(first_pass, "finish", lambda *_: end)
+    return first_pass.begin_with_found_camera(tuple, GUESS, ROLES, SETTINGS)
 
 
 def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,6 +61,30 @@ def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
     assert plain is not None
     assert plain.lens is None
     assert plain.notes[0].endswith("focal length of 280.0 px")
+
+
+def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a camera far from the one that frames were tracked with is tried on them, at most three times in all,
+    # and that one pass is enough where it is near. Oracle: the cameras that the passes are told to find.
+    tracked: list[float] = []
+
+    def run(_: Any, camera: Camera, __: Any, ___: Any, ____: Clock, before: Slam | None) -> Any:
+        tracked.append(camera.intrinsics[0] if before is None else before.intrinsics[0])
+        return iter([replace(found(), intrinsics=tracked[-1] * np.array([1.0, 1.0, 0.5, 0.4]))])
+
+    def end(slam: Slam, *_: Any) -> Slam:
+        return replace(slam, intrinsics=np.array([answers[len(tracked) - 1]] * 2 + [160.0, 120.0]))
+
+    monkeypatch.setattr(first_pass, "run_frames", run)
+    monkeypatch.setattr(first_pass, "finish", end)
+    guess = GUESS.intrinsics[0]
+    for answers, cameras in (([1.01 * guess], [guess]), ([400.0, 300.0, 280.0], [guess, 400.0, 300.0])):
+        tracked.clear()
+        slam = first_pass.begin_with_found_camera(tuple, GUESS, ROLES, SETTINGS)
+        assert tracked == pytest.approx(cameras)
+        assert slam is not None
+        assert slam.intrinsics[0] == pytest.approx(answers[len(cameras) - 1])
+    assert "3 first passes" in slam.notes[0]
 
 
 def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,8 +119,8 @@ class _Passes:
         self.counts: list[int] = []
         self._camera = camera
 
-    def __call__(self, frames: Iterable[Frame], camera: Camera, roles: Any, settings: Any) -> Slam | None:
-        self.counts.append(len(list(frames)))
+    def __call__(self, frames: Callable[[], Iterable[Frame]], camera: Camera, roles: Any, settings: Any) -> Slam | None:
+        self.counts.append(len(list(frames())))
         if self._camera is None:
             return None
         own = np.array(self._camera.intrinsics)

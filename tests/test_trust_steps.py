@@ -14,6 +14,7 @@ from trust_checks import found_by_steps
 from witness import Walk
 
 from vggtgeo.slam.trust.finding import conclude
+from vggtgeo.slam.trust.steps import breaks, check_steps, steps
 
 
 @pytest.mark.parametrize("metric", [True, False])
@@ -53,3 +54,25 @@ def test_poses_that_mean_nothing_fail(healthy: Walk) -> None:
     other = np.random.default_rng(3).permutation(len(healthy.evidence))
     found = found_by_steps(healthy.with_poses(healthy.estimate.poses[other]), healthy.evidence)
     assert "failed" in {f.level for f in found}
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.5, True), (0.32, False)])
+def test_poses_that_half_of_the_corners_contradict_again_and_again(healthy: Walk, share: float, told: bool) -> None:
+    """Half of the corners go another way for 14 frames: too few to contradict one step, and told of all together; of a
+    third nothing is told. Oracle: the frames that they were moved in.
+    """
+    others = lambda frame: np.random.default_rng(5).random(100_000)[frame.ids] < share
+    aside = lambda row: np.float32(12.0 * np.clip(row - 12, 0, 14))
+    moved = [
+        replace(frame, pixels=frame.pixels + aside(row) * others(frame)[:, None].astype(np.float32))
+        for row, frame in enumerate(healthy.evidence)
+    ]
+    taken = steps(healthy.estimate, moved)
+    assert not any(step.contradicted for step in taken), "each by itself is none"
+    found = check_steps(healthy.estimate, taken, breaks(healthy.estimate, moved, taken))
+    assert bool(found) == told
+    if told:
+        assert {finding.level for finding in found} == {"degraded"}
+        assert 10 <= min(finding.start or 0 for finding in found) <= 14
+        assert 24 <= max(finding.end or 0 for finding in found) <= 28
+        assert not any(finding.local for finding in found)

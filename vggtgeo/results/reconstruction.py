@@ -312,7 +312,7 @@ def _first_pass(
     refused = {role: replace(counts) for role, counts in perception.refusals.items()}
     with hooks.clock.measure("first pass"), stop.at_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        frames = source.frames.frames(start, end, stride)
+        frames = lambda: source.frames.frames(start, end, stride)
         found = begin_with_found_camera(frames, source.camera, perception.roles, settings)
     for role, counts in refused.items():
         vars(perception.refusals[role]).update(vars(counts))

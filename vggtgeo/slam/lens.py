@@ -97,17 +97,21 @@ def _with_lens(problem: Problem) -> Problem:
 
 
 def largest_shift(camera: Camera) -> float:
-    """The most that the lens moves a pixel of its images, pixels; infinite where it folds the image."""
+    """The most that the lens moves a pixel of its images, pixels; infinite where it folds them before the middle of
+    their farthest side. A fold in the corners costs no more than those: k1 = -0.25 does that to redkitchen.
+    """
     fx, _, cx, cy = camera.intrinsics
     k1, k2, *_ = camera.distortion
-    across = np.hypot(max(cx, camera.width - cx), max(cy, camera.height - cy)) / fx
+    sides = max(cx, camera.width - cx), max(cy, camera.height - cy)
+    side, corner = max(sides) / fx, np.hypot(*sides) / fx
     # Ideal radii up to a corner's, and half as far again: a barrel's corner is farther out than it looks.
-    radius = np.linspace(0.0, 1.5 * across, 300)
+    radius = np.linspace(0.0, 1.5 * corner, 300)
     drawn = radius * (1 + k1 * radius**2 + k2 * radius**4)
-    inside = np.maximum.accumulate(drawn) <= across
-    if np.any(np.diff(drawn[inside]) <= 0) or inside.all():
+    folds = np.append(np.diff(drawn) <= 0, True)
+    before = np.arange(len(radius)) <= np.argmax(folds)
+    if drawn[before].max() < side:
         return float("inf")
-    return float(fx * np.abs(drawn - radius)[inside].max())
+    return float(fx * np.abs(drawn - radius)[before & (drawn <= corner)].max())
 
 
 def can_undistort(slam: Slam) -> bool:
