@@ -85,6 +85,21 @@ def test_a_focal_length_that_few_pairs_fit_better_is_no_want(healthy: Walk) -> N
     assert right.better < 2 / 3
 
 
+def test_frames_that_are_played_twice_say_no_more_of_the_camera(healthy: Walk) -> None:
+    """A walk that goes on where it ends says more of its camera than the first half; the same half twice does not.
+    Oracle: the number of blocks of time that are independent.
+    """
+    once, whole = (camera_opinion(here.estimate, here.evidence) for here in (healthy, walk(80)))
+    one, later = healthy.estimate, [replace(frame, ids=frame.ids + 10_000) for frame in healthy.evidence]
+    repeated = {name: np.concatenate([getattr(one, name)] * 2) for name in ("poses", "tracked", "inliers", "frames")}
+    twice = camera_opinion(replace(one, **repeated), [*healthy.evidence, *later])
+    assert once is not None
+    assert whole is not None
+    assert twice is not None
+    assert twice.blocks == once.blocks
+    assert whole.blocks > 1.5 * once.blocks
+
+
 @pytest.mark.parametrize(
     ("width", "height", "centre"),
     [

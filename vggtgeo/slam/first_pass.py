@@ -40,7 +40,7 @@ def begin_with_found_camera(
 ) -> Slam | None:
     """The state before the first frame, with the camera that some frames tell; None where they do not tell it.
 
-    Where the camera that is found is far from the one that the frames were tracked with, they are tracked with it.
+    Where the camera that is found is far from the one that the frames were tracked with, it is tried on them again.
 
     frames: gives them, from the first on, each time it is called. camera: the guess to begin with.
     """

@@ -123,7 +123,7 @@ def _pairs(estimate: Estimate, evidence: Evidence) -> list[CameraPair]:
     spread = np.unique(np.linspace(0, max(len(evidence) - GAP - 1, 0), MOST_PAIRS).astype(int))
     starts = [int(row) for row in spread if row + GAP < len(evidence)]
     pairs = [(row, row + GAP) for row in starts] + [(row + GAP, row) for row in starts]
-    blocks = _blocks(estimate, evidence)
+    blocks = _blocks(estimate, evidence, starts)
     found = []
     for row, other in pairs:
         if not (estimate.tracked[row] and estimate.tracked[other]):
@@ -142,22 +142,22 @@ def _pairs(estimate: Estimate, evidence: Evidence) -> list[CameraPair]:
     return found
 
 
-def _blocks(estimate: Estimate, evidence: Evidence) -> np.ndarray:
-    """The block of time of each frame, int [n]; a block that shows again what an earlier one did belongs to that.
+def _blocks(estimate: Estimate, evidence: Evidence, rows: list[int]) -> np.ndarray:
+    """The block of time of each frame, int [n], where it is one of `rows`; a block that shows again what an earlier one
+    did belongs to that.
 
     The errors of depth in two pictures of one view are the same: redkitchen's frames played twice "wanted" the
     principal point 60 px away, twice as surely as once.
     """
-    count, depth = len(evidence), np.array([noted.depth_median for noted in evidence])
-    blocks = np.arange(count) // BLOCK
-    for start in range(BLOCK, count, BLOCK):
-        middle = min(start + BLOCK // 2, count - 1)
-        before = estimate.poses[:start] @ rigid.invert(estimate.poses[middle])
-        moved = np.linalg.norm(before[:, :3, 3], axis=1) / depth[middle]
-        turned = np.arccos(np.clip((np.trace(before[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
-        apart = estimate.intrinsics[0] * (moved + turned)
-        # A block beside this one is its neighbour in time, however slow the camera.
-        apart[max(start - BLOCK, 0) :] = np.inf
-        if len(apart) and apart.min() < AGAIN:
-            blocks[start : start + BLOCK] = blocks[int(apart.argmin())]
+    blocks = np.arange(len(evidence)) // BLOCK
+    for block in np.unique(blocks[rows])[1:]:
+        start = int(block) * BLOCK
+        middle = min(start + BLOCK // 2, len(evidence) - 1)
+        # The block before this one is its neighbour in time, however slow the camera.
+        motion = estimate.poses[: start - BLOCK] @ rigid.invert(estimate.poses[middle])
+        moved = np.linalg.norm(motion[:, :3, 3], axis=1) / evidence[middle].depth_median
+        turned = np.arccos(np.clip((np.trace(motion[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+        again = estimate.intrinsics[0] * (moved + turned) < AGAIN
+        if again.any():
+            blocks[start : start + BLOCK] = blocks[int(np.argmax(again))]
     return blocks
