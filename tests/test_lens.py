@@ -106,8 +106,8 @@ def test_a_lens_that_folds_the_image_is_none() -> None:
     # and that a lens that keeps their order does not. Oracle: k1 = -1 folds at a radius of 0.58 focal lengths, and the
     # corner's is 0.71; 0.1 moves the farthest corner by what solves the cubic.
     assert largest_shift(replace(LENS, distortion=(-1.0, 0.0, 0.0, 0.0))) == float("inf")
-    # k1 = -0.35 folds between the sides, 0.57 away, and the corners: a picture without its corners. There the derivative
-    # of r - 0.35 r^3 is zero, and the shift 0.35 r^3.
+    # k1 = -0.35 folds between the sides, 0.57 away, and the corners: a picture without its corners. There the
+    # derivative of r - 0.35 r^3 is zero, and the shift 0.35 r^3.
     folded = largest_shift(replace(LENS, distortion=(-0.35, 0.0, 0.0, 0.0)))
     assert folded == pytest.approx(LENS.intrinsics[0] * 0.35 * (1 / np.sqrt(1.05)) ** 3, rel=0.02)
     f, _, cx, cy = LENS.intrinsics
