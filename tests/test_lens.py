@@ -183,11 +183,13 @@ def test_descriptors_that_hold_their_image_keep_the_pinhole() -> None:
 
 def test_a_camera_that_was_found_goes_with_its_map() -> None:
     # Proves that a map of a guessed camera takes the calibration that its run found, and refuses another, such as what
-    # the run began with. Oracle: the rule.
+    # the run began with; and that a run in the map holds what was found. Oracle: the rule.
     guess = np.array([160.0, 160.0, 79.5, 59.5])
     known = as_map(undistorted(run_of_room(), LENS))
     known = replace(known, given_intrinsics=guess, intrinsics_sigma=np.full(4, 48.0))
-    entered(known, replace(LENS, known=True))
+    within = entered(known, replace(LENS, known=True))
+    assert within.camera_found
+    assert within.given_intrinsics.tolist() == list(LENS.intrinsics)
     with pytest.raises(vg.InputError, match=r"is of a camera with fx, fy, cx, cy = 140\.0, 140\.0, 80\.0, 58\.0 px"):
         entered(known, Camera((160.0, 160.0, 79.5, 59.5), 160, 120))
 

@@ -111,4 +111,7 @@ def entered(known: Slam, camera: Camera) -> Slam:
             f"`known_map` is of a camera with fx, fy, cx, cy = {cameras[0]} px; that of this run has {cameras[1]} px: "
             "a map is used with the camera that it was made with"
         )
-    return replace(known, lost=1)
+    if known.calibrated:
+        return replace(known, lost=1)
+    # Its own run found it, and its keyframes stand as that camera sees them.
+    return replace(known, lost=1, given_intrinsics=known.intrinsics, camera_found=True)
