@@ -20,6 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from skimage.metrics import peak_signal_noise_ratio
 
 import vggtgeo as vg
 from vggtgeo.evaluation.alignment import umeyama
@@ -31,7 +32,6 @@ HALF = 2
 """Pictures are halved: a depth camera's points are about as dense as that."""
 SURFACE = 0.02
 """Relative: points so little behind the nearest one of their pixel are of the same surface."""
-WHITE = 255.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,8 @@ def main() -> None:
             for cloud, poses in zip(clouds, (brought, reference.poses), strict=True)
         ]
         both = np.isfinite(drawn[0]).all(2) & np.isfinite(drawn[1]).all(2)
-        found.append([_psnr(picture[both], truth[both]) for picture in drawn] + [100 * both.mean()])
+        psnr = [peak_signal_noise_ratio(truth[both], picture[both], data_range=255.0) for picture in drawn]
+        found.append([*psnr, 100 * both.mean()])
         if options.pictures:
             _save(options.pictures / f"{pictures[rows[row]].timestamp:.3f}.jpg", [truth, *drawn])
     first, second, covered = np.mean(found, axis=0)
@@ -125,10 +126,6 @@ def _drawn(
     sums = [np.bincount(cell[front], own[front], height * width) for own in colours[inside].T]
     with np.errstate(invalid="ignore"):
         return np.stack([total / np.where(count, count, np.nan) for total in sums], 1).reshape(height, width, 3)
-
-
-def _psnr(drawn: np.ndarray, truth: np.ndarray) -> float:
-    return float(20 * np.log10(WHITE / np.sqrt(np.mean((drawn - truth) ** 2))))
 
 
 def _save(path: Path, pictures: list[np.ndarray]) -> None:

@@ -101,6 +101,22 @@ def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
         assert find_lens(problem, state, (480, 640), ends_at) is None
 
 
+def test_few_keyframes_tell_no_lens() -> None:
+    # Proves that as many keyframes as the camera has parameters explain any lens, and so tell none. Oracle: the count.
+    packed = []
+    for keyframes in (5, 7):
+        window = vg.simulate_window(keyframes, 12, 0)
+        _, _, cx, cy = window.intrinsics
+        guess = window.observations, window.start, np.array([window.intrinsics[0], cx, cy])
+        problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, camera=SquarePinhole)
+        packed.append(find_lens(problem, state, (480, 640), lambda _, state: state))
+    few, enough = packed
+    assert few is not None
+    assert enough is not None
+    assert few.needed == float("inf")
+    assert enough.needed < float("inf")
+
+
 def test_a_lens_that_folds_the_image_is_none() -> None:
     # Proves that coefficients that draw a farther point nearer, as bad data may ask for, move pixels without a bound,
     # and that a lens that keeps their order does not. Oracle: k1 = -1 folds at a radius of 0.58 focal lengths, and the

@@ -26,5 +26,9 @@ def test_steps_that_nobody_saw_are_told(healthy: Walk) -> None:
 
     assert [(f.start, f.end, f.local) for f in found(few)] == [(19, 20, False)]
     assert found(np.full(40, 100)) == []
+    by_surface = replace(healthy.estimate, inliers=few, by_surface=np.arange(40) == 20)
+    assert check_blind(by_surface, cut, steps(by_surface, cut)) == [], "picture and surfaces place it without a match"
+    elsewhere = replace(by_surface, by_surface=np.arange(40) == 21)
+    assert len(check_blind(elsewhere, cut, steps(elsewhere, cut))) == 1
     estimate = replace(healthy.estimate, inliers=few)
     assert check_blind(estimate, healthy.evidence, steps(estimate, healthy.evidence)) == []

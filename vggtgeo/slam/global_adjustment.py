@@ -68,6 +68,8 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         before = slam
         if settings.camera.refine_intrinsics != "never":
             slam = _with_its_camera(slam, adjustment, solution.state, edges, settings)
+        if settings.refinement.global_rounds == 1:
+            break
         if estimated or slam.intrinsics is not before.intrinsics:
             edges, surfaces = _edges(slam, settings), _surfaces(slam)
             camera = replace(camera, mean=slam.intrinsics)

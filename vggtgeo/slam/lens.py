@@ -1,8 +1,9 @@
 """The lens of a camera that nobody calibrated: found once in the last adjustment, and taken out of the map.
 
-A guessed camera is a pinhole until the whole map is adjusted. Where its lens distorts, the focal length takes that up,
-and comes out wrong: redkitchen, images alone, ends at 539 and 550 px (COLMAP: 522 and 520, with k1 -0.007 and k2
--0.043). So the map is adjusted once more with the two radial coefficients of the lens free (520 px, -0.006, -0.047).
+A guessed camera is a pinhole until the whole map is adjusted, that of a first pass (`first_pass.py`) or of the run.
+Where its lens distorts, the focal length takes that up, and comes out wrong: redkitchen, images alone, ends at 539 and
+550 px (COLMAP: 522 and 520, with k1 -0.007 and k2 -0.043). So the map is adjusted once more with the two radial
+coefficients of the lens free (520 px, -0.006, -0.047).
 Where that explains the matches better by more than chance, and moves pixels by more than `LEAST_WARP`, images, key
 points and segments of the keyframes are resampled to those of the ideal pinhole, and everything after sees only that.
 

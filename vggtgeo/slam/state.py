@@ -86,8 +86,9 @@ class Slam:
     pose_sigma: of each keyframe after the last adjustment, see `pose_uncertainty.keyframe_sigma`. pending: the
     adjustment of the newest keyframe's window, while it goes on. lens: the distorting camera of the images as they were
     read, where the last adjustment found one: pixels and images of all keyframes, and `intrinsics`, are of images that
-    it no longer distorts (`lens.py`). camera_found: `intrinsics` and `lens` come from a first pass over the frames
-    (`first_pass.py`): windows hold them, and the last adjustment estimates the camera once more.
+    it no longer distorts (`lens.py`). camera_found: nobody gave the camera, and `given_intrinsics` and `lens`
+    are what a first pass over the frames found (`first_pass.py`), or the run that made the map which this one goes on
+    in: windows hold them, and the last adjustment estimates the camera once more.
     """
 
     intrinsics: np.ndarray

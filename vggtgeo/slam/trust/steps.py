@@ -128,10 +128,9 @@ def breaks(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> list[Br
 
 def _together(taken: list[Step], sure: np.ndarray) -> np.ndarray:
     """Steps that explain too little, of `TOGETHER` in a row that are contradicted as a whole, bool [n]."""
-    count = np.array([len(step.agrees) * bool(known) for step, known in zip(taken, sure, strict=False)], int)
-    agreeing = np.array(
-        [int(np.count_nonzero(step.agrees)) * bool(known) for step, known in zip(taken, sure, strict=False)], int
-    )
+    known = sure[: len(taken)]
+    count = np.array([len(step.agrees) for step in taken], int) * known
+    agreeing = np.array([np.count_nonzero(step.agrees) for step in taken], int) * known
     wrong = np.zeros(len(taken), bool)
     for first in range(len(taken) - TOGETHER + 1):
         rows = slice(first, first + TOGETHER)
