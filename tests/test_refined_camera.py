@@ -12,7 +12,7 @@ import pytest
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.calibration import Refinement, try_camera
+from vggtgeo.slam.calibration import Refinement, free_focal, try_camera
 from vggtgeo.slam.camera_of_pairs import CameraPair, camera_of_pairs
 
 HELD = 1e-6
@@ -91,3 +91,23 @@ def test_a_lens_that_nobody_told_of_is_no_focal_length() -> None:
     assert opinion.value[3] == pytest.approx(-0.2, abs=0.02)
     assert abs(opinion.value[0]) < 0.01
     assert opinion.value[3] < -10 * opinion.sigma[3]
+
+
+def test_matches_alone_tell_a_wrong_focal_length() -> None:
+    # Proves that without any depth a camera 20 % off is told, with the right focal length to 3 %, and that nothing else
+    # than the right one is wanted of a camera that is right. Oracle: the camera that the window was drawn with.
+    window = vg.simulate_window(seed=2, **WINDOW)
+    solve = lambda problem, state: _solve(problem, state).state
+    for factor in (0.8, 1.0, 1.2):
+        given = window.intrinsics * np.array([factor, factor, 1.0, 1.0])
+        problem, initial, _ = window.pack(
+            fixed_intrinsics=False, intrinsics_mean=given, intrinsics_sigma=np.full(4, HELD * given[0])
+        )
+        problem = problem.with_term(problem.depth.reweighted(jnp.zeros_like(problem.depth.weight)))
+        start = eqx.tree_at(lambda state: state.intrinsics, initial, jnp.asarray(given))
+        wanted = free_focal(problem, solve(problem, start), solve)
+        if factor == 1.0:
+            assert wanted is None or np.abs(wanted / given[:2] - 1).max() < 0.03
+        else:
+            assert wanted is not None, factor
+            np.testing.assert_allclose(wanted, window.intrinsics[:2], rtol=0.03)

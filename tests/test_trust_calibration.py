@@ -141,3 +141,15 @@ def test_a_guessed_camera_is_no_wrong_calibration(healthy: Walk) -> None:
     wrong = K * np.array([1.2, 1.2, 1, 1])
     estimate = replace(healthy.estimate, intrinsics=wrong, given=wrong, sigma=np.full(4, 150.0))
     assert found_by_camera(estimate, healthy.evidence) == []
+
+
+def test_a_focal_length_that_a_map_without_depth_wants_is_told(healthy: Walk) -> None:
+    """20 % are told with the right one; 5 %, or what the run has moved to by itself, are not. Oracle: the intrinsics
+    that the walk was made with.
+    """
+    for factor, ends, told in ((1.2, 1.2, True), (0.8, 0.8, True), (1.05, 1.05, False), (1.2, 1.01, False)):
+        given, own = (K * np.array([f, f, 1, 1]) for f in (factor, ends))
+        estimate = replace(healthy.estimate, intrinsics=own, given=given, focal_wanted=K[:2])
+        texts = [f.text for f in check_camera(estimate, None, SIZE)]
+        assert ["focal length of about 500 px" in text for text in texts] == [True] * told, factor
+    assert check_camera(replace(healthy.estimate, focal_wanted=None), None, SIZE) == []

@@ -11,7 +11,7 @@ from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
 from vggtgeo.slam.adjustment import Adjustment, CameraPrior, build, write_back
-from vggtgeo.slam.calibration import Refinement, keyframe_pairs, try_camera, without_surfaces
+from vggtgeo.slam.calibration import Refinement, free_focal, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.covisibility import Directed, directions
 from vggtgeo.slam.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.factors import Factor, MeasuredRelativePose, factor_terms
@@ -66,6 +66,9 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         if number > 0:
             continue
         before = slam
+        if slam.calibrated and not slam.metric:
+            again = lambda problem, state: solve_jit(problem, state, solver=global_solver(problem, settings)).state
+            slam = replace(slam, focal_wanted=free_focal(adjustment.problem, solution.state, again))
         if settings.camera.refine_intrinsics != "never":
             slam = _with_its_camera(slam, adjustment, solution.state, edges, settings)
         if settings.refinement.global_rounds == 1:

@@ -88,7 +88,9 @@ class Slam:
     read, where the last adjustment found one: pixels and images of all keyframes, and `intrinsics`, are of images that
     it no longer distorts (`lens.py`). camera_found: nobody gave the camera, and `given_intrinsics` and `lens`
     are what a first pass over the frames found (`first_pass.py`), or the run that made the map which this one goes on
-    in: windows hold them, and the last adjustment estimates the camera once more.
+    in: windows hold them, and the last adjustment estimates the camera once more. focal_wanted: the focal lengths that
+    the last adjustment of a given camera without measured depth finds if they are free, float64 [2], pixels; None where
+    they explain matches no better than chance.
     """
 
     intrinsics: np.ndarray
@@ -116,6 +118,7 @@ class Slam:
     pending: PendingWindow | None = None
     lens: Camera | None = None
     camera_found: bool = False
+    focal_wanted: np.ndarray | None = None
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)

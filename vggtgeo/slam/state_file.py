@@ -54,7 +54,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 4
+VERSION = 5
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -75,7 +75,13 @@ def _with_first_pass(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
-UPGRADES = {1: _with_recorded_times, 2: _with_lens, 3: _with_first_pass}
+def _with_focal_wanted(header: Header) -> Header:
+    """Version 4 did not ask maps without depth whether their focal length is right."""
+    tree, classes = with_field(header["tree"], header["classes"], "Slam", "focal_wanted")
+    return {**header, "tree": tree, "classes": classes}
+
+
+UPGRADES = {1: _with_recorded_times, 2: _with_lens, 3: _with_first_pass, 4: _with_focal_wanted}
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)
 

@@ -24,7 +24,8 @@ class Estimate:
     intrinsics: fx, fy, cx, cy at the end; given: before the run; sigma: of their prior, pixels. metric: lengths are
     metres. inliers: int [n], matches that agreed with the pose; is_keyframe: bool [n]. pieces: how many parts the map
     has. started: whether there ever was a map. by_surface: bool [n], frames that picture and surfaces place beyond
-    doubt, without any match; None: no frame.
+    doubt, without any match; None: no frame. focal_wanted: focal lengths that the last adjustment found if they are
+    free, float64 [2], pixels; None where that explained nothing.
     """
 
     frames: np.ndarray
@@ -40,6 +41,7 @@ class Estimate:
     pieces: int = 1
     started: bool = True
     by_surface: np.ndarray | None = None
+    focal_wanted: np.ndarray | None = None
 
     @classmethod
     def of(cls, slam: Slam) -> Self:
@@ -60,6 +62,7 @@ class Estimate:
             max(len(pieces_by_size(slam)), 1),
             known,
             np.array([record.evidence.placed_by_surface for record in slam.frames], bool),
+            slam.focal_wanted,
         )
 
     def __len__(self) -> int:
