@@ -24,9 +24,8 @@ SHORTER: dict[str, dict[str, str]] = {
     "evaluate": {'sequences=["room"]': 'sequences=["room"], seeds=1'},
     "differentiate": {
         "tracked_windows(sequence, 8,": "tracked_windows(sequence, 3,",
-        "tracked_windows(other, 4,": "tracked_windows(other, 2,",
-        "steps=25, size=4": "steps=2, size=2",
-        "seed=201, size": "seed=101, size",  # the world that is built already
+        "stacked(range(24)), stacked(range(100, 124))": "stacked(range(3)), stacked(range(100, 103))",
+        "range(80)": "range(2)",
     },
 }
 

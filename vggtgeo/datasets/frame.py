@@ -87,3 +87,13 @@ def check_selection(name: str, count: int, start: int, end: int | None, stride: 
         raise InputError(f"`start` is {start} and `end` {end}; they must be 0 <= start < end")
     if start >= count:
         raise InputError(f"`start` is {start}; `{name}` has {count} frames: give at most {count - 1}")
+
+
+def check_size(frame: Frame, camera: Camera) -> None:
+    """Raises InputError for a frame whose size is not that of the camera's images."""
+    height, width = frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise InputError(
+            f"`{frame.name}` is {width} x {height} pixels; the camera's images are {camera.width} x {camera.height}: "
+            "all frames of a run must have one size"
+        )

@@ -81,6 +81,13 @@ class Camera:
         """The ideal camera that undistorted images belong to: the same intrinsics, no distortion."""
         return replace(self, distortion=())
 
+    def resized(self, width: int, height: int) -> Self:
+        """The same camera of its images resized to `width` x `height` pixels; a pixel's middle is a whole number."""
+        across, down = width / self.width, height / self.height
+        fx, fy, cx, cy = self.intrinsics
+        centre = across * (cx + 0.5) - 0.5, down * (cy + 0.5) - 0.5
+        return replace(self, intrinsics=(across * fx, down * fy, *centre), width=width, height=height)
+
     def undistorted(self, pixels: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
         """Where pixels of this camera's images are in those of `pinhole`, float64; any may lie outside the image."""
         flat = np.asarray(pixels, np.float64).reshape(-1, 1, 2)

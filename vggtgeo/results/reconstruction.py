@@ -16,6 +16,7 @@ from typing import Any
 from vggtgeo.datasets import Frame, Sequence, SequenceView, open_sequence
 from vggtgeo.datasets.frame import check_selection
 from vggtgeo.datasets.in_memory import FrameStream, frame_stream
+from vggtgeo.datasets.reduced import reduced
 from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -35,7 +36,7 @@ from vggtgeo.results.checkpoints import (
     resumed,
 )
 from vggtgeo.results.result import Result, RunRecord
-from vggtgeo.results.summary import compare, summarise
+from vggtgeo.results.summary import compare, lens_of, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
@@ -120,7 +121,7 @@ def reconstruct(
     clock, began = Clock(), time.perf_counter()
     settings = settings or SlamSettings()
     with interruption() as stop, collected_warnings() as collected:
-        source = _opened(frames, camera)
+        source = _opened(frames, camera, settings)
         source.check(start, end, stride)
         perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric)
@@ -153,6 +154,7 @@ def reconstruct(
             **(facts or {}),
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
+            **_as_read(source, slam),
         }
         notices = (*warned, *(collected if before is None else before.unsaid(collected)))
         ending = _Ending(
@@ -217,6 +219,8 @@ class _Source:
     name: str
     frames: Sequence | FrameStream
     truth: Trajectory | None
+    read: Camera
+    """Of the images before they were reduced."""
 
     @property
     def camera(self) -> Camera:
@@ -261,14 +265,18 @@ class _Source:
         return len(range(start, length if end is None else min(length, end), stride))
 
 
-def _opened(frames: str | os.PathLike[str] | Sequence | Iterable[Any], camera: Camera | None) -> _Source:
+def _opened(
+    frames: str | os.PathLike[str] | Sequence | Iterable[Any], camera: Camera | None, settings: SlamSettings
+) -> _Source:
+    most = settings.camera.most_pixels
     if isinstance(frames, str | os.PathLike):
         frames = open_sequence(Path(frames))
     if not isinstance(frames, Sequence):
-        return _Source("frames", frame_stream(frames, camera), None)
+        stream = frame_stream(frames, camera)
+        return _Source("frames", reduced(stream, most), None, stream.camera)
     name = frames.name.encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
     view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
-    return _Source(name, view, _truth(frames))
+    return _Source(name, reduced(view, most), _truth(frames), view.camera)
 
 
 def _truth(sequence: Sequence) -> Trajectory | None:
@@ -278,6 +286,19 @@ def _truth(sequence: Sequence) -> Trajectory | None:
     except InputError as error:
         warnings.warn(f"the truth cannot be used and is left out: {error}", InputWarning, stacklevel=4)
         return None
+
+
+def _as_read(source: _Source, slam: Slam) -> dict[str, Any]:
+    """What the summary says of images that were reduced: both sizes, and the camera of the images as they were read."""
+    size, read = (f"{camera.width} x {camera.height}" for camera in (source.camera, source.read))
+    if size == read:
+        return {}
+    fx, fy, cx, cy = map(float, slam.intrinsics)
+    enlarged = lambda camera: camera.resized(source.read.width, source.read.height)
+    found = enlarged(replace(source.camera, intrinsics=(fx, fy, cx, cy)))
+    camera = dict(zip(("fx", "fy", "cx", "cy"), found.intrinsics, strict=True))
+    lens = {} if slam.lens is None else {"lens": lens_of(enlarged(slam.lens))}
+    return {"images_reduced": {"from": read, "to": size, "intrinsics_as_read": camera}, **lens}
 
 
 def _first_state(known: Slam | None, source: _Source, settings: SlamSettings) -> Slam | None:

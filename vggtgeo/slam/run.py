@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.frame import Frame, Sequence
-from vggtgeo.datasets.in_memory import frame_stream
+from vggtgeo.datasets.frame import Frame, Sequence, check_size
+from vggtgeo.datasets.in_memory import FrameStream, frame_stream
+from vggtgeo.datasets.reduced import reduced
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
@@ -71,10 +71,11 @@ def run(
         Slam(1 frame, 1 keyframe, tracking)
 
     """
-    source = frames if isinstance(frames, Sequence) else frame_stream(frames, camera)
+    source: Sequence | FrameStream = frames if isinstance(frames, Sequence) else frame_stream(frames, camera)
     roles = roles or default_roles(source.has_depth)
-    selected = source.frames(start, end, stride)
     settings, clock = settings or SlamSettings(), clock or Clock()
+    source = reduced(source, settings.camera.most_pixels)
+    selected = source.frames(start, end, stride)
     known = None if known_map is None else entered(known_map, source.camera)
     yield from run_frames(selected, source.camera, roles, settings, clock, known)
 
@@ -189,7 +190,7 @@ def _described(
             return roles.points.describe(image)
 
     def prepare(frame: Frame) -> tuple[Frame, Description]:
-        _check_size(frame, camera)
+        check_size(frame, camera)
         image = undistorter.image(frame.image)
         depth = None if frame.depth is None else undistorter.depth(frame.depth)
         frame = Frame(frame.index, frame.timestamp, image, depth, frame.name)
@@ -218,12 +219,3 @@ def _described(
         finally:
             for waiting in queue:
                 waiting.cancel()
-
-
-def _check_size(frame: Frame, camera: Camera) -> None:
-    height, width = frame.image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise InputError(
-            f"`{frame.name}` is {width} x {height} pixels; the camera's images are {camera.width} x {camera.height}: "
-            "all frames of a run must have one size"
-        )

@@ -171,6 +171,9 @@ class CameraSettings(CheckedSettings):
     """Of their principal point, in image widths and heights: published calibrations of TUM RGB-D, EuRoC, KITTI and
     ICL-NUIM are 0.014 off the middle (root mean square). Left as free as the focal length, it took up errors of the
     poses: 110 px in 40 frames of redkitchen."""
+    most_pixels: int = whole(500_000, at_least=0)
+    """Of an image: larger ones are reduced to about that many on the way in, and the camera with them (1920 x 1080
+    to 943 x 530), see `datasets/reduced.py`; 0: never. Dense maps and exports are of the reduced images."""
     first_pass: int = whole(150, at_least=0)
     """Frames of a first pass that finds a camera which nobody gave; the run begins with what it found. Where frames
     come once (a live camera, a stream), or with 0, there is none, and a guess is estimated while the run goes on."""

@@ -1,0 +1,90 @@
+"""Large images are reduced on the way in: the pipeline looks for corners, and judges them, in pixels.
+
+What is a pixel of noise, a radius to search, a fold of a curve is the same everywhere in the pipeline, and was measured
+on images of 540 x 360 to 752 x 480. Phones record 1920 x 1080 and 3840 x 2160: corners are blurred there over several
+pixels, and the same error is many of them. Forty frames of building-walk, without intrinsics, start and are 1.9 cm off
+as they are (540 x 360); enlarged to 3840 x 2160 they never started.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import overload
+
+import cv2
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame, Sequence, check_size
+from vggtgeo.datasets.in_memory import FrameStream
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class ReducedSequence:
+    """`source` with smaller images and depth; `camera` is that of what comes out."""
+
+    source: Sequence
+    camera: Camera
+
+    @property
+    def name(self) -> str:
+        """The name of the source."""
+        return self.source.name
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether the source has depth."""
+        return self.source.has_depth
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """See `Sequence.frames`."""
+        return _reduced_frames(self.source.frames(start, end, stride), self.source.camera, self.camera)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The truth of the source."""
+        return self.source.ground_truth()
+
+
+@overload
+def reduced(source: Sequence, most_pixels: int) -> Sequence: ...
+
+
+@overload
+def reduced(source: FrameStream, most_pixels: int) -> FrameStream: ...
+
+
+def reduced(source: Sequence | FrameStream, most_pixels: int) -> Sequence | FrameStream:
+    """The same frames with at most about `most_pixels` pixels each, their camera with them; the source itself, where
+    its images have no more, or where `most_pixels` is 0.
+    """
+    camera = reduced_camera(source.camera, most_pixels)
+    if camera == source.camera:
+        return source
+    if isinstance(source, FrameStream):
+        return replace(source, camera=camera, source=_reduced_frames(source.source, source.camera, camera))
+    return ReducedSequence(source, camera)
+
+
+def reduced_camera(camera: Camera, most_pixels: int) -> Camera:
+    """The camera of images that were reduced to about `most_pixels` pixels; 0: of the images as they are."""
+    factor = math.sqrt(most_pixels / (camera.width * camera.height))
+    if factor >= 1 or not most_pixels:
+        return camera
+    return camera.resized(max(round(factor * camera.width), 1), max(round(factor * camera.height), 1))
+
+
+def _reduced_frames(frames: Iterator[Frame], camera: Camera, smaller: Camera) -> Iterator[Frame]:
+    size = smaller.width, smaller.height
+    for frame in frames:
+        check_size(frame, camera)
+        image = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        depth = frame.depth
+        if depth is not None:  # a mean over an edge would be a depth that is nowhere
+            depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+        yield replace(frame, image=image, depth=depth)
