@@ -42,7 +42,7 @@ def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str,
         "keyframes": summary["keyframes"],
         "map_points": len(result.cloud),
         "frames_per_second": summary["frames_per_second"],
-        "focal_error": focal_error(result.intrinsics, given.sequence.camera.intrinsics)
+        "focal_error": focal_error(result.intrinsics_as_read, given.sequence.camera.intrinsics)
         if given.sequence.camera.known
         else None,
         **{f"seconds_{name.replace(' ', '_')}": value for name, value in summary["seconds_by_stage"].items()},

@@ -79,13 +79,18 @@ def _state(slam: Slam) -> str:
 
 def print_result(console: Console, result: Result, summary: Mapping[str, Any], folder: Path) -> None:
     """The report of a run; its last line is the verdict. summary: as it was written."""
-    verdict, (fx, fy, cx, cy) = result.verdict, result.intrinsics
+    verdict, (fx, fy, cx, cy) = result.verdict, result.intrinsics_as_read
     rate, whole = summary["frames_per_second"], summary["frames_per_second_whole_run"]
     lines = [
         f"{summary['frames']} frames ({summary['frames_tracked']} tracked), {summary['keyframes']} keyframes, "
         f"{rate:.1f} frames/s, {whole:.1f} with everything from compiling to writing",
         f"intrinsics fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}",
     ]
+    if "images_reduced" in summary:
+        sizes = summary["images_reduced"]
+        lines[-1] += (
+            f", of the images as read; {sizes['from']} pixels were reduced to {sizes['to']} for everything else"
+        )
     if summary["scale"].startswith("free"):
         lines.append("scale: free, there is no metric depth; lengths have no unit")
     elif not verdict.metric:

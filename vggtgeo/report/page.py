@@ -116,6 +116,7 @@ def write_page(
         settings=_flat(summary["settings"]),
         versions=summary["versions"],
         intrinsics=summary["intrinsics"],
+        reduced=summary.get("images_reduced"),
         truth_table=_truth_table(summary.get("truth"), slam.metric),
         scale=summary["scale"],
         scale_basis=summary.get("scale_basis"),

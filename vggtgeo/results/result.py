@@ -68,7 +68,7 @@ class Result:
         trajectory: camera -> world of every frame that has a pose.
         keyframes: those of the keyframes.
         cloud: the map, world frame.
-        intrinsics: fx, fy, cx, cy, pixels, as adjusted, of undistorted images.
+        intrinsics: fx, fy, cx, cy, pixels, as adjusted, of undistorted images, as large as those of the keyframes.
         metric: whether lengths are metres; without metric depth they have no unit.
         verdict: how far all this can be trusted, by segment of time.
         summary: counts, times and settings, as `summary.json` has them.
@@ -94,6 +94,15 @@ class Result:
     record: RunRecord | None = None
     saved_mesh: Mesh | None = None
     saved_uncertainty: PoseUncertainty | None = None
+
+    @property
+    def intrinsics_as_read(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy, pixels of the images as they were read, where those were larger (`camera.most_pixels`)."""
+        reduced = self.summary.get("images_reduced")
+        if reduced is None:
+            return self.intrinsics
+        fx, fy, cx, cy = (float(reduced["intrinsics_as_read"][name]) for name in ("fx", "fy", "cx", "cy"))
+        return fx, fy, cx, cy
 
     @property
     def mesh(self) -> Mesh | None:
