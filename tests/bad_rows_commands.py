@@ -71,6 +71,28 @@ def write(content: str) -> Any:
     return lambda path: path.write_text(content)
 
 
+def onto(name: str, flag: str) -> Any:
+    """`vggtgeo run` on good images, with a flag that names a text file that is there."""
+
+    def argv(made: Path) -> Any:
+        (made.parent / name).write_text("of the user")
+        return run_with(flag, made.parent / name)(made)
+
+    return argv
+
+
+def somebodys_map(folder: Path) -> None:
+    """A folder with a file that a run would replace."""
+    folder.mkdir()
+    (folder / "map.ply").write_text("of the user")
+
+
+def result_with_images(folder: Path) -> Path:
+    """A run's folder whose pictures are the input of the next."""
+    bad.frames(folder / "r/images")
+    return folder_of_run("{}")(folder / "r")
+
+
 def folder_of_run(summary: str, unfinished: bool = False) -> Any:
     """A run's folder with this summary."""
 
@@ -162,6 +184,12 @@ RUN = rows(
         ("`--map` that is no map", good, flags("--map", __file__)),
         ("`--localise-only` without `--map`", good, flags("--localise-only")),
         ("`--save-map` of a folder", good, flags("--save-map", "/")),
+        ("`--save-map` onto a file that is no map", good, flags("--save-map", __file__)),
+        (
+            "`--save-map` onto a result of the run",
+            good,
+            {"argv": lambda made: [*run_with("--save-map", made.parent / "out/trajectory.txt")(made)]},
+        ),
         ("`--fps` where frames have times", bad.rgbd(lambda folder: None), flags("--fps", "5")),
         ("`--provider cuda` without a GPU", good, flags("--provider", "cuda")),
         ("`--provider tpu`", good, flags("--provider", "tpu")),
@@ -174,6 +202,7 @@ RUN = rows(
         ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=-3")),
         ("`--set` of a number of 5000 digits", good, flags("--set", "tracking.least_inliers=1" + "0" * 5000)),
         ("`--set` of ten thousand brackets", good, flags("--set", "tracking.least_inliers=" + "[" * 10_000)),
+        ("`--rerun` onto a file that is no recording", good, {"argv": onto("mine.rrd", "--rerun")}),
         ("`--rerun` to a text file", good, flags("--rerun", "run.txt")),
         ("`--seed -1`", good, flags("--seed", "-1")),
         ("`--seed` beyond 32 bits", good, flags("--seed", "99999999999")),
@@ -204,6 +233,12 @@ OUTPUT = rows(
         ("a folder of images", None, output(bad.frames, "pictures")),
         ("a TUM folder", None, output(tiny.tum, "desk")),
         ("the folder that is read", good, {"argv": lambda made: ["run", made, "-o", made]}),
+        ("a folder with a `map.ply`, and no run's summary", None, output(somebodys_map, "things")),
+        (
+            "a folder in whose `images` the images that are read lie",
+            result_with_images,
+            {"argv": lambda made: ["run", made / "images", "-o", made]},
+        ),
         ("a folder that another run writes", nothing, {"call": locked}),
         ("of `solve`: a folder", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made.parent]}),
         ("of `solve`: the problem", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made]}),
@@ -244,6 +279,8 @@ TRAJECTORIES = rows(
     "`vggtgeo evaluate`",
     [
         ("a file that is not there", nothing, {"argv": line("evaluate", "no.txt", "no.txt")}),
+        ("`--delta inf`", None, evaluated(walk(), walk(), "--delta", "inf")),
+        ("columns in the order t q p", None, evaluated(write("0 1 0 0 0 2.5 1.5 3.5\n"), walk())),
         ("`--delta 0`", None, evaluated(walk(), walk(), "--delta", "0")),
         ("`--max-dt -1`", None, evaluated(walk(), walk(), "--max-dt", "-1")),
         ("times that never meet", None, evaluated(walk(), walk(start=1e6))),
@@ -269,6 +306,7 @@ NETWORKS = rows(
     "Network files",
     [
         ("a file that is not there", None, network(None)),
+        ("a folder", nothing, {"argv": lambda made: ["models", "verify", made]}),
         ("an empty file", None, network(b"")),
         ("a PyTorch checkpoint", None, network(b"PK\x03\x04" + b"\0" * 99)),
         ("a pickle", None, network(b"\x80\x02}q\0." + b"\0" * 99)),

@@ -13,14 +13,20 @@ import tiny_sequences as tiny
 from bad_row import Row, read_frames, rows, solve_with
 
 from vggtgeo.bundle.problem_file import load_problem
+from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.results.reconstruction import _opened
+from vggtgeo.results.source import opened
+from vggtgeo.slam.settings import SlamSettings
 
 PICTURE = bad.picture(1)
 WIDE = (PICTURE.astype(np.uint16) << 8) + 128
 HALF_GREY = np.vstack([PICTURE[:16], np.full((32, 64, 3), 128, np.uint8)])
 NUL = b"\0" * 999
 XYZ = "\nproperty float x\nproperty float y\nproperty float z\n"
+FACES = (
+    f"format binary_little_endian 1.0\nelement vertex 3{XYZ}element face 1000000000000000\n"
+    "property list uchar int vertex_indices\n"
+)
 WEIGHTS = ("pt_weight", "ln_weight", "d_weight")
 LISTED = (
     *("edges", "var_kf", "var_uv", "d_init", "d_prior", "d_sigma", "pt_edge", "pt_var", "pt_target", "ln_edge"),
@@ -114,6 +120,11 @@ IMAGES = rows(
         ("half a JPEG", bad.with_image(lambda: bad.cut_jpeg()[:-2], ".jpg")),
         ("half a JPEG with an end mark", bad.with_image(bad.cut_jpeg, ".jpg")),
         ("half a progressive JPEG with an end mark", bad.with_image(lambda: bad.cut_jpeg(True), ".jpg")),
+        ("a JPEG with other bytes in its middle", bad.with_image(bad.damaged_jpeg, ".jpg")),
+        (
+            "a JPEG with three bytes before its end mark, as some cameras write it",
+            bad.with_image(lambda: bad.encoded(".jpg")[:-2] + b"\1\2\3\xff\xd9", ".jpg"),
+        ),
         ("a header of 60000 x 60000 pixels", bad.with_image(bad.huge_png)),
         ("another size than the others", bad.with_image(lambda: bad.encoded(".png", bad.picture(1, 80, 60)))),
         ("12-bit values in a 16-bit PNG", bad.with_image(lambda: bad.encoded(".png", PICTURE.astype(np.uint16) << 4))),
@@ -150,7 +161,7 @@ DEPTH = rows(
     ],
     call=read_frames,
 )
-OPENED: dict[str, Any] = {"call": lambda made: _opened(made, None)}
+OPENED: dict[str, Any] = {"call": lambda made: opened(made, None, SlamSettings())}
 """As a run opens a sequence: a truth that cannot be read costs the comparison only."""
 LISTS = rows(
     "Lists and poses",
@@ -186,6 +197,7 @@ CALIBRATION = rows(
         ("of another image size", calibrated("525 525 120 90")),
         ("binary data", calibrated(bytes(range(256)))),
         ("commas, a byte order mark and CR LF", calibrated(b"\xef\xbb\xbf55, 55, 31.5, 23.5\r\n")),
+        ("decimal commas", calibrated("55,0 55,0 31,5 23,5")),
         ("a matrix of eight numbers", matrix("1 " * 8)),
         ("a matrix that is none of intrinsics", matrix("1 2 3 4 5 6 7 8 9")),
         ("none", calibrated(None)),
@@ -216,6 +228,7 @@ CLOUDS = rows(
             "a header of 10^15 points",
             bad.ply("format binary_little_endian 1.0\nelement vertex 1000000000000000" + XYZ, NUL),
         ),
+        ("a mesh whose header declares 10^15 faces", bad.ply(FACES, NUL), {"call": Mesh.load_ply}),
         ("a point that is NaN", bad.ply("format ascii 1.0\nelement vertex 1" + XYZ, b"nan 2 3\n")),
         ("not there", lambda folder: folder / "map.ply"),
     ],

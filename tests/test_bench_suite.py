@@ -88,6 +88,10 @@ def test_a_fingerprint_changes_with_what_a_result_depends_on(tmp_path: Path) -> 
         (('name = "bare"', 'name = "bare"\nstart_of_pose = "window"'), "`start_of_pose` is 'window'"),
         (("seeds = 3", "seeds = 0"), "`seeds` is 0; it must be positive"),
         (("seeds = 3", "seeds = "), "is no TOML"),
+        (("seeds = 3", "seeds = 2.5"), "`seeds` is 2.5; it must be a whole number"),
+        (("seeds = 3", "seeds = 'three'"), "`seeds` is 'three'; it must be a whole number"),
+        (("seeds = 3", "seeds = 3\ntimeout_minutes = 'long'"), "`timeout_minutes` is 'long'; it must be a number"),
+        (('title = "Tiny"', "title = 3"), "`title` is 3; it must be a text"),
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(change: tuple[str, str], message: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from vggtgeo.cli.main import make_app
 from vggtgeo.export import FORMATS, export
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.mapping.tracks import make_tracks
 from vggtgeo.results.scene import Scene
 from vggtgeo.slam.covisibility import Pair
@@ -167,6 +169,47 @@ def test_paths_and_clouds_as_text_and_ply(folder: Path, tmp_path: Path) -> None:
     assert (tmp_path / "tum/trajectory.txt").read_bytes() == (folder / "trajectory.txt").read_bytes()
     assert (tmp_path / "ply/cloud.ply").read_bytes() == (folder / "map.ply").read_bytes()
     assert (tmp_path / "ply/mesh.ply").read_bytes() == (folder / "mesh.ply").read_bytes()
+
+
+def _changed(folder: Path, place: Path) -> Path:
+    """A copy of the run, to be damaged."""
+    return Path(shutil.copytree(folder, place / "copy", ignore=shutil.ignore_patterns("export")))
+
+
+def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) -> None:
+    # Proves that pictures and depth that are none are named, and that what an earlier export wrote stays as it was,
+    # without a trace of the new one. Oracle: the files before.
+    copy, target = _changed(folder, tmp_path), tmp_path / "out"
+    export(copy, "nerfstudio", target)
+    before = {path: path.read_bytes() for path in target.rglob("*") if path.is_file()}
+    depth, picture = next((copy / "depth").glob("*.depth.png")), sorted((copy / "images").iterdir())[-1]
+    whole = depth.read_bytes()
+    cv2.imwrite(str(depth), np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(vg.InputError, match=r"depth.png` is uint8 \(4, 4, 3\); expected 16-bit depth"):
+        export(copy, "nerfstudio", target)
+    depth.write_bytes(whole)
+    for content, message in ((b"", "found 0 x 0"), (None, "is not there; run again")):
+        picture.unlink() if content is None else picture.write_bytes(content)
+        for name in ("nerfstudio", "colmap"):
+            with pytest.raises(vg.InputError, match=message):
+                export(copy, name, target)
+    assert {path: path.read_bytes() for path in target.rglob("*") if path.is_file()} == before
+    assert {path.name for path in target.iterdir()} == {path.relative_to(target).parts[0] for path in before}
+    with pytest.raises(vg.InputError, match="is the folder of the run itself"):
+        export(copy, "colmap", copy)
+
+
+def test_clouds_that_a_format_cannot_hold_are_named(folder: Path, tmp_path: Path) -> None:
+    # Proves the errors of a cloud wider than LAS counts millimetres, and of an empty one. Oracle: the sentences.
+    pytest.importorskip("laspy"), pytest.importorskip("trimesh")
+    copy = _changed(folder, tmp_path)
+    (copy / "mesh.ply").unlink()
+    PointCloud(np.array([[0.0, 0, 0], [3e6, 0, 0]]), np.zeros((2, 3), np.uint8)).save_ply(copy / "map.ply")
+    with pytest.raises(vg.InputError, match=r"is 3e\+06 m across; LAS in millimetres holds 2147484 m"):
+        export(copy, "las", tmp_path / "out")
+    PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)).save_ply(copy / "map.ply")
+    with pytest.raises(vg.InputError, match="has no points, and there is no mesh"):
+        export(copy, "glb", tmp_path / "out")
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:

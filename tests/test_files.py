@@ -66,6 +66,18 @@ def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
+def test_a_device_is_no_place_for_a_file(tmp_path: Path) -> None:
+    # Proves that a pipe is refused and stays, instead of being replaced by a file. Oracle: the error names it.
+    os.mkfifo(tmp_path / "pipe")
+    with (
+        pytest.raises(OSError, match="it is no file but a device, a pipe or a socket") as error,
+        atomic_path(tmp_path / "pipe"),
+    ):
+        pass
+    assert error.value.filename == str(tmp_path / "pipe")
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
 def test_json_refuses_nan(tmp_path: Path) -> None:
     # Proves that NaN, which is no JSON, never reaches a file: the write fails and nothing is left.
     with pytest.raises(ValueError, match="JSON"):

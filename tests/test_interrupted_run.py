@@ -37,10 +37,12 @@ def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
 
     monkeypatch.setattr("vggtgeo.results.reconstruction.run_frames", interrupted)
     (tmp_path / "trajectory.txt").write_text("of an earlier run")
+    (tmp_path / "summary.json").write_text("{}")
     result = CliRunner().invoke(make_app(), ["demo", "--scene", "room", "--frames", "3", "-o", str(tmp_path), "--json"])
     assert result.exit_code == 130, result.output
     assert result.stderr.strip() == "interrupted"
-    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("trajectory.txt", "of an earlier run")]
+    left = {file.name: file.read_text() for file in tmp_path.iterdir()}
+    assert left == {"trajectory.txt": "of an earlier run", "summary.json": "{}"}
 
 
 @pytest.mark.slow  # a process of its own, which compiles the window's solver

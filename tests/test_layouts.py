@@ -20,7 +20,7 @@ from vggtgeo.datasets.seven_scenes import _TO_COLOUR
 from vggtgeo.datasets.tanks import inside_crop
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.results.reconstruction import _Source
+from vggtgeo.results.source import Source
 
 CAMERA = Camera(tiny_sequences.INTRINSICS, tiny_sequences.WIDTH, tiny_sequences.HEIGHT)
 LOSSLESS = (tiny.scannet, tiny.euroc, tiny.icl, tiny.kitti, tiny.arkit)
@@ -331,4 +331,4 @@ def test_a_spoilt_file_of_poses_is_named(tmp_path: Path, write: Callable[[Path],
 def test_a_run_on_a_stream_has_no_total(tmp_path: Path) -> None:
     # Proves that an unknown length is told as None to what shows the progress. Oracle: the callback.
     stream = LiveCamera("webcam", CAMERA)
-    assert _Source("x", stream, None).count(0, None, 1) is None
+    assert Source("x", stream, None, CAMERA).count(0, None, 1) is None

@@ -1,4 +1,5 @@
-"""What fuzzing found (`fuzz_parsers.py`), once each: files that ended in a traceback, or took gigabytes.
+"""What fuzzing (`fuzz_parsers.py`) and hostile trials found, once each: files that ended in a traceback, took
+gigabytes, or were used although nobody can have meant them.
 
 Oracle: `InputError` with a sentence that names the file, or the file is read. Each failed before its parser was mended.
 """
@@ -6,14 +7,17 @@ Oracle: `InputError` with a sentence that names the file, or the file is read. E
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny_layouts as layouts
 from parsers import KINDS
 
+from vggtgeo.datasets import open_sequence
 from vggtgeo.io.errors import InputError, InputWarning
 
 Change = Callable[[bytes], bytes]
@@ -83,6 +87,19 @@ REFUSED: tuple[tuple[str, Change, str], ...] = (
     ("EuRoC camera", put(b"intrinsics: [", b"intrinsics: [1e-9, 1e-9, 9, 9] #"), r"the camera of .* must be in pixels"),
     ("Tanks crop", lambda _: b"1", r"c.json`: expected orthogonal_axis, axis_min, axis_max, bounding_polygon"),
     ("Tanks crop", put(b'bounding_polygon": [[', b'bounding_polygon": [1], "x": [['), r"c.json`: expected orthogonal"),
+    ("scene", array("frames", np.zeros(0, int)), r"scene.npz` cannot be read|expected numbers"),
+    ("scene", array("intrinsics", np.array([1.0, np.nan, 1.0, 1.0])), r"its intrinsics are \[ 1. nan"),
+    ("scene", array("poses", np.zeros((2, 4, 4))), r"its poses are not all rigid"),
+    ("scene", array("size", np.array([64, -48])), r"its pictures are 64 x -48 pixels"),
+    ("scene", array("track_points", np.full((1, 3), np.inf)), r"its points or their pixels hold a NaN or an infinity"),
+    ("scene", array("track_colours", np.zeros((1, 3))), r"its colours are float64; expected uint8"),
+    ("KITTI times", lambda _: b"0\nnan\n2\n", r"000001.png` has the time nan; expected seconds"),
+    ("KITTI camera", put(b"P2: ", b"P2: nan 0 0 0 0 55 0 0 0 0 1 0\nP3: "), r"calib.txt`: `intrinsics` is \(nan"),
+    ("EuRoC camera", put(b"intrinsics: [", b"intrinsics: [0, "), r"sensor.yaml`: `intrinsics` has 5 numbers"),
+    ("Stray camera", lambda _: b"nan 0 1\n0 1 1\n0 0 1\n", r"camera_matrix.csv`: `intrinsics` is \(nan"),
+    ("Replica camera", put(b"6553.5", b"0"), r"cam_params.json`: `scale` is 0.0; it must be a positive number"),
+    ("Replica camera", put(b"6553.5", b"NaN"), r"cam_params.json`: `scale` is nan"),
+    ("trajectory", lambda _: b"0 1 0 0 0 2.5 1.5 3.5\n", r"the quaternion has length 4.56; expected about 1"),
     ("KITTI camera", put(b"P2: ", b"P2: word "), r"calib.txt`: `P2` is 'word .*; expected numbers"),
 )
 
@@ -101,6 +118,51 @@ def test_a_file_that_was_too_much_is_refused(row: int, tmp_path: Path) -> None:
     name, change, sentence = REFUSED[row]
     with pytest.raises(InputError, match=sentence):
         read(name, change, tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore:.*poses have a NaN")
+def test_a_pose_of_zeros_is_no_truth(tmp_path: Path) -> None:
+    """ScanNet's lost frames hold infinities, other exporters write zeros; oracle: the warning."""
+    with pytest.warns(InputWarning, match="1 of 3 poses have no rotation"):
+        read("ScanNet pose", lambda _: b"0 " * 16, tmp_path)
+
+
+def test_the_size_is_that_of_the_first_depth_that_can_be_read(tmp_path: Path) -> None:
+    """One damaged file costs its frame's depth only; oracle: the camera of the whole folder."""
+    folder = layouts.scannet(tmp_path / "scan")
+    whole = open_sequence(folder).camera
+    (folder / "depth/0.png").write_bytes(b"")
+    assert open_sequence(folder).camera == whole
+
+
+def test_a_camera_row_by_row_is_the_camera(tmp_path: Path) -> None:
+    """Open3D writes `intrinsic_matrix` by columns, many scripts by rows; a byte order mark; a size in quotes. Oracle:
+    the camera of the file by columns.
+    """
+    folder = layouts.rgbd(tmp_path / "scan")
+    file, whole = folder / "intrinsic.json", open_sequence(folder).camera
+    content = json.loads(file.read_text())
+    content["intrinsic_matrix"] = np.reshape(content["intrinsic_matrix"], (3, 3)).T.ravel().tolist()
+    content["width"] = str(content["width"])
+    file.write_text(json.dumps(content), encoding="utf-8-sig")
+    assert open_sequence(folder).camera == whole
+
+
+def test_a_recording_with_fewer_times_than_frames_says_so(tmp_path: Path) -> None:
+    """Oracle: the counts."""
+    folder = layouts.stray(tmp_path / "scan")
+    lines = (folder / "odometry.csv").read_text().splitlines(keepends=True)
+    (folder / "odometry.csv").write_text("".join(lines[:-1]))
+    with pytest.warns(InputWarning, match=r"`rgb.mp4` has 3 frames, `odometry.csv` 2 times; frames behind 2"):
+        assert len(open_sequence(folder)) == 2
+
+
+def test_replica_without_its_camera_is_taken_for_none_other(tmp_path: Path) -> None:
+    """The published camera is that of images of 1200 x 680 pixels. Oracle: the sentence."""
+    folder = layouts.replica(tmp_path / "room")
+    (tmp_path / "cam_params.json").unlink()
+    with pytest.raises(InputError, match=r"has no `cam_params.json`, and its images are .* pixels; those of the publi"):
+        open_sequence(folder)
 
 
 @pytest.mark.filterwarnings("ignore:.*the IMU is not used")

@@ -23,6 +23,12 @@ from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import Tables, updated
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
+_PLAIN: dict[str, tuple[tuple[type, ...], str]] = {
+    "int": ((int,), "a whole number"),
+    "float": ((int, float), "a number"),
+    "str": ((str,), "a text"),
+    "bool": ((bool,), "true or false"),
+}
 _Table = TypeVar("_Table", bound="CheckedTable")
 
 
@@ -39,6 +45,10 @@ class CheckedTable:
         for key in values:
             if key not in known:
                 raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
+        for key, value in values.items():
+            expected = _PLAIN.get(str(known[key].type))
+            if expected is not None and type(value) not in expected[0]:
+                raise InputError(f"{where}: `{key}` is {value!r}; it must be {expected[1]}")
         plain = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
         try:
             return cls(**plain)

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zipfile import is_zipfile
 
 from vggtgeo.cli import run_options as options
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
@@ -88,8 +89,8 @@ def run(
     }
     if localise_only:
         switches["localise_only"] = {"keyframes": {"localise_only": True}}
-    if save_map is not None and save_map.is_dir():
-        raise InputError(f"`--save-map` is `{save_map}`, which is a folder; give the name of a file")
+    if save_map is not None:
+        check_map_file(save_map, output)
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:
         sequence = open_input(path, kind, intrinsics, rgb_only, fps, depth_scale)
@@ -114,6 +115,20 @@ def run(
         warned=warned,
         known_map=None if map_file is None else load_map(map_file),
     )
+
+
+def check_map_file(file: Path, output: Path) -> None:
+    """InputError for a map's file that would replace something else, or that results of the run would replace."""
+    if file.is_dir():
+        raise InputError(f"`--save-map` is `{file}`, which is a folder; give the name of a file")
+    from vggtgeo.results.run_folder import is_result
+
+    if file.is_file() and file.stat().st_size and not is_zipfile(file):
+        raise InputError(f"`--save-map` is `{file}`, which is there and is no map; give the name of a new file")
+    if is_result(output, file):
+        raise InputError(
+            f"`--save-map` is `{file}`, the name of a result of the run itself; give another, such as `{output}.map`"
+        )
 
 
 def check_flags(preset: str, features: str, memory_limit_gb: float | None, fps: float | None = None) -> None:

@@ -40,6 +40,8 @@ def verify_file(
     file: Path, network: str | None, image: Path | None, against: Path | None, runs: int, provider: Provider
 ) -> Report:
     """Check one file; raises `InputError` where it cannot be opened, is another network, or fails while it runs."""
+    if not file.name or file.is_dir():
+        raise InputError(f"`{file}` is a folder; give the file of a network, `NAME.onnx`")
     beside = file.with_name(file.name + PARITY_SUFFIX)
     record = against or (beside if beside.is_file() else None)
     with as_input_errors():

@@ -103,6 +103,8 @@ def _of_images(frames: list[Frame]) -> list[str]:
 
 def _of_times(frames: list[Frame], count: int) -> list[str]:
     times = np.array([frame.timestamp for frame in frames])
+    if not np.isfinite(times).all():
+        return [f"frame {frames[int(np.argmin(np.isfinite(times)))].index} has no time (a NaN or an infinity)"]
     steps = np.diff(times)
     if not len(steps):
         return []

@@ -12,8 +12,9 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of, yaml_numbers
-from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
+from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -50,7 +51,7 @@ class Euroc(FolderSequence):
             raise InputError(f"`{camera_folder}/data.csv` lists no image; expected lines `nanoseconds,file`")
         width, height = common_size(str(folder), files)
         sensor = camera_folder / "sensor.yaml"
-        intrinsics = check_intrinsics(yaml_numbers(sensor, "intrinsics"))
+        intrinsics = intrinsics_of(sensor, yaml_numbers(sensor, "intrinsics"))
         distortion = check_distortion(yaml_numbers(sensor, "distortion_coefficients"))
         return cls(base, folder.resolve().name, Camera(intrinsics, width, height, distortion), files)
 

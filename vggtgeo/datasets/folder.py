@@ -1,5 +1,6 @@
 """What all sequences of image files share: a list of files, read one by one, with a word for bad ones."""
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -49,6 +50,11 @@ class FolderSequence:
     files: tuple[FrameFile, ...] = field(repr=False)
     depth_format: DepthFormat = MILLIMETRES
     has_depth: bool = False
+
+    def __post_init__(self) -> None:
+        for file in self.files:
+            if not math.isfinite(file.timestamp):
+                raise InputError(f"`{self.folder}`: `{file.image}` has the time {file.timestamp}; expected seconds")
 
     def __len__(self) -> int:
         return len(self.files)

@@ -1,5 +1,6 @@
 """What every reader gives: frames one after another, the camera, and the truth where there is one."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -89,8 +90,10 @@ def check_selection(name: str, count: int, start: int, end: int | None, stride: 
         raise InputError(f"`start` is {start}; `{name}` has {count} frames: give at most {count - 1}")
 
 
-def check_size(frame: Frame, camera: Camera) -> None:
-    """Raises InputError for a frame whose size is not that of the camera's images."""
+def check_frame(frame: Frame, camera: Camera) -> None:
+    """Raises InputError for a frame whose size is not that of the camera's images, or whose time is none."""
+    if not math.isfinite(frame.timestamp):
+        raise InputError(f"`{frame.name}` has the time {frame.timestamp}; expected a number of seconds")
     height, width = frame.image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise InputError(

@@ -1,24 +1,20 @@
 """What is wrong with the bytes of an image file, where its decoder would hand back something without a word.
 
-A JPEG whose data end too early is filled up with mid grey by the decoder (libjpeg sets the coefficients of missing
-blocks to zero), whether its end mark is there or not. A header may declare any size, and the decoder takes memory for
-it before it looks at the data.
+A header may declare any size, and the decoder takes memory for it before it looks at the data. What libjpeg-turbo warns
+of it does not refuse: missing blocks become grey, and those after a damaged byte come to lie elsewhere.
 """
 
 from __future__ import annotations
 
+import re
 import struct
-
-import numpy as np
 
 from vggtgeo.datasets import image_sizes
 
 MOST_PIXELS = 100_000_000
 """Pixels of an image that are decoded: 0.3 GB."""
-_BLOCK = 8
-_MID_GREY = 128
-_LONGEST_PERIOD = 64
-_SHORTEST_TAIL, _LONGEST_TAIL = 16, 192
+_LEFT_OVER = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
+_MOST_LEFT_OVER = 4
 _ORIENTATION = 0x0112
 
 
@@ -40,24 +36,16 @@ def defect(content: bytes) -> str:
     return ""
 
 
-def ends_in_grey(content: bytes, image: np.ndarray) -> bool:
-    """Whether a JPEG's data end too early although it has an end mark; image: as decoded, uint8 [H, W, ...].
-
-    Its last block is mid grey then, and the last bytes are those of a picture. Where a picture is grey there, the data
-    of many equal blocks repeat every few bytes.
+def decoding_defect(message: str) -> str:
+    """What libjpeg-turbo's first warning or error says of a JPEG, as the end of a sentence; empty where it says nothing
+    of damage. Encoders of some cameras leave a few bytes between the data and the end mark: those harm nothing.
     """
-    if not content.startswith(b"\xff\xd8") or not (image[-1, -_BLOCK:] == _MID_GREY).all():
-        return False
-    coloured = np.flatnonzero((image.reshape(len(image), -1) != _MID_GREY).any(axis=1))
-    grey_rows = len(image) - 1 - int(coloured[-1]) if len(coloured) else len(image)
-    # Two bytes are the least that a whole 16 x 16 block of one colour takes.
-    length = min(_LONGEST_TAIL, 2 * (grey_rows // 16) * (image.shape[1] // 16))
-    if length < _SHORTEST_TAIL:
-        return False  # of so few blocks nothing can be said, and little is lost
-    end = content.rfind(b"\xff\xd9")
-    tail = np.frombuffer(content[max(end - length, 0) : end], np.uint8)[:-2]  # the last byte is padded
-    periods = range(1, min(_LONGEST_PERIOD, len(tail) // 2))
-    return not any(np.array_equal(tail[period:], tail[:-period]) for period in periods)
+    left = _LEFT_OVER.search(message)
+    if left is not None and int(left[1]) <= _MOST_LEFT_OVER:
+        return ""
+    if message.startswith(("Corrupt JPEG data", "Premature end")):
+        return f"is damaged, or cut off: a part of it would be grey or in a wrong place ({message})"
+    return ""
 
 
 def orientation(content: bytes) -> int:

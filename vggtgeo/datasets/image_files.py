@@ -1,8 +1,9 @@
 """Image and depth files, decoded by OpenCV, with the checks that OpenCV leaves out.
 
-OpenCV may hand back a partly grey image for a JPEG that ends too early, and turns an image as its EXIF data say, which
-neither the intrinsics nor the depth of a folder know of. So files are looked at before (`image_defects.py`), and images
-are used as they are stored.
+OpenCV hands back a picture for a JPEG whose data end too early or are damaged, partly grey or shifted, and turns an
+image as its EXIF data say, which neither the intrinsics nor the depth of a folder know of. So JPEGs are decoded by
+simplejpeg, which says what libjpeg-turbo warns of, files are looked at before (`image_defects.py`), and images are used
+as they are stored.
 """
 
 from dataclasses import dataclass
@@ -10,9 +11,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import simplejpeg
 from jaxtyping import Float, UInt8
 
-from vggtgeo.datasets.image_defects import defect, ends_in_grey, orientation
+from vggtgeo.datasets.image_defects import decoding_defect, defect, orientation
 from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
@@ -66,8 +68,6 @@ def read_image_file(path: Path, least_bits: int = 8) -> ImageFile:
         needed = max(int(image.max()).bit_length(), least_bits)
         bits = next(known for known in BITS if known >= needed)
         image = (image >> (bits - 8)).astype(np.uint8)
-    elif ends_in_grey(content, image):
-        raise InputError(f"`{path}` is cut off: its data end before its end mark, and the rest would be grey")
     return ImageFile(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), bits, orientation(content))
 
 
@@ -93,7 +93,14 @@ def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
     wrong = defect(content)
     if wrong:
         raise InputError(f"`{path}` {wrong}")
-    try:
+    if content.startswith(b"\xff\xd8"):
+        try:
+            return content, simplejpeg.decode_jpeg(content, "BGR")
+        except ValueError as error:
+            wrong = decoding_defect(str(error))
+        if wrong:
+            raise InputError(f"`{path}` {wrong}")
+    try:  # JPEGs too that simplejpeg does not know: of rare samplings, of arithmetic coding
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
         raise InputError(f"`{path}` cannot be decoded: {error.err}") from None

@@ -44,6 +44,14 @@ def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
     return check_intrinsics(_numbers("`intrinsics`", text, "fx,fy,cx,cy"))
 
 
+def intrinsics_of(file: Path, values: object) -> tuple[float, float, float, float]:
+    """`values` as fx, fy, cx, cy; InputError with the name of the file where they cannot be."""
+    try:
+        return check_intrinsics(values)
+    except InputError as error:
+        raise InputError(f"`{file}`: {error}") from None
+
+
 def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
     """The camera of `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`), else of
     `camera-intrinsics.txt` (3 x 3), else of a JSON file as Open3D's and RealSense's recorders write it, in `folder`,
@@ -143,10 +151,7 @@ def _read_matrix(file: Path) -> tuple[tuple[float, float, float, float], tuple[f
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6):
         raise InputError(f"`{file}`: found {matrix.tolist()}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    try:
-        return check_intrinsics((fx, fy, cx, cy)), ()
-    except InputError as error:
-        raise InputError(f"`{file}`: {error}") from None
+    return intrinsics_of(file, (fx, fy, cx, cy)), ()
 
 
 def _read_json_camera(
@@ -159,14 +164,15 @@ def _read_json_camera(
     if not isinstance(content, dict):
         raise InputError(f"`{file}`: found {type(content).__name__}; expected an object with the camera")
     size = content.get("width", width), content.get("height", height)
-    if size != (width, height):
+    if tuple(map(str, size)) != (str(width), str(height)):
         raise InputError(
             f"`{file}` is of images of {size[0]} x {size[1]} pixels; those here are {width} x {height}: write the "
             f"camera of these into `{CALIBRATION}`, or give --intrinsics fx,fy,cx,cy"
         )
     matrix = content.get("intrinsic_matrix")
     if isinstance(matrix, list) and len(matrix) == 9:
-        found = [matrix[0], matrix[4], matrix[6], matrix[7]]
+        by_row = matrix[6:8] == [0, 0] and matrix[2] != 0  # somebody's own script
+        found = [matrix[0], matrix[4], *(matrix[2:6:3] if by_row else matrix[6:8])]
     else:
         found = [content.get(name, content.get(other)) for name, other in _JSON_NAMES]
     if not all(isinstance(number, int | float) for number in found):
@@ -177,10 +183,13 @@ def _read_json_camera(
         raise InputError(f"`{file}`: {error}") from None
 
 
+_DECIMAL_COMMA = re.compile(r"-?\d+,\d+")
 _JSON_NAMES = (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy"))
 
 
 def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
+    if len(words := text.split()) >= 4 and all(map(_DECIMAL_COMMA.fullmatch, words)):
+        raise InputError(f"{where}: found {text.strip()!r}; write decimals with a point: {expected}")
     try:
         return tuple(float(word) for word in text.replace(",", " ").split())
     except ValueError:

@@ -13,9 +13,9 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import natural_key
-from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, intrinsics_of
 from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of
-from vggtgeo.geometry.camera import Camera, check_intrinsics
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -104,7 +104,7 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
                 values = numbers_of(rest.split(), f"`{file}`: `{key}`")
                 if len(values) != 12:
                     raise InputError(f"`{file}`: `{key}` has {len(values)} numbers; expected 12")
-                intrinsics = check_intrinsics((values[0], values[5], values[2], values[6]))
+                intrinsics = intrinsics_of(file, (values[0], values[5], values[2], values[6]))
                 return Camera(intrinsics, width, height), -values[3] / values[0]
     own = camera_from_folder(folder, width, height)
     return own or guess_with_warning(str(folder), width, height), 0.0

@@ -25,9 +25,10 @@ from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, read_depth
 from vggtgeo.datasets.images import natural_key
+from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_matrix, trajectory_of
 from vggtgeo.datasets.video import VideoFile
-from vggtgeo.geometry.camera import Camera, check_intrinsics
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -62,12 +63,20 @@ class StrayScanner:
             video = VideoFile.open(folder / "rgb.mp4")
         width, height = video.camera.width, video.camera.height
         reduction = -(-max(width, height) // LARGEST)
-        matrix = read_matrix(folder / "camera_matrix.csv", (3, 3))
+        file = folder / "camera_matrix.csv"
+        matrix = read_matrix(file, (3, 3))
         # pixel (0, 0) is the centre of the corner pixel, not the corner
         centre = (matrix[:2, 2] + 0.5) / reduction - 0.5
-        intrinsics = check_intrinsics((matrix[0, 0] / reduction, matrix[1, 1] / reduction, *centre))
+        intrinsics = intrinsics_of(file, (matrix[0, 0] / reduction, matrix[1, 1] / reduction, *centre))
         camera = Camera(intrinsics, width // reduction, height // reduction)
         times = tuple(_odometry(folder)[:, 0].tolist())
+        if len(video) and len(times) != len(video):
+            warnings.warn(
+                f"`{folder}`: `rgb.mp4` has {len(video)} frames, `odometry.csv` {len(times)} times; frames behind "
+                f"{min(len(video), len(times))} are left out",
+                InputWarning,
+                stacklevel=3,
+            )
         has_depth = any((folder / "depth").glob("*.png"))
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
 
@@ -190,4 +199,4 @@ def _pincam(folder: Path, width: int, height: int) -> Camera:
             f"`{files[0]}` is for {rows[0, 0]:g} x {rows[0, 1]:g} pixels; the images are {width} x {height}"
         )
     fx, fy, cx, cy = np.median(rows[:, 2:], axis=0)
-    return Camera(check_intrinsics((fx, fy, cx, cy)), width, height)
+    return Camera(intrinsics_of(files[0].parent, (fx, fy, cx, cy)), width, height)

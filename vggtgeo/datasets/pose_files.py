@@ -14,6 +14,9 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
+_MOST_STRETCH = 0.1
+"""Of the axes of a pose in a file: few digits, or a scale of a per cent, are mended."""
+
 
 def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
     """Lines of `columns` numbers, blanks or commas in between; InputError with the line of one that is not so."""
@@ -41,20 +44,29 @@ def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
 
 
 def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path) -> Trajectory | None:
-    """Camera -> world at `times`; poses with NaN or infinity (tracking was lost) are left out with an InputWarning.
+    """Camera -> world at `times`; poses with NaN or infinity, or without a rotation, as files have them where tracking
+    was lost, are left out with an InputWarning.
 
     None where no pose is left.
     """
     poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     times = np.asarray(times, np.float64)[: len(poses)]
-    known = np.isfinite(poses).all(axis=(1, 2))
+    known = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     if not known.all():
         warnings.warn(
             f"`{where}`: {int((~known).sum())} of {len(poses)} poses have a NaN or an infinity; left out of the truth",
             InputWarning,
             stacklevel=3,
         )
-    return Trajectory(times[known], _orthonormal(poses[known])) if known.any() else None
+    turned = known & _have_rotations(np.nan_to_num(poses, nan=0.0, posinf=0.0, neginf=0.0))
+    if not turned[known].all():
+        warnings.warn(
+            f"`{where}`: {int((known & ~turned).sum())} of {len(poses)} poses have no rotation (all zeros, say); left "
+            "out of the truth",
+            InputWarning,
+            stacklevel=3,
+        )
+    return Trajectory(times[turned], _orthonormal(poses[turned])) if turned.any() else None
 
 
 def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
@@ -99,6 +111,13 @@ def read_json(file: Path) -> Any:
         raise InputError(f"`{file}` is no JSON: {error}") from None
 
 
+def _have_rotations(poses: np.ndarray) -> np.ndarray:
+    """Whether the axes of each pose have nearly unit length and are no mirror image."""
+    lengths = np.linalg.norm(poses[:, :3, :3], axis=1)
+    near = (np.abs(lengths - 1.0) < _MOST_STRETCH).all(axis=1)
+    return np.asarray(near & (np.linalg.det(poses[:, :3, :3]) > 0.0), bool)
+
+
 def _orthonormal(poses: np.ndarray) -> np.ndarray:
     """The nearest rotations: files with few digits, or with a scale of 1 +- 1e-3, are no exact ones."""
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
@@ -107,6 +126,6 @@ def _orthonormal(poses: np.ndarray) -> np.ndarray:
 
 def _text(file: Path) -> str:
     try:
-        return file.read_text(encoding="utf-8", errors="replace")
+        return file.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None

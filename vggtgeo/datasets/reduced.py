@@ -16,7 +16,7 @@ from typing import overload
 import cv2
 import numpy as np
 
-from vggtgeo.datasets.frame import Frame, Sequence, check_size
+from vggtgeo.datasets.frame import Frame, Sequence, check_frame
 from vggtgeo.datasets.in_memory import FrameStream
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -82,7 +82,7 @@ def reduced_camera(camera: Camera, most_pixels: int) -> Camera:
 def _reduced_frames(frames: Iterator[Frame], camera: Camera, smaller: Camera) -> Iterator[Frame]:
     size = smaller.width, smaller.height
     for frame in frames:
-        check_size(frame, camera)
+        check_frame(frame, camera)
         image = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
         depth = frame.depth
         if depth is not None:  # a mean over an edge would be a depth that is nowhere

@@ -4,6 +4,7 @@ The camera is in `cam_params.json` beside the rooms; the depth is in 1 / 6553.5 
 "NICE-SLAM", CVPR 2022; J. Straub et al., "The Replica Dataset", 2019.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -11,13 +12,14 @@ from typing import Self
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
-from vggtgeo.datasets.intrinsics import camera_from_folder
+from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
 from vggtgeo.datasets.pose_files import read_json, read_matrices, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
 _PUBLISHED = (600.0, 600.0, 599.5, 339.5)
+_PUBLISHED_SIZE = (1200, 680)
 _UNITS = 6553.5
 
 
@@ -63,9 +65,17 @@ def _camera(folder: Path, width: int, height: int) -> tuple[Camera, float]:
             values = read_json(file)
             try:
                 camera = values["camera"]
-                intrinsics = tuple(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
-                return Camera(intrinsics, width, height), float(camera["scale"])  # type: ignore[arg-type]
+                found = tuple(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
+                scale = float(camera["scale"])
             except (KeyError, TypeError, ValueError) as error:
                 raise InputError(f"`{file}`: expected `camera` with fx, fy, cx, cy and scale ({error!r})") from None
+            if not (math.isfinite(scale) and scale > 0):
+                raise InputError(f"`{file}`: `scale` is {scale}; it must be a positive number of units a metre")
+            return Camera(intrinsics_of(file, found), width, height), scale
     own = camera_from_folder(folder, width, height)
+    if own is None and (width, height) != _PUBLISHED_SIZE:
+        raise InputError(
+            f"`{folder}` has no `cam_params.json`, and its images are {width} x {height} pixels; those of the "
+            f"published camera are {_PUBLISHED_SIZE[0]} x {_PUBLISHED_SIZE[1]}: put that file beside the scene"
+        )
     return own or Camera(_PUBLISHED, width, height), _UNITS

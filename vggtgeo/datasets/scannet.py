@@ -15,9 +15,9 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
-from vggtgeo.datasets.intrinsics import check_plausible
+from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of
 from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
-from vggtgeo.geometry.camera import Camera, check_intrinsics
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -89,12 +89,18 @@ def _depth(folder: Path, image: Path) -> Path | None:
 
 def _intrinsics(file: Path) -> tuple[float, float, float, float]:
     matrix = read_matrix(file, (4, 4))
-    return check_intrinsics((matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+    return intrinsics_of(file, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
 
 
 def _size(folder: Path, files: tuple[FrameFile, ...]) -> tuple[int, int]:
+    """Width and height of the depth images: of the first that can be read."""
+    wrong = "has no depth image"
     for file in files:
         if file.depth is not None:
-            height, width = read_depth(file.depth, MILLIMETRES).shape
+            try:
+                height, width = read_depth(file.depth, MILLIMETRES).shape
+            except InputError as error:
+                wrong = f"has no depth image that can be read ({error})"
+                continue
             return width, height
-    raise InputError(f"`{folder}/depth` has no depth image; the size of the depth camera is not known")
+    raise InputError(f"`{folder}/depth` {wrong}; the size of the depth camera is not known")

@@ -18,6 +18,7 @@ from vggtgeo.io.errors import InputError
 
 Unit = Literal["poses", "seconds", "metres"]
 UNITS: tuple[Unit, ...] = get_args(Unit)
+_MOST_POSES = 2**31
 PATH_TOLERANCE = 0.1
 """Share of a delta in seconds or metres by which overlapping pairs may miss it; evo's default."""
 
@@ -92,8 +93,8 @@ def pairs(
     if unit not in UNITS:
         raise InputError(f"`unit` is {unit!r}; it must be one of {', '.join(UNITS)}")
     if unit == "poses":
-        if delta < 1 or delta != int(delta):
-            raise InputError(f"`delta` is {delta}; it must be at least 1 pose, a whole number")
+        if not (1 <= delta <= _MOST_POSES) or delta != int(delta):
+            raise InputError(f"`delta` is {delta}; it must be at least 1 pose, a whole number, at most {_MOST_POSES}")
         first = np.arange(0, max(len(trajectory) - int(delta), 0), 1 if all_pairs else int(delta))
         return first, first + int(delta)
     if not (np.isfinite(delta) and delta > 0):

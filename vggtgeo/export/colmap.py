@@ -7,13 +7,13 @@ half a pixel is added.
 
 from __future__ import annotations
 
-import shutil
 import struct
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from vggtgeo.export.pictures import copy_pictures
 from vggtgeo.geometry import rigid
 from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import Scene
@@ -28,9 +28,7 @@ def write_colmap(source: Path, target: Path) -> dict[str, float]:
     Returns what was written: counts, and the mean reprojection error in pixels.
     """
     scene = Scene.load(source)
-    (target / "images").mkdir(parents=True, exist_ok=True)
-    for view in range(len(scene.frames)):
-        shutil.copyfile(source / "images" / scene.image_name(view), target / "images" / scene.image_name(view))
+    copy_pictures(scene, source, target)
     place_of = _places(scene)
     model = target / "sparse" / "0"
     for name, content in (

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,7 +38,8 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
         What was written: counts, and for COLMAP the mean reprojection error in pixels.
 
     Raises:
-        InputError: an unknown format, no run in `source`, or a package that is not installed.
+        InputError: an unknown format, no run in `source`, or files of it that are damaged, `target` is the run itself,
+            or a package is not installed.
 
     """
     place = Path(source)
@@ -44,4 +47,17 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
         raise InputError(f"`to` is {to!r}; it must be one of {', '.join(FORMATS)}")
     if not (place / "summary.json").is_file():
         raise InputError(f"`{place}` holds no run (no `summary.json`); give a folder that `vggtgeo run` wrote")
-    return FORMATS[to](place, Path(target) if target is not None else place / "export" / to)
+    output = Path(target) if target is not None else place / "export" / to
+    if output.resolve() == place.resolve():
+        raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
+    output.mkdir(parents=True, exist_ok=True)
+    stage = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=output))
+    try:  # what is there already stays until all is written
+        written = FORMATS[to](place, stage)
+        for file in sorted(path for path in stage.rglob("*") if path.is_file()):
+            final = output / file.relative_to(stage)
+            final.parent.mkdir(parents=True, exist_ok=True)
+            file.replace(final)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+    return written

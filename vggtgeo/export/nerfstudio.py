@@ -6,15 +6,16 @@ pixel. Depth images hold thousandths of the unit in 16 bit, 0 = none (nerfstudio
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from vggtgeo.export.pictures import copy_pictures
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.scene import Scene
@@ -31,11 +32,10 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     """
     scene = Scene.load(source)
     poses = rigid.invert(scene.poses) @ FLIP
+    copy_pictures(scene, source, target)
     frames, deep = [], 0
     for view in range(len(scene.frames)):
         name = scene.image_name(view)
-        (target / "images").mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source / "images" / name, target / "images" / name)
         frame: dict[str, Any] = {"file_path": f"images/{name}", "transform_matrix": poses[view].tolist()}
         depth = source / "depth" / f"{scene.frames[view]:06d}.depth.png"
         if depth.is_file():
@@ -53,7 +53,9 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
 def _depth(file: Path, target: Path, name: str) -> dict[str, str]:
     """Depth and mask of one picture in nerfstudio's units, and what `transforms.json` says of them."""
     counts = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    assert counts is not None
+    if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
+        found = "no image" if counts is None else f"{counts.dtype} {counts.shape}"
+        raise InputError(f"`{file}` is {found}; expected 16-bit depth as `vggtgeo run --save-depth` writes it")
     milli = np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16)
     for folder, image in (("depth", milli), ("masks", np.where(counts > 0, 255, 0).astype(np.uint8))):
         with atomic_path(target / folder / name) as temporary:

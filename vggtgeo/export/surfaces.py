@@ -16,6 +16,7 @@ from vggtgeo.io.files import atomic_path
 UPRIGHT = np.array([1.0, -1.0, -1.0])
 """From y down, z forward (the first camera's axes) to glTF's y up, z backward."""
 LAS_UNIT = 1e-3
+_LAS_COUNTS = 2**31 - 1
 
 
 def write_ply(source: Path, target: Path) -> dict[str, float]:
@@ -44,6 +45,8 @@ def write_glb(source: Path, target: Path) -> dict[str, float]:
         counts: dict[str, float] = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     else:
         cloud = PointCloud.load_ply(source / "map.ply")
+        if not len(cloud):
+            raise InputError(f"`{source / 'map.ply'}` has no points, and there is no mesh: nothing to export")
         shape = trimesh.PointCloud(cloud.points * UPRIGHT, colors=cloud.colours)
         counts = {"vertices": len(cloud), "faces": 0}
     with atomic_path(target / "map.glb") as temporary:
@@ -55,6 +58,11 @@ def write_las(source: Path, target: Path) -> dict[str, float]:
     """`map.las`, version 1.4, point format 7: places to a millimetre, 16-bit colours."""
     laspy = _package("laspy")
     cloud = PointCloud.load_ply(source / "map.ply")
+    if len(cloud) and np.ptp(cloud.points.astype(np.float64), axis=0).max() >= LAS_UNIT * _LAS_COUNTS:
+        raise InputError(
+            f"`{source / 'map.ply'}` is {np.ptp(cloud.points, axis=0).max():.3g} m across; LAS in millimetres holds "
+            f"{LAS_UNIT * _LAS_COUNTS:.0f} m: export it with `--to ply`"
+        )
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales = np.full(3, LAS_UNIT)
     header.offsets = np.floor(cloud.points.min(axis=0)) if len(cloud) else np.zeros(3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,8 @@ from plyfile import PlyData, PlyElement
 from vggtgeo.geometry.point_cloud import UNREADABLE
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
+
+_LONGEST_HEAD = 65_536
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +58,20 @@ class Mesh:
     def load_ply(cls, path: str | os.PathLike[str]) -> Mesh:
         """Reads what `save_ply` wrote."""
         try:
+            _check_counts(path)
             data = PlyData.read(os.fspath(path), known_list_len={"face": {"vertex_indices": 3}})
             vertices, faces = data["vertex"].data, data["face"].data["vertex_indices"]
             column = lambda *names: np.column_stack([vertices[name] for name in names])
             return cls(column("x", "y", "z"), np.array(faces), column("nx", "ny", "nz"), column("red", "green", "blue"))
         except UNREADABLE as error:
             raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY mesh: {error}") from None
+
+
+def _check_counts(path: str | os.PathLike[str]) -> None:
+    """ValueError where the head declares more than a byte each could hold: space is taken before faces are read."""
+    with open(path, "rb") as handle:
+        head = handle.read(_LONGEST_HEAD).partition(b"end_header")[0]
+    declared = sum(int(count) for count in re.findall(rb"^element\s+\S+\s+(\d{1,18})\s*$", head, re.MULTILINE))
+    size = os.path.getsize(path)
+    if declared > size:
+        raise ValueError(f"it declares {declared} vertices and faces, and has {size} bytes")

@@ -160,6 +160,11 @@ def _parse_row(where: str, text: str) -> list[float]:
         )
     if np.linalg.norm(row[4:]) < 1e-6:
         raise InputError(f"{where}: the quaternion has length zero; expected a unit quaternion `qx qy qz qw`")
+    if not 0.5 <= np.linalg.norm(row[4:]) <= 2.0:
+        raise InputError(
+            f"{where}: the quaternion has length {np.linalg.norm(row[4:]):.3g}; expected about 1: are the columns "
+            "`timestamp tx ty tz qx qy qz qw`?"
+        )
     return row
 
 

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
-from pathlib import Path
 from typing import Any
 
-from vggtgeo.datasets import Frame, Sequence, SequenceView, open_sequence
-from vggtgeo.datasets.frame import check_selection
-from vggtgeo.datasets.in_memory import FrameStream, frame_stream
-from vggtgeo.datasets.reduced import reduced
+from vggtgeo.datasets import Frame, Sequence
 from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -36,7 +31,8 @@ from vggtgeo.results.checkpoints import (
     resumed,
 )
 from vggtgeo.results.result import Result, RunRecord
-from vggtgeo.results.summary import compare, lens_of, summarise
+from vggtgeo.results.source import Source, as_read, opened
+from vggtgeo.results.summary import compare, summarise
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
@@ -60,8 +56,6 @@ FREE_MAP = (
     "`known_map` was made without depth, so that its lengths have no unit: the depth of these frames, in metres, is "
     "not used; begin a new map to have it in metres"
 )
-LEAST_SIDE = 32
-"""Pixels: windows of features and of the image pyramid do not fit into less."""
 
 
 @in_double_precision
@@ -121,7 +115,7 @@ def reconstruct(
     clock, began = Clock(), time.perf_counter()
     settings = settings or SlamSettings()
     with interruption() as stop, collected_warnings() as collected:
-        source = _opened(frames, camera, settings)
+        source = opened(frames, camera, settings)
         source.check(start, end, stride)
         perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric)
@@ -154,7 +148,7 @@ def reconstruct(
             **(facts or {}),
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
-            **_as_read(source, slam),
+            **as_read(source, slam),
         }
         notices = (*warned, *(collected if before is None else before.unsaid(collected)))
         ending = _Ending(
@@ -212,96 +206,7 @@ def _concluded(
     return Result.assemble(RunRecord(slam, built, tuple(windows), run.truth, notices, run.title), verdict, summary)
 
 
-@dataclass(frozen=True, eq=False)
-class _Source:
-    """What an estimator may see, and the truth, set apart for the comparison."""
-
-    name: str
-    frames: Sequence | FrameStream
-    truth: Trajectory | None
-    read: Camera
-    """Of the images before they were reduced."""
-
-    @property
-    def camera(self) -> Camera:
-        return self.frames.camera
-
-    @property
-    def has_depth(self) -> bool:
-        return self.frames.has_depth
-
-    def check(self, start: int, end: int | None, stride: int) -> None:
-        """InputError for a selection that is none, or images too small for features, before anything is compiled."""
-        if min(self.camera.width, self.camera.height) < LEAST_SIDE:
-            raise InputError(
-                f"the images of `{self.name}` are {self.camera.width} x {self.camera.height} pixels; both sides must "
-                f"be at least {LEAST_SIDE}"
-            )
-        length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames) or sys.maxsize
-        check_selection(self.name, length, start, end, stride)
-
-    def known(self, selection: tuple[int, int | None, int]) -> dict[str, Any]:
-        """What tells this source from another before a frame is read."""
-        length = None if isinstance(self.frames, FrameStream) else len(self.frames)
-        size = f"{self.camera.width} x {self.camera.height}"
-        return {
-            **{"name": self.name, "frames": length, "size": size, "camera": self.camera},
-            **{"depth": self.has_depth, "start, end, stride": selection},
-        }
-
-    def resumable(self, asked: Checkpoints | None) -> Checkpoints | None:
-        """InputError for a resumed run over frames that do not come again."""
-        if asked is not None and asked.resume and self.count(0, None, 1) is None:
-            raise InputError(f"the frames of `{self.name}` come once: such a run cannot be resumed")
-        return asked
-
-    def count(self, start: int, end: int | None, stride: int) -> int | None:
-        """Frames of a selection; None where only their end will tell."""
-        if isinstance(self.frames, FrameStream):
-            return None
-        length = len(self.frames)
-        if not length:  # a camera that is running
-            return None
-        return len(range(start, length if end is None else min(length, end), stride))
-
-
-def _opened(
-    frames: str | os.PathLike[str] | Sequence | Iterable[Any], camera: Camera | None, settings: SlamSettings
-) -> _Source:
-    most = settings.camera.most_pixels
-    if isinstance(frames, str | os.PathLike):
-        frames = open_sequence(Path(frames))
-    if not isinstance(frames, Sequence):
-        stream = frame_stream(frames, camera)
-        return _Source("frames", reduced(stream, most), None, stream.camera)
-    name = frames.name.encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
-    view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
-    return _Source(name, reduced(view, most), _truth(frames), view.camera)
-
-
-def _truth(sequence: Sequence) -> Trajectory | None:
-    """The truth for the comparison; one that cannot be read costs that only."""
-    try:
-        return sequence.ground_truth()
-    except InputError as error:
-        warnings.warn(f"the truth cannot be used and is left out: {error}", InputWarning, stacklevel=4)
-        return None
-
-
-def _as_read(source: _Source, slam: Slam) -> dict[str, Any]:
-    """What the summary says of images that were reduced: both sizes, and the camera of the images as they were read."""
-    size, read = (f"{camera.width} x {camera.height}" for camera in (source.camera, source.read))
-    if size == read:
-        return {}
-    fx, fy, cx, cy = map(float, slam.intrinsics)
-    enlarged = lambda camera: camera.resized(source.read.width, source.read.height)
-    found = enlarged(replace(source.camera, intrinsics=(fx, fy, cx, cy)))
-    camera = dict(zip(("fx", "fy", "cx", "cy"), found.intrinsics, strict=True))
-    lens = {} if slam.lens is None else {"lens": lens_of(enlarged(slam.lens))}
-    return {"images_reduced": {"from": read, "to": size, "intrinsics_as_read": camera}, **lens}
-
-
-def _first_state(known: Slam | None, source: _Source, settings: SlamSettings) -> Slam | None:
+def _first_state(known: Slam | None, source: Source, settings: SlamSettings) -> Slam | None:
     """Before the first frame, in a map that is known; InputError for one of another camera, or where one is needed."""
     if known is not None:
         if source.has_depth and not known.metric:
@@ -313,7 +218,7 @@ def _first_state(known: Slam | None, source: _Source, settings: SlamSettings) ->
 
 
 def _first_pass(
-    source: _Source,
+    source: Source,
     selection: tuple[int, int | None, int],
     perception: Perception,
     settings: SlamSettings,
@@ -391,7 +296,7 @@ class _Loop:
     first: the state before the first frame, where there is a map.
     """
 
-    source: _Source
+    source: Source
     selection: tuple[int, int | None, int]
     perception: Perception
     settings: SlamSettings

@@ -244,13 +244,43 @@ def _refuse_input(place: Path, source: Path | None) -> None:
         raise InputError(f"`{place}` is a file; the results need a folder: give another name with `-o`")
     if source is not None and place.exists() and source.is_dir() and place.samefile(source):
         raise InputError(f"`{place}` is the folder that is read; give another folder for the results with `-o`")
-    if not place.is_dir() or (place / SUMMARY).is_file():
+    if not place.is_dir():
+        return
+    if source is not None:
+        inside = _inside(place, source)
+        if inside is not None and _is_known(inside):
+            raise InputError(
+                f"`{source}` is read, and a run into `{place}` replaces `{place / inside}`; give another folder for "
+                "the results with `-o`"
+            )
+    if (place / SUMMARY).is_file():
         return
     for path in place.iterdir():
         if path.name in _MARKS or (path.suffix.lower() in IMAGE_SUFFIXES and not _is_known(path.name)):
             raise InputError(
                 f"`{place}` holds images or a sequence (`{path.name}`); give another folder for the results with `-o`"
             )
+    if not (place / UNFINISHED).is_dir():  # a run that was killed while its files were moved has no summary, either
+        for path in sorted(place.iterdir()):
+            if any(fnmatchcase(path.name, pattern) for pattern in NAMES):
+                raise InputError(
+                    f"`{place}` holds `{path.name}`, which a run replaces, and no `{SUMMARY}`: it is not of a run; "
+                    "give another folder for the results with `-o`"
+                )
+
+
+def _inside(place: Path, source: Path) -> str | None:
+    """The first part of the way from `place` to `source`; None where it does not lie in it."""
+    try:
+        parts = source.resolve().relative_to(place.resolve()).parts
+    except ValueError:
+        return None
+    return parts[0] if parts else None
+
+
+def is_result(folder: Path, file: Path) -> bool:
+    """Whether `file` has the name and place of a result of a run into `folder`."""
+    return file.resolve().parent == folder.resolve() and _is_known(file.name)
 
 
 def _is_known(name: str) -> bool:

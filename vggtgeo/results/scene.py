@@ -37,6 +37,8 @@ _LAYOUT: dict[str, tuple[int | str, ...]] = {
     "track_pixel": ("m", 2),
 }
 """Shapes of the arrays: `k` keyframes, `n` points, `m` observations."""
+_LARGEST, _RIGID = 100_000, 1e-3
+"""Pixels of a side; how far a rotation's product with its transpose may be from the unit matrix."""
 _WHOLE = ("frames", "size", "track_point", "track_view")
 
 
@@ -97,7 +99,31 @@ class Scene:
         if len(tracks.point) and not (0 <= tracks.point.min() <= tracks.point.max() < len(tracks)):
             raise ValueError("its tracks name points that are not there")
         size, intrinsics = (int(width), int(height)), values["intrinsics"]
+        wrong = _impossible(poses, intrinsics, size, tracks)
+        if wrong:
+            raise ValueError(wrong)
         return cls(values["frames"], values["timestamps"], poses, intrinsics, size, tracks, bool(values["metric"]))
+
+
+def _impossible(poses: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], tracks: Tracks) -> str | None:
+    """What no run writes, if anything: other programs would take it as it is."""
+    if not len(poses):
+        return "it has no keyframe"
+    if not (0 < min(size) <= max(size) <= _LARGEST):
+        return f"its pictures are {size[0]} x {size[1]} pixels"
+    if not (np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all()):
+        return f"its intrinsics are {intrinsics}"
+    turns = poses[:, :3, :3].astype(np.float64)
+    if not (np.isfinite(poses).all() and np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() < _RIGID):
+        return "its poses are not all rigid"
+    if not (np.isfinite(tracks.points).all() and np.isfinite(tracks.pixel).all()):
+        return "its points or their pixels hold a NaN or an infinity"
+    if tracks.colours.dtype != np.uint8:
+        return f"its colours are {tracks.colours.dtype}; expected uint8"
+    seen = np.bincount(tracks.point, minlength=len(tracks))
+    if (np.diff(tracks.point) < 0).any() or (seen == 0).any():
+        return "its observations are not listed point by point, or a point has none"
+    return None
 
 
 def _read(archive: Archive) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.frame import Frame, Sequence, check_size
+from vggtgeo.datasets.frame import Frame, Sequence, check_frame
 from vggtgeo.datasets.in_memory import FrameStream, frame_stream
 from vggtgeo.datasets.reduced import reduced
 from vggtgeo.geometry import rigid
@@ -190,7 +190,7 @@ def _described(
             return roles.points.describe(image)
 
     def prepare(frame: Frame) -> tuple[Frame, Description]:
-        check_size(frame, camera)
+        check_frame(frame, camera)
         image = undistorter.image(frame.image)
         depth = None if frame.depth is None else undistorter.depth(frame.depth)
         frame = Frame(frame.index, frame.timestamp, image, depth, frame.name)

@@ -35,7 +35,7 @@ def recording_of(folder: Path) -> Path | None:
     """
     try:
         target = tomllib.loads((folder / "settings.toml").read_text(encoding="utf-8")).get("rerun")
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return max(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, default=None)
     if target is None:
         return None
@@ -69,17 +69,21 @@ def _log_depth(stream: Any, file: Path) -> None:
     import rerun as rr
 
     number = file.name.split(".")[0]
+    if not number.isdecimal():
+        raise InputError(f"`{file}` is no depth of a run: expected the number of a frame before `.depth.png`")
     stream.set_time("frame", sequence=int(number))
-    stream.log("keyframe/depth", rr.DepthImage(_read(file), meter=DEPTH_UNIT, colormap="viridis"))
+    stream.log("keyframe/depth", rr.DepthImage(_read(file, np.uint16), meter=DEPTH_UNIT, colormap="viridis"))
     confidence = file.with_name(f"{number}.confidence.png")
     if confidence.is_file():
         stream.log(
-            "keyframe/confidence", rr.Image(cv2.applyColorMap(_read(confidence), cv2.COLORMAP_VIRIDIS)[..., ::-1])
+            "keyframe/confidence",
+            rr.Image(cv2.applyColorMap(_read(confidence, np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]),
         )
 
 
-def _read(file: Path) -> np.ndarray:
+def _read(file: Path, kind: type) -> np.ndarray:
     image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise InputError(f"`{file}` cannot be read as an image; run again with `--save-depth`")
+    if image is None or image.ndim != 2 or image.dtype != kind:
+        found = "cannot be read as an image" if image is None else f"is {image.dtype} {image.shape}"
+        raise InputError(f"`{file}` {found}; expected {np.dtype(kind)} [H, W]: run again with `--save-depth`")
     return np.asarray(image)

@@ -24,6 +24,7 @@ VIEWER_PORT = 9876
 """Where the viewer listens, and where a served recording is to be had if the port is free."""
 WEB_PORT = 9090
 """The same of the page that shows a served recording."""
+_MAGIC = b"RRF"
 _PATIENCE = 10.0
 """Seconds: for a viewer to open, and for it to take what was logged last."""
 
@@ -44,7 +45,15 @@ def check_target(target: str) -> str:
         )
     if Path(target).is_dir():
         raise InputError(f"`--rerun` is `{target}`, which is a folder; give a new file ending with `.rrd`")
+    if Path(target).is_file() and not _is_recording(Path(target)):
+        raise InputError(f"`--rerun` is `{target}`, which is there and is no recording; give the name of a new file")
     return target
+
+
+def _is_recording(file: Path) -> bool:
+    """Whether Rerun wrote the file, so that a new recording may take its place."""
+    with file.open("rb") as handle:
+        return handle.read(len(_MAGIC)) in (_MAGIC, b"")
 
 
 def open_target(target: str, name: str, instead: Path) -> Opened:
@@ -90,7 +99,10 @@ def has_screen() -> bool:
 
 def _save(stream: Any, path: Path) -> None:
     make_parent(path)
-    stream.save(path, default_blueprint=blueprint())
+    try:
+        stream.save(path, default_blueprint=blueprint())
+    except RuntimeError as error:
+        raise InputError(f"`--rerun` is `{path}`, which cannot be written: {str(error).splitlines()[0]}") from None
 
 
 def _spawn(stream: Any, instead: Path) -> None:

@@ -1,0 +1,26 @@
+"""The pictures of a run's keyframes, for the formats that want them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from vggtgeo.datasets.image_defects import declared_size
+from vggtgeo.io.errors import InputError
+from vggtgeo.results.scene import Scene
+
+
+def copy_pictures(scene: Scene, source: Path, target: Path) -> None:
+    """`images/` of the run in `source`, below `target`; InputError for one that is missing, or of another size."""
+    (target / "images").mkdir(parents=True, exist_ok=True)
+    for view in range(len(scene.frames)):
+        file = source / "images" / scene.image_name(view)
+        if not file.is_file():
+            raise InputError(f"`{file}` is not there; run again, with `-o {source}`")
+        width, height = declared_size(file.read_bytes())
+        if (width, height) != scene.size:
+            raise InputError(
+                f"`{file}` is no picture of {scene.size[0]} x {scene.size[1]} pixels (found {width} x {height}); run "
+                f"again, with `-o {source}`"
+            )
+        shutil.copyfile(file, target / "images" / file.name)

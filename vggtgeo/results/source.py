@@ -1,0 +1,116 @@
+"""Where a run's frames come from: a folder, a file, a reader, a stream of images; opened, checked and reduced."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vggtgeo.datasets import Sequence, SequenceView, open_sequence
+from vggtgeo.datasets.frame import check_selection
+from vggtgeo.datasets.in_memory import FrameStream, frame_stream
+from vggtgeo.datasets.reduced import reduced
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.results.checkpoints import Checkpoints
+from vggtgeo.results.summary import lens_of
+from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.state import Slam
+
+LEAST_SIDE = 32
+"""Pixels: windows of features and of the image pyramid do not fit into less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What an estimator may see, and the truth, set apart for the comparison."""
+
+    name: str
+    frames: Sequence | FrameStream
+    truth: Trajectory | None
+    read: Camera
+    """Of the images before they were reduced."""
+
+    @property
+    def camera(self) -> Camera:
+        return self.frames.camera
+
+    @property
+    def has_depth(self) -> bool:
+        return self.frames.has_depth
+
+    def check(self, start: int, end: int | None, stride: int) -> None:
+        """InputError for a selection that is none, or images too small for features, before anything is compiled."""
+        if min(self.camera.width, self.camera.height) < LEAST_SIDE:
+            raise InputError(
+                f"the images of `{self.name}` are {self.camera.width} x {self.camera.height} pixels; both sides must "
+                f"be at least {LEAST_SIDE}"
+            )
+        length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames) or sys.maxsize
+        check_selection(self.name, length, start, end, stride)
+
+    def known(self, selection: tuple[int, int | None, int]) -> dict[str, Any]:
+        """What tells this source from another before a frame is read."""
+        length = None if isinstance(self.frames, FrameStream) else len(self.frames)
+        size = f"{self.camera.width} x {self.camera.height}"
+        return {
+            **{"name": self.name, "frames": length, "size": size, "camera": self.camera},
+            **{"depth": self.has_depth, "start, end, stride": selection},
+        }
+
+    def resumable(self, asked: Checkpoints | None) -> Checkpoints | None:
+        """InputError for a resumed run over frames that do not come again."""
+        if asked is not None and asked.resume and self.count(0, None, 1) is None:
+            raise InputError(f"the frames of `{self.name}` come once: such a run cannot be resumed")
+        return asked
+
+    def count(self, start: int, end: int | None, stride: int) -> int | None:
+        """Frames of a selection; None where only their end will tell."""
+        if isinstance(self.frames, FrameStream):
+            return None
+        length = len(self.frames)
+        if not length:  # a camera that is running
+            return None
+        return len(range(start, length if end is None else min(length, end), stride))
+
+
+def opened(
+    frames: str | os.PathLike[str] | Sequence | Iterable[Any], camera: Camera | None, settings: SlamSettings
+) -> Source:
+    """Opens what a run was given, as `reconstruct` takes it; images are reduced to `camera.most_pixels`."""
+    most = settings.camera.most_pixels
+    if isinstance(frames, str | os.PathLike):
+        frames = open_sequence(Path(frames))
+    if not isinstance(frames, Sequence):
+        stream = frame_stream(frames, camera)
+        return Source("frames", reduced(stream, most), None, stream.camera)
+    name = frames.name.encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
+    view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
+    return Source(name, reduced(view, most), _truth(frames), view.camera)
+
+
+def _truth(sequence: Sequence) -> Trajectory | None:
+    """The truth for the comparison; one that cannot be read costs that only."""
+    try:
+        return sequence.ground_truth()
+    except InputError as error:
+        warnings.warn(f"the truth cannot be used and is left out: {error}", InputWarning, stacklevel=4)
+        return None
+
+
+def as_read(source: Source, slam: Slam) -> dict[str, Any]:
+    """What the summary says of images that were reduced: both sizes, and the camera of the images as they were read."""
+    size, read = (f"{camera.width} x {camera.height}" for camera in (source.camera, source.read))
+    if size == read:
+        return {}
+    fx, fy, cx, cy = map(float, slam.intrinsics)
+    enlarged = lambda camera: camera.resized(source.read.width, source.read.height)
+    found = enlarged(replace(source.camera, intrinsics=(fx, fy, cx, cy)))
+    camera = dict(zip(("fx", "fy", "cx", "cy"), found.intrinsics, strict=True))
+    lens = {} if slam.lens is None else {"lens": lens_of(enlarged(slam.lens))}
+    return {"images_reduced": {"from": read, "to": size, "intrinsics_as_read": camera}, **lens}
