@@ -51,6 +51,7 @@ WRONG = {
     "camera.guessed_intrinsics_sigma": (-0.3,),
     "camera.guessed_centre_sigma": (0.0, -0.02),
     "camera.most_pixels": (-1, 1.5),
+    "camera.still_parts": (1,),
     "camera.first_pass": (-1, 1.5),
     "camera.refine_intrinsics": ("sometimes", True),
     "window.size": (2, 10.0),

@@ -45,6 +45,7 @@ from vggtgeo.slam.run import default_roles, finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import changed
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.still_parts import APART, PICTURES, StillParts, find_still_parts
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.input import check_input, check_refusals
@@ -135,6 +136,7 @@ def reconstruct(
         hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
+        perception = _without_still_parts(perception, source, selection, settings, hooks, evidence)
         if first is None and before is None:
             first = _first_pass(source, selection, perception, settings, hooks, stop)
         loop = _Loop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
@@ -149,6 +151,7 @@ def reconstruct(
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
             **as_read(source, slam),
+            **({"still_parts": round(still.share, 4)} if (still := perception.roles.still_parts) is not None else {}),
         }
         notices = (*warned, *(collected if before is None else before.unsaid(collected)))
         ending = _Ending(
@@ -243,6 +246,32 @@ def _first_pass(
     for role, counts in refused.items():
         vars(perception.refusals[role]).update(vars(counts))
     return found
+
+
+def _without_still_parts(
+    perception: Perception,
+    source: Source,
+    selection: tuple[int, int | None, int],
+    settings: SlamSettings,
+    hooks: _Callbacks,
+    evidence: EvidenceRecorder,
+) -> Perception:
+    """Roles, and the verdict's witness, that look for nothing where the picture moves with the camera."""
+    if not settings.camera.still_parts:
+        return perception
+    with hooks.clock.measure("still parts"):
+        seen = find_still_parts(source.some_pictures(*selection, PICTURES, APART))
+    if seen is None:
+        return perception
+    parts = StillParts.of(seen, source.camera)
+    warnings.warn(
+        f"{100 * parts.share:.1f} % of the picture stays in its place while the rest moves (bars, a watermark, "
+        "something on the lens?): nothing is looked for there",
+        InputWarning,
+        stacklevel=3,
+    )
+    evidence.still = parts.seen
+    return replace(perception, roles=replace(perception.roles, still_parts=parts))
 
 
 def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:

@@ -10,6 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import UInt8
+
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence
 from vggtgeo.datasets.frame import check_selection
 from vggtgeo.datasets.in_memory import FrameStream, frame_stream
@@ -19,6 +22,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.summary import lens_of
+from vggtgeo.simulation.sequence import SyntheticSequence
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam
 
@@ -35,6 +39,7 @@ class Source:
     truth: Trajectory | None
     read: Camera
     """Of the images before they were reduced."""
+    simulated: bool = False
 
     @property
     def camera(self) -> Camera:
@@ -69,6 +74,22 @@ class Source:
             raise InputError(f"the frames of `{self.name}` come once: such a run cannot be resumed")
         return asked
 
+    def some_pictures(
+        self, start: int, end: int | None, stride: int, most: int, apart: int
+    ) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """At most `most` of the first images of a selection, at most `apart` of its frames apart; none of frames that
+        come once, nor of simulated ones, which cost more than to look at them is worth.
+        """
+        count = self.count(start, end, stride)
+        if not count or self.simulated or isinstance(self.frames, FrameStream):
+            return []
+        step = max(min(apart, count // most), 1)
+        until = start + min(count, most * step) * stride
+        with warnings.catch_warnings():  # what is wrong with a frame is told when the run comes to it
+            warnings.simplefilter("ignore", InputWarning)
+            frames = SequenceView(self.frames, self.camera, False).frames(start, until, step * stride)
+            return [frame.image for frame in frames]
+
     def count(self, start: int, end: int | None, stride: int) -> int | None:
         """Frames of a selection; None where only their end will tell."""
         if isinstance(self.frames, FrameStream):
@@ -91,7 +112,8 @@ def opened(
         return Source("frames", reduced(stream, most), None, stream.camera)
     name = frames.name.encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
     view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
-    return Source(name, reduced(view, most), _truth(frames), view.camera)
+    simulated = isinstance(frames, SyntheticSequence)
+    return Source(name, reduced(view, most), _truth(frames), view.camera, simulated)
 
 
 def _truth(sequence: Sequence) -> Trajectory | None:

@@ -142,7 +142,10 @@ def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineF
     """The described segments of an image; none where the settings leave lines out."""
     if not settings.line.use_lines:
         return roles.line_matches.describe(image, Segments(np.zeros((0, 2, 2)), np.zeros(0)))
-    return roles.line_matches.describe(image, roles.lines.detect(image))
+    found = roles.lines.detect(image)
+    if roles.still_parts is not None:
+        found = roles.still_parts.without_segments(found)
+    return roles.line_matches.describe(image, found)
 
 
 def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) -> Slots:

@@ -187,12 +187,15 @@ def _described(
 
     def describe(image: np.ndarray, stage: str) -> Features:
         with clock.measure(stage):
-            return roles.points.describe(image)
+            features = roles.points.describe(image)
+            return features if roles.still_parts is None else roles.still_parts.without_points(features)
 
     def prepare(frame: Frame) -> tuple[Frame, Description]:
         check_frame(frame, camera)
         image = undistorter.image(frame.image)
         depth = None if frame.depth is None else undistorter.depth(frame.depth)
+        if depth is not None and roles.still_parts is not None:
+            depth = roles.still_parts.without_depth(depth)
         frame = Frame(frame.index, frame.timestamp, image, depth, frame.name)
         view = None
         if roles.alignment is not None and roles.metric and camera.known:

@@ -177,6 +177,10 @@ class CameraSettings(CheckedSettings):
     first_pass: int = whole(150, at_least=0)
     """Frames of a first pass that finds a camera which nobody gave; the run begins with what it found. Where frames
     come once (a live camera, a stream), or with 0, there is none, and a guess is estimated while the run goes on."""
+    still_parts: bool = switch(True)
+    """Whether some frames are looked at first for parts of the picture that stay in their place while the rest moves
+    (bars, a watermark, specks on the lens), so that nothing is looked for there, see `slam/still_parts.py`. Frames that
+    come once (a live camera, a stream) and simulated ones are not."""
     refine_intrinsics: str = one_of("auto", "always", "never")
     """Whether the last adjustment may move known intrinsics: "auto", where the images ask for it and it pays (see
     `slam/calibration.py`); "always", where the images ask for it; "never". Guessed ones are always estimated, and

@@ -33,6 +33,7 @@ from vggtgeo.slam.setting_groups import (
     WeightSettings,
     WindowSettings,
 )
+from vggtgeo.slam.still_parts import StillParts
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,10 @@ class Roles:
     flow: PatchFlow | None = field(default_factory=PatchFlow)
     """Follows a keyframe's key points into frames that `alignment` then refines, so that most frames need no
     descriptors; None describes and matches every frame."""
+
+    still_parts: StillParts | None = None
+    """What of the picture belongs to the camera, not to the world: nothing is looked for there. `vggtgeo.run` and
+    `vggtgeo.reconstruct` find it."""
 
     def seeded(self, seed: int) -> Roles:
         """The same roles, whose robust estimators draw other samples; 0: as they draw them by themselves."""

@@ -32,8 +32,9 @@ ROUND_TRIP = 0.5
 """Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
 MOST_WAITING = 4
 """Frames that wait to be looked at; they hold their images."""
+_PATCH = (15, 15)
 _FLOW = {
-    "winSize": (15, 15),
+    "winSize": _PATCH,
     "maxLevel": 4,
     "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),
 }
@@ -91,6 +92,8 @@ class EvidenceRecorder(Callback):
     """
 
     def __init__(self, camera: Camera) -> None:
+        self.still: np.ndarray | None = None
+        """Bool [H, W], parts of the images that belong to the camera: no corner is followed there."""
         self._frames: list[FrameEvidence] = []
         self._waiting: deque[Future[None]] = deque()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="evidence")
@@ -134,8 +137,10 @@ class EvidenceRecorder(Callback):
         grey, contrast = _small_grey(frame.image, scale)
         if self._image is not None and len(self._ids):
             pixels, kept = follow(self._image, grey, self._pixels)
+            kept &= self._of_the_world(pixels, grey)
             self._ids, self._pixels = one_a_cell(self._ids[kept], pixels[kept])
         fresh = new_corners(grey, self._pixels)
+        fresh = fresh[self._of_the_world(fresh, grey)]
         numbers = np.arange(self._next, self._next + len(fresh), dtype=np.int32)
         self._next += len(fresh)
         self._ids = np.concatenate([self._ids, numbers])
@@ -148,6 +153,15 @@ class EvidenceRecorder(Callback):
         self._frames.append(
             FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth, median, changed, contrast)
         )
+
+    def _of_the_world(self, pixels: np.ndarray, grey: np.ndarray) -> np.ndarray:
+        """Which corners of the small image are so far from the still parts that no patch around them sees those."""
+        if self.still is None or not len(pixels):
+            return np.ones(len(pixels), bool)
+        small = cv2.resize(self.still.astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_AREA)
+        near = cv2.dilate(small, np.ones(_PATCH, np.uint8))
+        column, row = np.clip(np.rint(pixels), 0, np.array(grey.shape[::-1]) - 1).astype(int).T
+        return near[row, column] == 0
 
     def _compare_depth(self, depth: np.ndarray | None) -> tuple[float, float]:
         """The share of pixels that changed since the last frame, and the median; NaN where there is no depth."""
