@@ -232,7 +232,7 @@ class Bent:
             yield Frame(frame.index, frame.timestamp, image, None, frame.name)
 
 
-@pytest.mark.long
+@pytest.mark.slow  # three minutes: first passes, a run, its last adjustment
 def test_a_phone_without_calibration_from_end_to_end(tmp_path: Path) -> None:
     # Proves that images alone, of an unknown lens that bends corners by many pixels, give its focal length to 3 %, a
     # word on it, a summary that says it, and a map that frames as they were drawn are found in again. Oracle: the lens

@@ -136,7 +136,7 @@ def reconstruct(
         hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
-        perception = _without_still_parts(perception, source, selection, settings, hooks, evidence)
+        perception = _without_still_parts(perception, source, selection, settings, hooks, evidence, stop)
         if first is None and before is None:
             first = _first_pass(source, selection, perception, settings, hooks, stop)
         loop = _Loop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
@@ -255,11 +255,13 @@ def _without_still_parts(
     settings: SlamSettings,
     hooks: _Callbacks,
     evidence: EvidenceRecorder,
+    stop: Interruption,
 ) -> Perception:
     """Roles, and the verdict's witness, that look for nothing where the picture moves with the camera."""
     if not settings.camera.still_parts:
         return perception
-    with hooks.clock.measure("still parts"):
+    hooks.each("on_stage", "looking for what stays in its place in the picture")
+    with hooks.clock.measure("still parts"), stop.at_once():
         seen = find_still_parts(source.some_pictures(*selection, PICTURES, APART))
     if seen is None:
         return perception

@@ -6,6 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -85,10 +86,12 @@ class Source:
             return []
         step = max(min(apart, count // most), 1)
         until = start + min(count, most * step) * stride
-        with warnings.catch_warnings():  # what is wrong with a frame is told when the run comes to it
+        # What is wrong with a frame, or with all of them, is told when the run comes to it.
+        with warnings.catch_warnings(), suppress(InputError):
             warnings.simplefilter("ignore", InputWarning)
             frames = SequenceView(self.frames, self.camera, False).frames(start, until, step * stride)
             return [frame.image for frame in frames]
+        return []
 
     def count(self, start: int, end: int | None, stride: int) -> int | None:
         """Frames of a selection; None where only their end will tell."""

@@ -42,6 +42,47 @@ def dirty_lens(recording: Recording, rng: np.random.Generator) -> Recording:
     return _images(recording, lambda image, row: np.where(mask[..., None] > 0, image // 5, image))
 
 
+def bars(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Black bars above and below, of 13 % of the height each, as in a film."""
+    del rng
+    height = round(0.13 * recording.frames[0].image.shape[0])
+
+    def paint(image: np.ndarray, row: int) -> np.ndarray:
+        image = image.copy()
+        image[:height] = image[-height:] = 0
+        return image
+
+    return _images(recording, paint)
+
+
+def text(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A time code, the name of the camera and an address, white, in three lines."""
+    del rng
+    height, width = recording.frames[0].image.shape[:2]
+    size = width / 770
+
+    def paint(image: np.ndarray, row: int) -> np.ndarray:
+        image = image.copy()
+        lines = (f"REC 2024-05-03 12:{row // 600:02d}:{row // 10 % 60:02d}", "CAM 03  ISO 400  F2.8", "www.example.org")
+        for place, line in zip((0.08, 0.52, 0.97), lines, strict=True):
+            corner = (round(0.02 * width), round(place * height))
+            cv2.putText(image, line, corner, cv2.FONT_HERSHEY_SIMPLEX, size, (255, 255, 255), 2)
+        return image
+
+    return _images(recording, paint)
+
+
+def board(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A coloured board that the camera carries before the lower 30 % of the picture, 0.45 m away, also in depth."""
+    height, width = recording.frames[0].image.shape[:2]
+    pattern = rng.integers(0, 255, (height // 8, width // 8, 3)).astype(np.uint8)
+    pattern = cv2.resize(pattern, (width, height), interpolation=cv2.INTER_CUBIC)
+    top = round(0.7 * height)
+    below = np.arange(height)[:, None] >= top
+    painted = _images(recording, lambda image, row: np.where(below[..., None], pattern, image))
+    return _depths(painted, lambda depth, row: np.where(below, 0.45, depth))
+
+
 def person(recording: Recording, rng: np.random.Generator) -> Recording:
     """A patterned figure 1.2 m away walks through the picture, to and fro; depth sees it, too."""
     height, width = recording.frames[0].image.shape[:2]
@@ -136,10 +177,8 @@ def without_depth(recording: Recording, rng: np.random.Generator) -> Recording:
 
 DEGRADATIONS: dict[str, Degradation] = {
     "base": as_it_is,
-    **{
-        change.__name__: change
-        for change in (dirty_lens, person, dark, centimetres, growing_depth, other_depth, shuffled, barrel)
-    },
+    **{change.__name__: change for change in (dirty_lens, bars, text, board, person, dark, centimetres)},
+    **{change.__name__: change for change in (growing_depth, other_depth, shuffled, barrel)},
     **{change.__name__: change for change in (zoomed, covered, without_depth)},
 }
 
