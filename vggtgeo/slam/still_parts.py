@@ -2,9 +2,9 @@
 specks on the lens, a hand that holds the camera.
 
 Their corners and edges are the best of the picture to follow, sharp and always there, and all of them say that the
-camera stands still. Forty frames of building-walk with black bars of 13 % are 18.6 cm off and called good where the
-bars' edges are looked at, with three lines of text 44 cm; 1.5 cm without either. So some frames are looked at before
-the first is tracked.
+camera stands still. Forty frames of building-walk, images alone, with black bars of 13 % are 34 cm off and called good
+where the bars' edges are looked at, with three lines of text 42 cm; 1.3 cm without either
+(`benchmarks/still_parts.py`). So some frames are looked at before the first is tracked.
 
 What stays in its place has the same gradient in every picture: the sum of a pixel's gradients over the pictures is as
 long as the sum of their lengths (the mean resultant length of directional statistics). Where the camera moves, what
