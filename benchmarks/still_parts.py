@@ -38,11 +38,9 @@ def main() -> None:
             changed = DEGRADATIONS[name](Recording(frames, clip.camera, truth), np.random.default_rng(0))
             walk = DegradedWalk(f"{clip.name}, {name}", changed)
             for has_depth in (True, False) if clip.has_depth else (False,):
-                cells = [cell for on in (False, True) for cell in _run(SequenceView(walk, clip.camera, has_depth), on)]
-                share = cells.pop()
-                cells.pop(2)
-                kind = "RGB-D" if has_depth else "RGB"
-                print(f"| {clip.name} | {kind} | {name} | {' | '.join(cells)} | {share} |", flush=True)
+                sequence, kind = SequenceView(walk, clip.camera, has_depth), "RGB-D" if has_depth else "RGB"
+                off, on = (_run(sequence, still_parts) for still_parts in (False, True))
+                print(f"| {clip.name} | {kind} | {name} | {' | '.join((*off[:2], *on))} |", flush=True)
 
 
 def _run(sequence: SequenceView, still_parts: bool) -> list[str]:

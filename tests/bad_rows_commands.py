@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import bad_files as bad
+import numpy as np
 import pytest
 import tiny_sequences as tiny
 from bad_row import Row, good, line, nothing, rows, run_with
@@ -72,10 +73,13 @@ def write(content: str) -> Any:
 
 
 def onto(name: str, flag: str) -> Any:
-    """`vggtgeo run` on good images, with a flag that names a text file that is there."""
+    """`vggtgeo run` on good images, with a flag that names a file of the user."""
 
     def argv(made: Path) -> Any:
-        (made.parent / name).write_text("of the user")
+        if name.endswith(".npz"):  # an archive, as a map is one, too
+            np.savez(made.parent / name, measured=np.zeros(3))
+        else:
+            (made.parent / name).write_text("of the user")
         return run_with(flag, made.parent / name)(made)
 
     return argv
@@ -184,7 +188,7 @@ RUN = rows(
         ("`--map` that is no map", good, flags("--map", __file__)),
         ("`--localise-only` without `--map`", good, flags("--localise-only")),
         ("`--save-map` of a folder", good, flags("--save-map", "/")),
-        ("`--save-map` onto a file that is no map", good, flags("--save-map", __file__)),
+        ("`--save-map` onto a file that is no map", good, {"argv": onto("mine.npz", "--save-map")}),
         (
             "`--save-map` onto a result of the run",
             good,

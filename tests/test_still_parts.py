@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,10 +14,12 @@ from vggtgeo.models.classical import OrbMatcher, SiftMatcher
 from vggtgeo.models.roles import Segments
 
 import vggtgeo as vg
-from vggtgeo.datasets.in_memory import frame_stream
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.source import opened
 from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pipeline import begin
+from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 
@@ -100,6 +103,71 @@ def test_a_walker_before_a_camera_that_stands_is_not_the_world(width: int, step:
     assert find_still_parts(room) is None
 
 
+def rare_edges() -> list[np.ndarray]:
+    """A camera that moves; at the right border a white wall, over which a strong edge passes twice."""
+    pictures = moving(20)
+    for row, picture in enumerate(pictures):
+        picture[:, WIDTH - 40 - 9 * (row % 4) :] = 250
+        if row % 9 == 4:
+            picture[20:220, -30:-12] = 5
+    return pictures
+
+
+def most_of_it() -> list[np.ndarray]:
+    """A board that covers more than half of the picture."""
+    pictures, pattern = moving(), moving(1)[0]
+    for picture in pictures:
+        picture[90:] = pattern[90:]
+    return pictures
+
+
+def walker_in_a_bare_room() -> list[np.ndarray]:
+    """A broad walker before a band of texture, which comes back behind him; above it a frieze that stays."""
+    room = [np.full((HEIGHT, WIDTH, 3), 128, np.uint8) for _ in range(16)]
+    texture, figure = moving(1)[0], moving(2)[1]
+    for row, picture in enumerate(room):
+        picture[:40], picture[100:] = texture[:40], texture[100:]
+        picture[100:, 5 * row : 5 * row + 240] = figure[100:, :240]
+    return room
+
+
+def poster_before_a_slow_camera() -> list[np.ndarray]:
+    """Small soft squares everywhere, which move by a third of a pixel a picture; a dense poster crosses quickly."""
+    squares = np.full((HEIGHT + 20, WIDTH + 20), 128, np.float32)
+    for y in range(8, HEIGHT + 10, 24):
+        for x in range(8, WIDTH + 10, 24):
+            squares[y : y + 6, x : x + 6] = 230
+    squares = cv2.GaussianBlur(squares, (0, 0), 1.0)
+    poster, found = moving(1)[0][:80, :150], []
+    for row in range(20):
+        shift = np.array([[1.0, 0, -0.3 * row], [0, 1.0, -0.24 * row]])
+        picture = np.dstack([cv2.warpAffine(squares, shift, (WIDTH, HEIGHT))] * 3).astype(np.uint8)
+        left = 37 * row % (WIDTH - 150)
+        picture[100:180, left : left + 150] = poster
+        found.append(picture)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("make", "rule", "off"),
+    [
+        (rare_edges, "LEAST_SEEN", 0.0),
+        (most_of_it, "MOST_AREA", 1.0),
+        (walker_in_a_bare_room, "LEAST_CHANGED", 0.0),
+        (poster_before_a_slow_camera, "MOST_STANDING", 1.0),
+    ],
+)
+def test_each_rule_is_needed(
+    make: Callable[[], list[np.ndarray]], rule: str, off: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One rule alone refuses each of these: how often a pixel has its edge, how much of the picture is still, how much
+    else changes, and in how much of the picture. Oracle: with that rule switched off there is a mask.
+    """
+    assert find_still_parts(make()) is None
+    monkeypatch.setattr(f"vggtgeo.slam.still_parts.{rule}", off)
+    assert find_still_parts(make()) is not None
+
+
 @pytest.mark.parametrize("matcher", [SiftMatcher(), OrbMatcher()])
 def test_nothing_is_looked_for_there(matcher: SiftMatcher | OrbMatcher) -> None:
     """No key point, segment, depth or corner of the verdict's witness lies there; all others stay. Oracle: the same
@@ -108,7 +176,7 @@ def test_nothing_is_looked_for_there(matcher: SiftMatcher | OrbMatcher) -> None:
     picture = moving()[0]
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[60:120, 100:220] = True
-    parts = StillParts.of(mask, CAMERA)
+    parts = StillParts(mask)
     before = matcher.describe(picture)
     after = parts.without_points(before)
     inside = mask[tuple(np.rint(before.pixels).astype(int).T[::-1])]
@@ -120,7 +188,7 @@ def test_nothing_is_looked_for_there(matcher: SiftMatcher | OrbMatcher) -> None:
     depth = parts.without_depth(np.ones((HEIGHT, WIDTH), np.float32))
     np.testing.assert_array_equal(np.isnan(depth), mask)
     recorder = EvidenceRecorder(CAMERA)
-    recorder.still = mask
+    recorder.leave_out(mask)
     for row, image in enumerate(moving(3, (3, 2))):
         recorder.add(vg.Frame(row, row / 15, image, None, str(row)))
     assert all(len(frame.ids) > 20 for frame in recorder.frames)
@@ -133,9 +201,25 @@ def test_the_mask_is_undistorted_with_the_images() -> None:
     lens = vg.Camera(CAMERA.intrinsics, WIDTH, HEIGHT, (-0.3, 0.05, 0.0, 0.0))
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[20:31, 20:31] = True
-    row, column = np.argwhere(StillParts.of(mask, lens).ideal).mean(axis=0)
+    row, column = np.argwhere(StillParts(mask).undistorted(lens).mask).mean(axis=0)
     expected = cv2.undistortPoints(np.array([[[25.0, 25.0]]]), lens.matrix, np.array(lens.distortion), P=lens.matrix)
     np.testing.assert_allclose([column, row], expected[0, 0], atol=0.7)
+
+
+def test_a_lens_that_was_found_undistorts_the_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames of a run whose first pass found a lens are undistorted by that; so must be what is left out of them.
+    Oracle: the mask that the lens itself undistorts.
+    """
+    lens = vg.Camera(CAMERA.intrinsics, WIDTH, HEIGHT, (-0.3, 0.05, 0.0, 0.0))
+    parts = StillParts(np.tile(np.arange(HEIGHT)[:, None] < 30, (1, WIDTH)))
+    settings, given = vg.SlamSettings(), {}
+    known = replace(begin(CAMERA, vg.Roles(), settings), lens=lens)
+    described = lambda frames, camera, roles, clock: given.update(camera=camera, roles=roles) or iter(())
+    monkeypatch.setattr("vggtgeo.slam.run._described", described)
+    assert not list(run_frames(iter(()), CAMERA, vg.Roles(still_parts=parts), settings, Clock(), known))
+    assert given["camera"] == lens
+    np.testing.assert_array_equal(given["roles"].still_parts.mask, parts.undistorted(lens).mask)
+    assert (parts.undistorted(lens).mask != parts.mask).any()
 
 
 def test_which_frames_are_looked_at(tmp_path: Path) -> None:
@@ -148,10 +232,9 @@ def test_which_frames_are_looked_at(tmp_path: Path) -> None:
     assert [int(picture[0, 0, 0]) for picture in seen] == [10, 30, 50]
     seen = opened(folder, None, vg.SlamSettings()).some_pictures(0, None, 1, 3, 2)
     assert [int(picture[0, 0, 0]) for picture in seen] == [0, 20, 40]
-    assert opened(vg.simulate("room", 9, size=(64, 48)), None, vg.SlamSettings()).some_pictures(0, None, 1, 3, 2) == []
-    stream = opened(iter(moving(9)), CAMERA, vg.SlamSettings())
-    assert stream.some_pictures(0, None, 1, 3, 2) == []
-    assert frame_stream(iter(moving(1)), CAMERA).camera == CAMERA
+    assert opened(folder, None, vg.SlamSettings()).comes_again((0, None, 1))
+    assert not opened(vg.simulate("room", 9, size=(64, 48)), None, vg.SlamSettings()).comes_again((0, 9, 1))
+    assert not opened(iter(moving(9)), CAMERA, vg.SlamSettings()).comes_again((0, 9, 1))
 
 
 @pytest.mark.long  # two runs of 24 frames

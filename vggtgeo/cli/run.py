@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import is_zipfile
 
 from vggtgeo.cli import run_options as options
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
@@ -123,12 +122,22 @@ def check_map_file(file: Path, output: Path) -> None:
         raise InputError(f"`--save-map` is `{file}`, which is a folder; give the name of a file")
     from vggtgeo.results.run_folder import is_result
 
-    if file.is_file() and file.stat().st_size and not is_zipfile(file):
+    if file.is_file() and file.stat().st_size and not _is_map(file):
         raise InputError(f"`--save-map` is `{file}`, which is there and is no map; give the name of a new file")
     if is_result(output, file):
         raise InputError(
             f"`--save-map` is `{file}`, the name of a result of the run itself; give another, such as `{output}.map`"
         )
+
+
+def _is_map(file: Path) -> bool:
+    from vggtgeo.slam.known_map import MAP
+
+    try:
+        MAP.facts(file)
+    except InputError:
+        return False
+    return True
 
 
 def check_flags(preset: str, features: str, memory_limit_gb: float | None, fps: float | None = None) -> None:

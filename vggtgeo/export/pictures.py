@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 from vggtgeo.datasets.image_defects import declared_size
@@ -17,10 +16,11 @@ def copy_pictures(scene: Scene, source: Path, target: Path) -> None:
         file = source / "images" / scene.image_name(view)
         if not file.is_file():
             raise InputError(f"`{file}` is not there; run again, with `-o {source}`")
-        width, height = declared_size(file.read_bytes())
+        content = file.read_bytes()
+        width, height = declared_size(content)
         if (width, height) != scene.size:
             raise InputError(
                 f"`{file}` is no picture of {scene.size[0]} x {scene.size[1]} pixels (found {width} x {height}); run "
                 f"again, with `-o {source}`"
             )
-        shutil.copyfile(file, target / "images" / file.name)
+        (target / "images" / file.name).write_bytes(content)

@@ -258,21 +258,21 @@ def _without_still_parts(
     stop: Interruption,
 ) -> Perception:
     """Roles, and the verdict's witness, that look for nothing where the picture moves with the camera."""
-    if not settings.camera.still_parts:
+    if not (settings.camera.still_parts and source.comes_again(selection)):
         return perception
     hooks.each("on_stage", "looking for what stays in its place in the picture")
     with hooks.clock.measure("still parts"), stop.at_once():
         seen = find_still_parts(source.some_pictures(*selection, PICTURES, APART))
     if seen is None:
         return perception
-    parts = StillParts.of(seen, source.camera)
+    parts = StillParts(seen)
     warnings.warn(
         f"{100 * parts.share:.1f} % of the picture stays in its place while the rest moves (bars, a watermark, "
         "something on the lens?): nothing is looked for there",
         InputWarning,
         stacklevel=3,
     )
-    evidence.still = parts.seen
+    evidence.leave_out(parts.mask)
     return replace(perception, roles=replace(perception.roles, still_parts=parts))
 
 

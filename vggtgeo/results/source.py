@@ -75,14 +75,16 @@ class Source:
             raise InputError(f"the frames of `{self.name}` come once: such a run cannot be resumed")
         return asked
 
+    def comes_again(self, selection: tuple[int, int | None, int]) -> bool:
+        """Whether frames can be looked at before the run; simulated ones cost more to render than that is worth."""
+        return bool(self.count(*selection)) and not self.simulated
+
     def some_pictures(
         self, start: int, end: int | None, stride: int, most: int, apart: int
     ) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """At most `most` of the first images of a selection, at most `apart` of its frames apart; none of frames that
-        come once, nor of simulated ones, which cost more than to look at them is worth.
-        """
+        """At most `most` of the first images of a selection that comes again, at most `apart` of its frames apart."""
         count = self.count(start, end, stride)
-        if not count or self.simulated or isinstance(self.frames, FrameStream):
+        if not count or isinstance(self.frames, FrameStream):
             return []
         step = max(min(apart, count // most), 1)
         until = start + min(count, most * step) * stride

@@ -11,7 +11,7 @@ from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
 from vggtgeo.slam.adjustment import Adjustment, CameraPrior, build, write_back
-from vggtgeo.slam.calibration import Refinement, free_focal, keyframe_pairs, try_camera, without_surfaces
+from vggtgeo.slam.calibration import Refinement, Solve, free_focal, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.covisibility import Directed, directions
 from vggtgeo.slam.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.factors import Factor, MeasuredRelativePose, factor_terms
@@ -67,8 +67,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             continue
         before = slam
         if slam.calibrated and not slam.metric:
-            again = lambda problem, state: solve_jit(problem, state, solver=global_solver(problem, settings)).state
-            slam = replace(slam, focal_wanted=free_focal(adjustment.problem, solution.state, again))
+            slam = replace(slam, focal_wanted=free_focal(adjustment.problem, solution.state, _solves(settings)))
         if settings.camera.refine_intrinsics != "never":
             slam = _with_its_camera(slam, adjustment, solution.state, edges, settings)
         if settings.refinement.global_rounds == 1:
@@ -83,11 +82,16 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     return replace(slam, pose_sigma=sigma)
 
 
+def _solves(settings: SlamSettings) -> Solve:
+    """Adjusts any problem of the shape of a global adjustment."""
+    return lambda problem, state: solve_jit(problem, state, solver=global_solver(problem, settings)).state
+
+
 def _with_its_camera(
     slam: Slam, adjustment: Adjustment, state: State, edges: list[Directed], settings: SlamSettings
 ) -> Slam:
     """The state after a trial whether a given camera is to be refined, or the lens of a guessed one taken out."""
-    again = lambda problem, state: solve_jit(problem, state, solver=global_solver(problem, settings)).state
+    again = _solves(settings)
     if slam.calibrated:
         found = try_camera(keyframe_pairs(slam, edges), adjustment.problem, state, again)
         return _taken_camera(slam, adjustment, found, settings)

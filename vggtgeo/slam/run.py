@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,10 @@ def run_frames(
     """The same over any iterable of frames of one camera, on from a state that is known."""
     slam = begin(camera, roles, settings) if known is None else known
     # Frames of a map whose camera's lens was found are as that lens drew them.
-    for frame, description in _described(frames, slam.lens or camera, roles, clock):
+    seen_by = slam.lens or camera
+    if roles.still_parts is not None:
+        roles = replace(roles, still_parts=roles.still_parts.undistorted(seen_by))
+    for frame, description in _described(frames, seen_by, roles, clock):
         slam = step(slam, frame, description, roles, settings, clock)
         yield slam
 

@@ -61,8 +61,8 @@ class Roles:
     descriptors; None describes and matches every frame."""
 
     still_parts: StillParts | None = None
-    """What of the picture belongs to the camera, not to the world: nothing is looked for there. `vggtgeo.run` and
-    `vggtgeo.reconstruct` find it."""
+    """What of the images, as they are read, belongs to the camera and not to the world: nothing is looked for there.
+    `vggtgeo.reconstruct` finds it."""
 
     def seeded(self, seed: int) -> Roles:
         """The same roles, whose robust estimators draw other samples; 0: as they draw them by themselves."""

@@ -59,47 +59,40 @@ _GAP, _REACH = 6, 6
 
 @dataclass(frozen=True, eq=False)
 class StillParts:
-    """seen: bool [H, W], of the images as they are read; ideal: the same of the undistorted ones. share: of the picture
-    that is True.
-    """
+    """mask: bool [H, W], True where the picture belongs to the camera."""
 
-    seen: np.ndarray
-    ideal: np.ndarray
+    mask: np.ndarray
 
     @property
     def share(self) -> float:
         """Of the picture."""
-        return float(self.seen.mean())
+        return float(self.mask.mean())
 
-    @classmethod
-    def of(cls, seen: np.ndarray, camera: Camera) -> StillParts:
-        """From the mask of the images as they are read."""
-        ideal = camera.undistorter().image(seen.astype(np.uint8) * 255) > 0
-        return cls(seen, ideal)
+    def undistorted(self, camera: Camera) -> StillParts:
+        """The same of images that the lens of `camera` does not distort."""
+        return StillParts(camera.undistorter().image(self.mask.astype(np.uint8) * 255) > 0)
 
     def without_points(self, features: Features) -> Features:
-        """The key points of an undistorted image that do not lie there; those of networks that describe the whole image
-        are left as they are.
-        """
+        """The key points that do not lie there; those of networks that describe the whole image stay as they are."""
         descriptors: Any = features.descriptors
         vectors = getattr(descriptors, "vectors", None)
         if vectors is None or len(vectors) != len(features):
             return features
-        keep = ~_at(self.ideal, features.pixels)
+        keep = ~_at(self.mask, features.pixels)
         if keep.all():
             return features
         return Features(features.pixels[keep], features.scores[keep], replace(descriptors, vectors=vectors[keep]))
 
     def without_segments(self, segments: Segments) -> Segments:
-        """The segments of an undistorted image whose middle and quarters do not all lie there."""
+        """The segments of which neither the middle nor a quarter lies there."""
         ends = segments.endpoints
-        along = [_at(self.ideal, (1 - t) * ends[:, 0] + t * ends[:, 1]) for t in (0.25, 0.5, 0.75)]
+        along = [_at(self.mask, (1 - t) * ends[:, 0] + t * ends[:, 1]) for t in (0.25, 0.5, 0.75)]
         keep = ~np.logical_or.reduce(along)
         return Segments(ends[keep], segments.scores[keep])
 
     def without_depth(self, depth: np.ndarray) -> np.ndarray:
-        """Undistorted depth, NaN there: it may be that of the world behind, or of a hand before it."""
-        return np.where(self.ideal, np.float32(np.nan), depth).astype(depth.dtype)
+        """The depth, NaN there: it may be that of the world behind, or of a hand before it."""
+        return np.where(self.mask, np.float32(np.nan), depth).astype(depth.dtype)
 
 
 def find_still_parts(pictures: Iterable[np.ndarray]) -> np.ndarray | None:

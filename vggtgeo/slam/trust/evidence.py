@@ -92,8 +92,7 @@ class EvidenceRecorder(Callback):
     """
 
     def __init__(self, camera: Camera) -> None:
-        self.still: np.ndarray | None = None
-        """Bool [H, W], parts of the images that belong to the camera: no corner is followed there."""
+        self._left_out: np.ndarray | None = None
         self._frames: list[FrameEvidence] = []
         self._waiting: deque[Future[None]] = deque()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="evidence")
@@ -103,6 +102,13 @@ class EvidenceRecorder(Callback):
         self._ids = np.zeros(0, np.int32)
         self._pixels = np.zeros((0, 2), np.float32)
         self._next = 0
+
+    def leave_out(self, still: np.ndarray) -> None:
+        """No corner is followed where `still`, bool [H, W], says that the image belongs to the camera, nor so near that
+        the patch around it sees that.
+        """
+        small = cv2.resize(still.astype(np.uint8), _small_size(still.shape), interpolation=cv2.INTER_AREA)
+        self._left_out = cv2.dilate(small, np.ones(_PATCH, np.uint8)) > 0
 
     @property
     def frames(self) -> list[FrameEvidence]:
@@ -134,13 +140,13 @@ class EvidenceRecorder(Callback):
 
     def _add(self, frame: Frame) -> None:
         scale = max(frame.image.shape[:2]) / WIDTH
-        grey, contrast = _small_grey(frame.image, scale)
+        grey, contrast = _small_grey(frame.image)
         if self._image is not None and len(self._ids):
             pixels, kept = follow(self._image, grey, self._pixels)
-            kept &= self._of_the_world(pixels, grey)
+            kept &= self._of_the_world(pixels)
             self._ids, self._pixels = one_a_cell(self._ids[kept], pixels[kept])
         fresh = new_corners(grey, self._pixels)
-        fresh = fresh[self._of_the_world(fresh, grey)]
+        fresh = fresh[self._of_the_world(fresh)]
         numbers = np.arange(self._next, self._next + len(fresh), dtype=np.int32)
         self._next += len(fresh)
         self._ids = np.concatenate([self._ids, numbers])
@@ -154,14 +160,12 @@ class EvidenceRecorder(Callback):
             FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth, median, changed, contrast)
         )
 
-    def _of_the_world(self, pixels: np.ndarray, grey: np.ndarray) -> np.ndarray:
-        """Which corners of the small image are so far from the still parts that no patch around them sees those."""
-        if self.still is None or not len(pixels):
+    def _of_the_world(self, pixels: np.ndarray) -> np.ndarray:
+        """Which corners of the small image may be followed."""
+        if self._left_out is None:
             return np.ones(len(pixels), bool)
-        small = cv2.resize(self.still.astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_AREA)
-        near = cv2.dilate(small, np.ones(_PATCH, np.uint8))
-        column, row = np.clip(np.rint(pixels), 0, np.array(grey.shape[::-1]) - 1).astype(int).T
-        return near[row, column] == 0
+        column, row = np.clip(np.rint(pixels), 0, np.array(self._left_out.shape[::-1]) - 1).astype(int).T
+        return ~self._left_out[row, column]
 
     def _compare_depth(self, depth: np.ndarray | None) -> tuple[float, float]:
         """The share of pixels that changed since the last frame, and the median; NaN where there is no depth."""
@@ -212,11 +216,17 @@ def new_corners(grey: np.ndarray, taken: np.ndarray) -> np.ndarray:
     return np.column_stack([column * CELL + inner % CELL, row * CELL + inner // CELL]).astype(np.float32)
 
 
-def _small_grey(image: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
+def _small_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Width and height of the image that corners are followed in; shape: of the one that was read."""
+    scale = max(shape) / WIDTH
+    height, width = (max(round(side / scale), 2 * CELL) for side in shape)
+    return width, height
+
+
+def _small_grey(image: np.ndarray) -> tuple[np.ndarray, float]:
     """The image that corners are followed in, uint8, and the standard deviation of its grey levels before."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    height, width = (max(round(side / scale), 2 * CELL) for side in grey.shape)
-    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(grey, _small_size(grey.shape), interpolation=cv2.INTER_AREA)
     mean, deviation = float(small.mean()), float(small.std())
     # One mean and contrast for all, since a camera changes its exposure and LK compares grey levels.
     gain = min(CONTRAST / max(deviation, 1e-3), 4.0)
