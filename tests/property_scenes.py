@@ -34,22 +34,50 @@ FREE = ("pixel", "point_target")
 WEIGHTS = ("point_weight", "line_weight", "depth_weight")
 POSITIVE = ("depth_mean", "depth_sigma", "start_inverse_depth")
 STARTS = ("start_inverse_depth", "start_intrinsics", "start_poses")
-LARGEST, LEAST = float(np.finfo(np.float64).max), 1e-300
 
 Change = tuple[str, int, float]
 """A field, which of its numbers, and what it becomes."""
 
 
-def _numbers(largest: float) -> st.SearchStrategy[float]:
-    """Both signs, and as many near a decade as in another: problems break at 1e-9 and 1e9 rather than at 0.5."""
-    decades = np.floor(np.log10(largest))
-    sizes = st.floats(-300.0, decades).map(lambda power: 10.0**power)
-    return st.one_of(st.just(0.0), st.floats(-largest, largest), sizes, sizes.map(lambda size: -size))
+@dataclass(frozen=True)
+class Numbers:
+    """What one precision holds. What it does not, `pack` refuses by name: drawing that tries nothing of the solver."""
+
+    least: float
+    largest: float
+
+    def any(self) -> st.SearchStrategy[float]:
+        """Zero and both signs, and as many near a decade as in another: problems break at 1e-9 and at 1e9."""
+        return st.one_of(st.just(0.0), self.positive(), self.positive().map(lambda size: -size))
+
+    def positive(self) -> st.SearchStrategy[float]:
+        """From `least` to `largest`."""
+        sizes = st.floats(np.log10(self.least), np.log10(self.largest)).map(lambda power: 10.0**power)
+        return st.one_of(st.floats(self.least, self.largest), sizes).map(self.within)
+
+    def within(self, size: float) -> float:
+        """Rounding of a power leaves neither end."""
+        return min(max(size, self.least), self.largest)
+
+    def sigmas(self) -> st.SearchStrategy[float]:
+        """Those whose 1 / sigma^2 is a number, too."""
+        return self.positive().map(lambda size: max(size, 2 / np.sqrt(self.largest)))
+
+    def changes(self) -> st.SearchStrategy[Change]:
+        """Of any number that `pack` accepts."""
+        places = st.integers(0, 200)
+        return st.one_of(
+            st.tuples(st.sampled_from((*FREE, *STARTS[1:])), places, self.any()),
+            st.tuples(st.sampled_from(WEIGHTS), places, st.just(0.0) | self.positive()),
+            st.tuples(st.sampled_from(POSITIVE), places, self.positive()),
+        )
 
 
-def _change(largest: float) -> st.SearchStrategy[Change]:
-    names = st.sampled_from((*FREE, *WEIGHTS, *POSITIVE, *STARTS[1:]))
-    return st.tuples(names, st.integers(0, 200), _numbers(largest))
+def numbers_of(dtype: type, largest: float | None = None) -> Numbers:
+    """All that a precision holds (a step from its ends), or those up to `largest` and down to its inverse."""
+    if largest is not None:
+        return Numbers(1 / largest, largest)
+    return Numbers(2 * float(np.finfo(dtype).tiny), float(np.finfo(dtype).max) / 2)
 
 
 SEEDS = st.integers(0, 200)
@@ -92,37 +120,33 @@ class Drawn:
         )
 
 
-def finite_problems(largest: float = LARGEST) -> st.SearchStrategy[Drawn]:
-    """Any problem of numbers up to `largest` (what must be positive: down to its inverse): up to 12 of a scene's are
-    replaced and all of some weights, and so is what is held, the prior of the camera, the kernel's width and the weight
-    of the depths.
+def finite_problems(numbers: Numbers) -> st.SearchStrategy[Drawn]:
+    """Any problem of such numbers: up to 12 of a scene's are replaced and all of some weights, and so is what is held,
+    the prior of the camera, the kernel's width and the weight of the depths.
     """
     held = lambda count: st.tuples(*[st.booleans()] * count)
-    positive = _numbers(largest).map(lambda value: max(abs(value), LEAST, 1 / largest))
     return st.builds(
         Drawn,
         seed=SEEDS,
-        changes=st.lists(_change(largest), max_size=12).map(tuple),
+        changes=st.lists(numbers.changes(), max_size=12).map(tuple),
         none=st.frozensets(st.sampled_from(WEIGHTS), max_size=2),
         alpha=st.sampled_from([2.0, 0.0, 1e6]),
         fixed_pose=held(KEYFRAMES),
         fixed_intrinsics=held(4),
-        intrinsics_sigma=st.none() | st.just(5.0) | positive,
-        width=st.just(1.5) | positive,
+        intrinsics_sigma=st.none() | st.just(5.0) | numbers.sigmas(),
+        width=st.just(1.5) | numbers.positive(),
     )
 
 
 def _changed(scene: Scene, name: str, place: int, value: float) -> Scene:
-    """The scene with one number replaced, by its size where only positive ones are allowed."""
+    """The scene with one number replaced."""
     array = np.array(getattr(scene if name in STARTS else scene.observations, name))
     if name == "start_poses":
         row = place % len(array)
         array[row] = _moved(array[row], place // len(array) % 6, value)
     else:
-        if name in WEIGHTS:
-            value = abs(value)
-        elif name in POSITIVE or (name == "start_intrinsics" and place % 4 < 2):
-            value = max(abs(value), LEAST)
+        if name == "start_intrinsics" and place % 4 < 2:
+            value = abs(value) or 1.0  # focal lengths
         array.reshape(-1)[place % array.size] = value
     return replace(scene, **{name: array}) if name in STARTS else scene.with_observations(**{name: array})
 
