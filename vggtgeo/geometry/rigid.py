@@ -92,6 +92,14 @@ def fraction(motion: np.ndarray, share: float) -> np.ndarray:
     return part
 
 
+def moved(poses: np.ndarray, tangents: np.ndarray) -> np.ndarray:
+    """Each of float64 [n, 4, 4] by a small tangent [n, 6], translation first: turned from the left, then shifted."""
+    steps = np.tile(np.eye(4), (len(tangents), 1, 1))
+    steps[:, :3, :3] = Rotation.from_rotvec(tangents[:, 3:]).as_matrix()
+    steps[:, :3, 3] = tangents[:, :3]
+    return np.asarray(steps @ poses)
+
+
 def adjoint(pose: np.ndarray) -> np.ndarray:
     """`Ad(T)`, float64 [6, 6], tangents translation first."""
     x, y, z = pose[:3, 3]

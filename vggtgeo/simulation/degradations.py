@@ -153,7 +153,25 @@ def barrel(recording: Recording, rng: np.random.Generator) -> Recording:
     return _depths(bent, lambda depth, row: cv2.remap(depth, u, v, cv2.INTER_NEAREST, **nothing))
 
 
-def zoomed(recording: Recording, rng: np.random.Generator) -> Recording:
+def zooming(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A lens that zooms while it films: the picture grows steadily, by 1.3 in the end."""
+    del rng
+    cx, cy = recording.camera.intrinsics[2:]
+    last = max(len(recording.frames) - 1, 1)
+    nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
+
+    def grown(row: int) -> np.ndarray:
+        factor = 1.0 + 0.3 * row / last
+        return np.array([[factor, 0.0, (1.0 - factor) * cx], [0.0, factor, (1.0 - factor) * cy]])
+
+    def depth_through(depth: np.ndarray, row: int) -> np.ndarray:
+        return cv2.warpAffine(depth, grown(row), depth.shape[::-1], flags=cv2.INTER_NEAREST, **nothing)
+
+    seen = _images(recording, lambda image, row: cv2.warpAffine(image, grown(row), image.shape[1::-1]))
+    return _depths(seen, depth_through)
+
+
+def wrong_focal(recording: Recording, rng: np.random.Generator) -> Recording:
     """The calibration of a lens with 15 % more focal length."""
     del rng
     fx, fy, cx, cy = recording.camera.intrinsics
@@ -179,7 +197,7 @@ DEGRADATIONS: dict[str, Degradation] = {
     "base": as_it_is,
     **{change.__name__: change for change in (dirty_lens, bars, text, board, person, dark, centimetres)},
     **{change.__name__: change for change in (growing_depth, other_depth, shuffled, barrel)},
-    **{change.__name__: change for change in (zoomed, covered, without_depth)},
+    **{change.__name__: change for change in (zooming, wrong_focal, covered, without_depth)},
 }
 
 

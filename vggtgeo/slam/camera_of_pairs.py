@@ -19,8 +19,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import t as student_t
+
+from vggtgeo.geometry import rigid
 
 LEAST_PAIRS = 8
 PARAMETERS = 4
@@ -108,7 +109,7 @@ def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, np.nda
         normal = reduced.normal.sum(0) + np.diag(1 / PRIOR**2)
         step = np.clip(-np.linalg.solve(normal, reduced.gradient.sum(0)), -LONGEST_STEP, LONGEST_STEP)
         value = value + step
-        poses = _moved(poses, reduced.pose_steps(step))
+        poses = rigid.moved(poses, reduced.pose_steps(step))
         if np.all(np.abs(step) < SETTLED * LONGEST_STEP):
             break
         reduced = _reduce(points, poses, value, intrinsics)
@@ -152,19 +153,11 @@ class _Points:
 def _costs(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Robust cost of each pair with a camera, its pose brought to rest."""
     for _ in range(POSE_ITERATIONS):
-        poses = _moved(poses, _reduce(points, poses, value, intrinsics).pose_steps(np.zeros(4)))
+        poses = rigid.moved(poses, _reduce(points, poses, value, intrinsics).pose_steps(np.zeros(4)))
     off = np.linalg.norm(points.residuals(poses, value, intrinsics), axis=1)
     off = np.where(np.isfinite(off), np.minimum(off, FARTHEST), FARTHEST)
     cost = np.where(off < HUBER, off**2 / 2, HUBER * (off - HUBER / 2))
     return np.bincount(points.pair, cost, len(poses))
-
-
-def _moved(poses: np.ndarray, tangents: np.ndarray) -> np.ndarray:
-    """Each of float64 [pairs, 4, 4] by its tangent [pairs, 6], translation first."""
-    steps = np.tile(np.eye(4), (len(tangents), 1, 1))
-    steps[:, :3, :3] = Rotation.from_rotvec(tangents[:, 3:]).as_matrix()
-    steps[:, :3, 3] = tangents[:, :3]
-    return steps @ poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +181,7 @@ def _reduce(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: n
     residual = points.residuals(poses, value, intrinsics)
     columns = []
     for size, row in zip(POSE_STEPS, np.eye(6), strict=True):
-        beside = _moved(poses, np.tile(size * row, (len(poses), 1)))
+        beside = rigid.moved(poses, np.tile(size * row, (len(poses), 1)))
         columns.append((points.residuals(beside, value, intrinsics) - residual) / size)
     for size, row in zip(CAMERA_STEPS, np.eye(4), strict=True):
         columns.append((points.residuals(poses, value + size * row, intrinsics) - residual) / size)

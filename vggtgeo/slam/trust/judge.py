@@ -18,6 +18,7 @@ from vggtgeo.slam.trust.extent import check_extent
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
+from vggtgeo.slam.trust.sensor_drift import check_sensors
 from vggtgeo.slam.trust.speed import check_speed
 from vggtgeo.slam.trust.steps import breaks, check_steps, steps
 from vggtgeo.slam.trust.still_points import check_parts, divide
@@ -43,6 +44,8 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
         height, width = slam.keyframes[0].size
         found += _images(estimate, aligned, (width, height))
+        if any(np.isfinite(noted.depth_median) for noted in aligned):
+            found += check_sensors(slam)
     else:
         found += check_speed(estimate)
     return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)

@@ -1,0 +1,53 @@
+"""Clips to which something was done, for benchmarks of what the pipeline makes of that."""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import vggtgeo as vg
+from vggtgeo.benchmark.inputs import DegradedWalk
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.io.errors import InputWarning
+from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
+
+
+def degraded_clips(folder: Path, count: int, names: tuple[str, ...]) -> Iterator[tuple[str, SequenceView]]:
+    """The first frames of a clip with each of these things done to them, with depth where there is some and without."""
+    clip = vg.read(folder)
+    truth = clip.ground_truth()
+    if truth is None:
+        raise SystemExit(f"`{folder}` has no truth to compare with")
+    frames = list(clip.frames(0, min(count, len(clip))))
+    for name in names:
+        changed = DEGRADATIONS[name](Recording(frames, clip.camera, truth), np.random.default_rng(0))
+        walk = DegradedWalk(clip.name, changed)
+        for has_depth in (True, False) if clip.has_depth else (False,):
+            yield name, SequenceView(walk, clip.camera, has_depth)
+
+
+def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> tuple[vg.Result, float]:
+    """The result, and its ATE: metres, after SE(3) with depth, after Sim(3) without; NaN where nothing was tracked."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        result = vg.reconstruct(sequence, settings=settings, dense="none")
+    truth = result.summary.get("truth")
+    alignment = "ate_se3_m" if sequence.has_depth else "ate_sim3_m"
+    return result, truth[alignment]["rmse"] if truth else float("nan")
+
+
+def input_of(sequence: SequenceView) -> str:
+    """As tables say it."""
+    return "RGB-D" if sequence.has_depth else "RGB"
+
+
+def options_of(text: str | None) -> argparse.Namespace:
+    """`clips` and `frames` of a benchmark of that docstring."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clips", type=Path, nargs="+")
+    parser.add_argument("--frames", type=int, default=40)
+    return parser.parse_args()

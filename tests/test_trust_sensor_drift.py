@@ -1,0 +1,155 @@
+"""A lens that zooms while it films, and a depth camera whose unit changes, by keyframes whose depth was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded_run import recorded_run
+from scipy.spatial.transform import Rotation
+from vggtgeo.models import pinhole
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.trust.evidence import EvidenceRecorder
+from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.trust.sensor_drift import MOST_ZOOM, Change, DepthPair, change, compare, depth_pairs
+
+K = np.array([500.0, 500.0, 320.0, 240.0])
+KEYFRAMES = 20
+Curve = Callable[[float], float]
+"""A factor by the share of the run that is over."""
+
+
+def still(share: float) -> float:
+    """Nothing changes."""
+    return 1.0
+
+
+def grows(share: float) -> float:
+    """By 1.3 in the end."""
+    return 1.0 + 0.3 * share
+
+
+def shrinks(share: float) -> float:
+    """By 1.3 in the end."""
+    return 1.0 / (1.0 + 0.3 * share)
+
+
+def there_and_back(share: float) -> float:
+    """By 1.3 in the middle."""
+    return 1.0 + 0.3 * (1.0 - abs(2.0 * share - 1.0))
+
+
+def _pair(
+    rng: np.random.Generator, numbers: tuple[int, int], focal: tuple[float, float], unit: tuple[float, float]
+) -> DepthPair:
+    """Two pictures of sixty points 2 to 8 m away: half a pixel of noise, 1 % in depth, every tenth matched wrongly. The
+    camera goes 30 cm forward and turns, and its pose is taken 2 cm and half a degree off. focal, unit: factors of each.
+    """
+    before, depth = rng.uniform((0, 0), (640, 480), (60, 2)), rng.uniform(2.0, 8.0, 60)
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix()
+    motion[:3, 3] = (*rng.normal(0, 0.1, 2), -0.3)
+    first, second = (K * [factor, factor, 1.0, 1.0] for factor in focal)
+    points = (pinhole.rays(before, first) * depth[:, None]) @ motion[:3, :3].T + motion[:3, 3]
+    after = pinhole.project(points, second) + rng.normal(0, 0.5, (60, 2))
+    after[::10] += rng.normal(0, 50, (6, 2))
+    wrong = rigid.moved(motion[None], np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, 0.005, 3)])[None])[0]
+    measured = [unit[0] * depth, unit[1] * points[:, 2]] * (1 + rng.normal(0, 0.01, (2, 60)))
+    return DepthPair(numbers, before, after, measured[0], measured[1], wrong)
+
+
+def _run(focal: Curve, unit: Curve, seed: int = 0, keyframes: int = KEYFRAMES) -> list[DepthPair]:
+    """Each keyframe with the next two, both ways."""
+    rng = np.random.default_rng(seed)
+    at = lambda curve, way: (curve(way[0] / (keyframes - 1)), curve(way[1] / (keyframes - 1)))
+    ends = [(i, j) for i in range(keyframes) for j in (i + 1, i + 2) if j < keyframes]
+    return [_pair(rng, way, at(focal, way), at(unit, way)) for pair in ends for way in (pair, pair[::-1])]
+
+
+def _changes(pairs: list[DepthPair]) -> tuple[Change, Change]:
+    numbers = np.array([pair.numbers for pair in pairs], np.float64)
+    factors = [compare(pair, K) for pair in pairs]
+    lens, unit = change(numbers, [f.focal for f in factors]), change(numbers, [f.depth for f in factors])
+    assert lens is not None
+    assert unit is not None
+    return lens, unit
+
+
+def test_the_factors_between_two_pictures() -> None:
+    """Both are found, with standard deviations that hold, though the camera goes forward as well; oracle: the factors,
+    and the spread over pairs.
+    """
+    rng = np.random.default_rng(0)
+    zoomed = [compare(_pair(rng, (0, 1), (1.0, 1.1), (1.0, 1.0)), K).focal for _ in range(200)]
+    shorter = [compare(_pair(rng, (0, 1), (1.0, 1.0), (1.0, 0.9)), K).depth for _ in range(200)]
+    for factors, truth in ((zoomed, 1.1), (shorter, 0.9)):
+        value, sigma = np.array(factors).T
+        off = (value - np.log(truth)) / sigma
+        assert abs(off.mean()) < 0.3
+        assert 0.6 < off.std() < 1.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("curve", [grows, shrinks, there_and_back])
+def test_what_changes_is_found_and_what_stays_is_not(curve: Curve, seed: int) -> None:
+    """A lens, or a unit of depth, that changes by 1.3 is found; the other one stays. Oracle: the factor."""
+    zoom, unit = _changes(_run(curve, still, seed))
+    assert abs(zoom.value) == pytest.approx(np.log(1.3), abs=0.05)
+    assert zoom.is_sure
+    zoom, unit = _changes(_run(still, curve, seed))
+    assert abs(unit.value) == pytest.approx(np.log(1.3), abs=0.05)
+    assert unit.is_sure
+    assert abs(zoom.value) < MOST_ZOOM / 2
+
+
+def test_keyframes_of_a_run_agree() -> None:
+    """Pairs of a simulated run, whose lens and depth stay; oracle: none, within five standard deviations and 1 %."""
+    slam = recorded_run().slam
+    pairs = list(depth_pairs(slam))
+    assert pairs
+    for pair in pairs:
+        found = compare(pair, np.asarray(slam.intrinsics, np.float64))
+        for value, sigma in (found.focal, found.depth):
+            assert abs(value) < 5 * sigma + 0.01
+            assert sigma < 0.05
+
+
+def test_few_keyframes_say_nothing() -> None:
+    """Three keyframes leave no error to measure by."""
+    numbers = np.array([[0, 1], [1, 0], [1, 2], [2, 1], [0, 2]], np.float64)
+    assert change(numbers, [(0.1, 0.01)] * 5) is None
+    assert change(np.zeros((0, 2)), []) is None
+
+
+def test_pictures_of_which_nothing_fits_say_nothing() -> None:
+    """Matches that are all wrong have no say, rather than a sure one."""
+    pair = _pair(np.random.default_rng(0), (0, 1), (1.0, 1.0), (1.0, 1.0))
+    found = compare(replace(pair, after=pair.after + 1000.0), K)
+    assert found.focal[1] == found.depth[1] == np.inf
+    without = compare(replace(pair, depth_after=np.full(60, np.nan)), K)
+    assert np.isfinite(without.focal[1])
+    assert without.depth[1] == np.inf
+
+
+@pytest.mark.parametrize(("curves", "text"), [((grows, still), "the lens zooms"), ((still, grows), "the unit of")])
+def test_a_run_whose_sensors_change_is_told(
+    curves: tuple[Curve, Curve], text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The verdict tells it, where a sensor measured depth; oracle: the factor that the pairs were made with. The run as
+    it was made is told nothing.
+    """
+    run = recorded_run()
+    recorder = EvidenceRecorder(run.sequence.camera)
+    for frame in run.frames:
+        recorder.add(frame)
+    slam = replace(run.slam, intrinsics=K)
+    told = lambda evidence: [reason for reason in judge(slam, evidence).reasons if text in reason]
+    assert told(recorder.frames) == []
+    pairs = _run(*curves)
+    monkeypatch.setattr("vggtgeo.slam.trust.sensor_drift.depth_pairs", lambda slam: pairs)
+    (reason,) = told(recorder.frames)
+    assert 25 <= float(reason.split("about ")[1].split(" %")[0]) <= 35
+    assert told([replace(noted, depth_median=float("nan")) for noted in recorder.frames]) == []
