@@ -54,7 +54,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 5
+VERSION = 6
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -81,7 +81,16 @@ def _with_focal_wanted(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
-UPGRADES = {1: _with_recorded_times, 2: _with_lens, 3: _with_first_pass, 4: _with_focal_wanted}
+def _with_enlargement(header: Header) -> Header:
+    """Version 5 did not note by what factor a picture is larger than the one before."""
+    tree, classes = with_field(header["tree"], header["classes"], "FrameEvidence", "enlarged")
+    return {**header, "tree": tree, "classes": classes}
+
+
+UPGRADES = {
+    **{1: _with_recorded_times, 2: _with_lens, 3: _with_first_pass},
+    **{4: _with_focal_wanted, 5: _with_enlargement},
+}
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)
 

@@ -19,6 +19,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.enlargement import LEAST_FOLLOWED, followed_enlargement, matched_enlargement
 
 WIDTH = 320
 """Pixels of the longer side of the images that corners are followed in."""
@@ -47,6 +48,7 @@ class FrameEvidence:
     ids: int32 [m], a track's number, the same in each frame that saw it. pixels: float32 [m, 2], of the ideal pinhole
     image. depth: float32 [m], the sensor's, metres, NaN = none. depth_changed: share of the pixels with depth whose
     depth is not exactly that of the frame before, NaN without depth. contrast: standard deviation of the grey levels.
+    enlarged: logarithm of the factor by which the picture is larger than the one before, None where nothing says.
     """
 
     frame: int
@@ -57,6 +59,7 @@ class FrameEvidence:
     depth_median: float
     depth_changed: float
     contrast: float
+    enlarged: float | None = None
 
     def through(self, lens: Camera) -> FrameEvidence:
         """The same corners in images that the lens does not distort."""
@@ -141,9 +144,14 @@ class EvidenceRecorder(Callback):
     def _add(self, frame: Frame) -> None:
         scale = max(frame.image.shape[:2]) / WIDTH
         grey, contrast = _small_grey(frame.image)
+        enlarged = None
         if self._image is not None and len(self._ids):
             pixels, kept = follow(self._image, grey, self._pixels)
             kept &= self._of_the_world(pixels)
+            if np.mean(kept) < LEAST_FOLLOWED:
+                enlarged = matched_enlargement(self._image, grey, self._left_out)
+            else:
+                enlarged = followed_enlargement(self._pixels[kept], pixels[kept])
             self._ids, self._pixels = one_a_cell(self._ids[kept], pixels[kept])
         fresh = new_corners(grey, self._pixels)
         fresh = fresh[self._of_the_world(fresh)]
@@ -156,8 +164,9 @@ class EvidenceRecorder(Callback):
         changed, median = self._compare_depth(frame.depth)
         depth = np.full(len(full), np.nan, np.float32) if frame.depth is None else _read(frame.depth, full)
         ideal = self._camera.undistorted(full).astype(np.float32)
+        numbers = self._ids.copy()
         self._frames.append(
-            FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth, median, changed, contrast)
+            FrameEvidence(frame.index, frame.timestamp, numbers, ideal, depth, median, changed, contrast, enlarged)
         )
 
     def _of_the_world(self, pixels: np.ndarray) -> np.ndarray:

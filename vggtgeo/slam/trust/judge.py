@@ -12,6 +12,7 @@ from vggtgeo.slam.trust.blind import check_blind, cuts
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
 from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
+from vggtgeo.slam.trust.enlargement import check_enlargements
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence
 from vggtgeo.slam.trust.extent import check_extent
@@ -67,3 +68,4 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
         sound[part.first : part.last + 2] = False
     yield from check_scale(estimate, hand_overs(estimate, evidence, sound))
     yield from check_camera(estimate, camera_opinion(estimate, evidence), size)
+    yield from check_enlargements(estimate, np.array([noted.enlarged for noted in evidence], np.float64))

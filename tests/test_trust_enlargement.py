@@ -1,0 +1,88 @@
+"""Pictures that are larger at once, as where a phone changes its lens."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from recorded_run import recorded_run
+from witness import walk
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.slam.trust.enlargement import check_enlargements, followed_enlargement, matched_enlargement
+from vggtgeo.slam.trust.evidence import EvidenceRecorder
+from vggtgeo.slam.trust.judge import judge
+
+CHANGED = 5
+"""The first frame through the other lens."""
+
+
+def _enlarged(frame: Frame, factor: float) -> Frame:
+    """By a lens of so many times the focal length."""
+    _, _, x, y = recorded_run().sequence.camera.intrinsics
+    size = frame.image.shape[1::-1]
+    larger = np.array([[factor, 0.0, (1.0 - factor) * x], [0.0, factor, (1.0 - factor) * y]])
+    return replace(frame, image=cv2.warpAffine(frame.image, larger, size, borderMode=cv2.BORDER_REFLECT))
+
+
+@pytest.mark.parametrize("factor", [1.7, 1.3, 1 / 1.3, 1 / 1.7])
+def test_a_lens_that_is_changed_is_told_with_its_factor(factor: float) -> None:
+    """A simulated run whose frames are enlarged from the fifth on; oracle: the factor and the frame. The run as it was
+    recorded is told nothing.
+    """
+    run = recorded_run()
+    for applied in (1.0, factor):
+        recorder = EvidenceRecorder(run.sequence.camera)
+        for row, frame in enumerate(run.frames):
+            recorder.add(_enlarged(frame, applied if row >= CHANGED else 1.0))
+        reasons = [reason for reason in judge(run.slam, recorder.frames).reasons if "was the lens changed" in reason]
+        if applied == 1.0:
+            assert reasons == []
+        else:
+            (reason,) = reasons
+            assert reason.startswith(f"frames {CHANGED - 1} to {CHANGED}")
+            assert float(reason.split("picture is ")[1].split(" times")[0]) == pytest.approx(factor, rel=0.03)
+
+
+def test_what_has_nothing_in_common_says_nothing() -> None:
+    """Corners that move at random, pictures of noise, and few corners have no factor."""
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(0, 300, (2, 60, 2)).astype(np.float32)
+    assert followed_enlargement(*pixels) is None
+    assert followed_enlargement(pixels[0, :10], 1.3 * pixels[0, :10]) is None
+    noise = rng.integers(0, 255, (2, 240, 320)).astype(np.uint8)
+    assert matched_enlargement(*noise, None) is None
+    flat = np.full((240, 320), 128, np.uint8)
+    assert matched_enlargement(flat, flat, None) is None
+
+
+def test_what_the_camera_carries_has_no_say() -> None:
+    """A board that fills most of the picture stays as it is while the rest is enlarged; left out, the rest speaks."""
+    run = recorded_run()
+    grey = cv2.cvtColor(run.frames[0].image, cv2.COLOR_RGB2GRAY)
+    larger = cv2.cvtColor(_enlarged(run.frames[0], 1.5).image, cv2.COLOR_RGB2GRAY)
+    board = np.random.default_rng(0).integers(0, 255, (30, 40)).astype(np.uint8)
+    board = cv2.resize(board, (320, 240), interpolation=cv2.INTER_CUBIC)
+    left_out = np.zeros(grey.shape, bool)
+    left_out[100:] = True
+    before, after = np.where(left_out, board, grey), np.where(left_out, board, larger)
+    seen = matched_enlargement(before, after, None)
+    assert seen is not None
+    assert abs(seen) < 0.02
+    assert matched_enlargement(before, after, left_out) == pytest.approx(np.log(1.5), abs=0.05)
+
+
+def test_a_steady_growth_is_no_change_of_the_lens() -> None:
+    """Who walks towards a wall enlarges it in each frame; one frame that stands out is told, at either end of a run,
+    too; one of which no neighbour knows anything is not.
+    """
+    estimate = walk(count=8).estimate
+    told = lambda values: [finding.text.split(":")[0] for finding in check_enlargements(estimate, np.array(values))]
+    nothing = float("nan")
+    assert told([nothing, 0.3, 0.32, 0.3, 0.28, 0.3, 0.31, 0.3]) == []
+    assert told([nothing, 0.0, 0.01, 0.5, 0.0, 0.01, 0.0, 0.0]) == ["frames 2 to 3"]
+    assert told([nothing, -0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.6]) == ["frames 0 to 1", "frames 6 to 7"]
+    assert told([nothing, nothing, nothing, 0.5, nothing, nothing, 0.0, 0.0]) == []
+    assert told([nothing] * 8) == []

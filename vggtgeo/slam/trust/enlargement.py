@@ -1,0 +1,71 @@
+"""By what factor each picture is larger than the one before: a phone that changes its lens, a digital zoom.
+
+A camera that walks enlarges what it walks towards by a few percent a frame, as much as in the frames around it; a lens
+that is exchanged enlarges the whole picture at once. A map cannot tell: it takes the enlargement for a step forward.
+
+The factor is that of the similarity which most corners agree with (RANSAC). Where few of them could be followed, as
+over a large factor, key points are matched by their descriptors.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from vggtgeo.models.classical import SiftMatcher
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.finding import Finding
+
+MOST = 0.2
+"""Logarithm of the factor, beyond that of either neighbour. With one lens it is at most 0.063 in four clips, 0.094 at
+1.7 frames a second, 0.131 at one, and 0.175 where blocks of frames are out of order; where a picture is enlarged at
+once by 1.25 it is 0.21 to 0.25, by 1.7 0.51 to 0.54. The lenses of phones differ by factors of 1.5 and more."""
+LEAST_FOLLOWED = 0.5
+"""Share of the corners that were followed, below which key points are matched."""
+LEAST_AGREEING = 20
+"""Corners: fewer agree with some similarity where two pictures have nothing in common."""
+CLOSE = 2.0
+"""Pixels of the small image that a corner may be off the similarity: what lies nearer than the rest is farther off."""
+_MATCHER = SiftMatcher(count=600, ratio=0.8, refinement=None)
+
+
+def followed_enlargement(before: np.ndarray, after: np.ndarray) -> float | None:
+    """Logarithm of the factor between corners of two pictures, float32 [m, 2] each; None where too few agree."""
+    if len(before) < LEAST_AGREEING:
+        return None
+    found, agree = cv2.estimateAffinePartial2D(before, after, method=cv2.RANSAC, ransacReprojThreshold=CLOSE)
+    if found is None or np.count_nonzero(agree) < LEAST_AGREEING:
+        return None
+    factor = float(np.hypot(found[0, 0], found[1, 0]))
+    return float(np.log(factor)) if factor > 0 else None
+
+
+def matched_enlargement(before: np.ndarray, after: np.ndarray, left_out: np.ndarray | None) -> float | None:
+    """The same by descriptors, from grey images uint8 [h, w]; left_out: bool [h, w], what the camera carries."""
+    features = [_MATCHER.describe(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)) for image in (before, after)]
+    matches = _MATCHER.match(*features)
+    ends = [np.asarray(pixels, np.float32) for pixels in (matches.pixels_i, matches.pixels_j)]
+    if left_out is not None:
+        columns, rows = np.clip(np.rint(ends[1]), 0, np.array(left_out.shape[::-1]) - 1).astype(int).T
+        ends = [pixels[~left_out[rows, columns]] for pixels in ends]
+    return followed_enlargement(*ends)
+
+
+def check_enlargements(estimate: Estimate, enlarged: np.ndarray) -> list[Finding]:
+    """Steps over which the whole picture grows or shrinks at once.
+
+    enlarged: float64 [n], logarithm of each frame's factor over the one before it, NaN where nothing says.
+    """
+    beside = np.stack([np.append(np.nan, enlarged[:-1]), np.append(enlarged[1:], np.nan)])
+    # Where neither neighbour says anything, a large step of the camera looks the same.
+    apart = np.abs(enlarged - beside)
+    jump = np.where(np.isfinite(apart).any(0), np.nanmin(np.where(np.isfinite(apart), apart, np.inf), 0), 0.0)
+    found = []
+    for row in np.flatnonzero(jump > MOST):
+        first, last = int(estimate.frames[row - 1]), int(estimate.frames[row])
+        text = (
+            f"frames {first} to {last}: the whole picture is {np.exp(enlarged[row]):.2f} times as large at once: was "
+            "the lens changed? One focal length is assumed for all frames"
+        )
+        found.append(Finding("calibration", "degraded", text))
+    return found
