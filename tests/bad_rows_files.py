@@ -210,6 +210,7 @@ VIDEOS = rows(
         ("text", bad.file("clip.mp4", "no video")),
         ("no bytes", bad.file("clip.mp4", b"")),
         ("cut off", cut_video),
+        ("zeros in its middle", bad.holed_video),
         ("no regular file", lambda folder: Path("/dev/null")),
         ("text: FFmpeg draws its letters", bad.file("clip.mp4", "1305031102.175 rgb/1.png\n" * 99)),
         ("a list of other files for FFmpeg", bad.file("clip.mp4", "ffconcat version 1.0\nfile /etc/passwd\n")),
