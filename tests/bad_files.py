@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import tiny_sequences as tiny
+from picture_bytes import TURN
 from test_problem_file import SCENE, arrays_of
 
 from vggtgeo.bundle.problem_file import save_problem
@@ -70,8 +71,7 @@ def damaged_jpeg() -> bytes:
 
 def turned_jpeg() -> bytes:
     """A JPEG that asks to be turned by 90 degrees."""
-    tiff = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
-    part = b"Exif\0\0" + tiff
+    part = b"Exif\0\0" + TURN
     whole = encoded(".jpg")
     return whole[:2] + b"\xff\xe1" + struct.pack(">H", len(part) + 2) + part + whole[2:]
 
