@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import io
 import os
 import sys
 import warnings
@@ -16,6 +15,7 @@ from typer.core import TyperGroup
 
 from vggtgeo.cli.jax_flags import set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
+from vggtgeo.cli.streams import exit_code, use_lasting_streams
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.interruption import end_on_signals
 from vggtgeo.io.one_line import one_line
@@ -273,11 +273,12 @@ def main() -> None:
     """Entry point of the program."""
     set_jax_flags()
     end_on_signals()
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal may know fewer letters than names have
-            stream.reconfigure(errors="replace")
+    use_lasting_streams()
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
-    make_app()(prog_name="vggtgeo")
+    try:
+        make_app()(prog_name="vggtgeo")
+    except SystemExit as end:
+        raise SystemExit(exit_code(end.code, EXIT_INPUT)) from None
 
 
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
