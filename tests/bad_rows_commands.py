@@ -12,6 +12,7 @@ import pytest
 import tiny_sequences as tiny
 from bad_row import Row, good, line, nothing, rows, run_with
 
+from vggtgeo.cli.address_space import check_address_space
 from vggtgeo.io.jax_environment import cache_folder
 from vggtgeo.results import Result
 from vggtgeo.results.run_folder import taken
@@ -161,6 +162,13 @@ def without_home(folder: Path) -> None:
         assert cache_folder() is None
 
 
+def limited(gigabytes: float) -> None:
+    """What `vggtgeo run` asks first, with so large an address space."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("resource.getrlimit", lambda kind: (int(gigabytes * 1e9), -1))
+        check_address_space("run")
+
+
 RUN = rows(
     "`vggtgeo run`",
     [
@@ -228,6 +236,14 @@ SETTINGS = rows(
         ("an unknown group", None, settings("[trackin]\nleast_inliers = 3")),
         ("ten thousand brackets", None, settings("a = " + "[" * 10_000)),
         ("a number of 5000 digits", None, settings("stride = 1" + "0" * 5000)),
+        ("a number for a group", None, settings("tracking = 5")),
+        ("a list of tables for a group", None, settings("[[tracking]]\nleast_inliers = 3")),
+        ("a setting outside its group", None, settings("least_inliers = 5")),
+        ("a window of 10^12 keyframes", None, settings("window.size = 999999999999")),
+        ("a kernel of infinite width", None, settings("window.kernel = 'cauchy 1e400'")),
+        ("empty text for the output folder", None, settings("output = ''")),
+        ("a key twice", None, settings("stride = 1\nstride = 2")),
+        ("a date for a number", None, settings("stride = 2024-01-01")),
     ],
 )
 OUTPUT = rows(
@@ -336,6 +352,10 @@ RESULTS = rows(
 )
 ENVIRONMENT = rows(
     "Environment",
-    [("no home folder, or one that cannot be written: nothing is cached", nothing, {"call": without_home})],
+    [
+        ("no home folder, or one that cannot be written: nothing is cached", nothing, {"call": without_home}),
+        ("`ulimit -v` that is too small", nothing, {"call": lambda made: limited(2.5)}),
+        ("`ulimit -v` that is small", nothing, {"call": lambda made: limited(4.0)}),
+    ],
 )
 COMMANDS: list[Row] = [*RUN, *SETTINGS, *OUTPUT, *OTHERS, *TRAJECTORIES, *NETWORKS, *RESULTS, *ENVIRONMENT]

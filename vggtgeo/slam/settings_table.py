@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import tomllib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -111,7 +112,8 @@ def _kernel(name: str, text: str) -> AbstractKernel:
     kind, *numbers = text.split() or [""]
     kernel: AbstractKernel | None
     try:
-        kernel = KERNELS[kind.lower()](*map(float, numbers))
+        values = [float(number) for number in numbers]
+        kernel = KERNELS[kind.lower()](*values) if all(map(math.isfinite, values)) else None
     except (KeyError, TypeError, ValueError):
         kernel = None
     if kernel is None or not is_kernel(kernel):
