@@ -169,6 +169,13 @@ def limited(gigabytes: float) -> None:
         check_address_space("run")
 
 
+def looped(folder: Path) -> Path:
+    """Two links to each other."""
+    (folder / "a").symlink_to(folder / "b")
+    (folder / "b").symlink_to(folder / "a")
+    return folder / "a"
+
+
 RUN = rows(
     "`vggtgeo run`",
     [
@@ -220,6 +227,18 @@ RUN = rows(
         ("`--seed` beyond 32 bits", good, flags("--seed", "99999999999")),
         ("`--depth-scale 0`", good, flags("--depth-scale", "0")),
         ("a reader that is none", good, flags("--kind", "photos")),
+        ("`--memory-limit-gb 1e400`", good, flags("--memory-limit-gb", "1e400")),
+        ("`--fps 1e-320`", good, flags("--fps", "1e-320")),
+        ("`--start 0x1`", good, flags("--start", "0x1")),
+        ("`--stride 1e0`", good, flags("--stride", "1e0")),
+        ("`--intrinsics` with 1e400", good, flags("--intrinsics", "1e400,55,31.5,23.5")),
+        ("`--depth-scale 1e400`", good, flags("--depth-scale", "1e400")),
+        ("`--save-map` onto a device", good, flags("--save-map", "/dev/full")),
+        ("`--set` of two lines", good, flags("--set", "tracking.least_inliers=5\nkeyframes.keyframe_distance=1")),
+        ("the home folder of somebody unknown", nothing, {"argv": line("run", "~no-such-user/clip")}),
+        ("two paths", good, {"argv": lambda made: ["run", made, made]}),
+        ("`-` for standard input", nothing, {"argv": line("run", "-")}),
+        ("a link to itself", looped, {"argv": lambda made: ["run", made]}),
         ("the reader of videos on a folder", good, flags("--kind", "video")),
         ("the reader of folders on a file", bad.file("clip.mp4", b"no"), flags("--kind", "tum")),
     ],
@@ -228,6 +247,7 @@ SETTINGS = rows(
     "Settings files",
     [
         ("a file that is not there", good, flags("--settings", "no.toml")),
+        ("a device that never ends", good, flags("--settings", "/dev/zero")),
         ("no TOML", None, settings("stride: 2")),
         ("not UTF-8", None, settings(b"path = '\xff\xfe'")),
         ("an unknown key", None, settings("strid = 2")),
@@ -271,6 +291,7 @@ OTHERS = rows(
         ("a command that is none", nothing, {"argv": line("solv")}),
         ("a flag that is none", nothing, {"argv": line("run", "--bad")}),
         ("`demo --frames 0`", nothing, {"argv": line("demo", "--frames", "0")}),
+        ("`demo` of 10^20 frames", nothing, {"argv": line("demo", "--frames", "1" + "0" * 20)}),
         ("`demo --frames many`", nothing, {"argv": line("demo", "--frames", "many")}),
         ("`demo` of a scene that is none", nothing, {"argv": line("demo", "--scene", "moon")}),
         ("`simulate --frames 0`", nothing, {"argv": simulated("--frames", "0")}),

@@ -179,7 +179,8 @@ LISTS = rows(
         ("truth that is a folder", bad.rgbd(truth_folder), OPENED),
         ("a pose file of 7-Scenes with NaN", poses("nan " * 16)),
         ("a pose file of 7-Scenes with nine numbers", poses("1 " * 9), OPENED),
-        ("a pose file of 7-Scenes that is no rotation", poses("2 " * 16), OPENED),
+        ("a pose file of 7-Scenes with another last row", poses("1 0 0 0 0 1 0 0 0 0 1 0 5 5 5 5"), OPENED),
+        ("a pose file of 7-Scenes that is no rotation", poses("2 " * 12 + "0 0 0 1"), OPENED),
     ],
     call=read_frames,
 )

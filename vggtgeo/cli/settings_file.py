@@ -22,6 +22,7 @@ from vggtgeo.io.errors import InputError
 
 _NOT_SETTINGS = ("settings", "help", "assignments", "resume", "checkpoint_every")
 _LONGEST = 60
+_MOST_BYTES = 1_000_000
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("true or false", (bool,)),
     int: ("a whole number", (int,)),
@@ -85,11 +86,17 @@ that is no flag of the command, and for a value of a wrong type."""
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:  # a device that never ends, or something that is no settings file
+            raise InputError(f"`--settings` is `{path}`, which has more than {_MOST_BYTES} bytes; give a TOML file")
+        return tomllib.loads(content.decode("utf-8-sig"))
     except OSError as error:
         raise InputError(
             f"`--settings` is `{path}`, which cannot be read ({error.strerror}); give a TOML file"
         ) from None
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
         raise InputError(f"`{path}` is no TOML file: {error}; a line is `key = value`, text in quotes") from None
 

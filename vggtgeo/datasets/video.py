@@ -181,11 +181,13 @@ def _capture(path: Path) -> Iterator[Any]:
     if _is_text(path):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
     try:
-        capture = cv2.VideoCapture(str(path))
+        name = str(path).encode().decode()
+    except UnicodeError:  # OpenCV 5 ends the process over such a name
+        raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
+    try:
+        capture = cv2.VideoCapture(name)
     except cv2.error as error:
         raise InputError(f"`{path}` cannot be opened as a video: {error.err}") from None
-    except UnicodeError:
-        raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
     try:
         if not capture.isOpened():
             raise InputError(f"`{path}` cannot be opened as a video: it is damaged, or no video that OpenCV knows")
