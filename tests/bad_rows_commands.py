@@ -13,6 +13,7 @@ import tiny_sequences as tiny
 from bad_row import Row, good, line, nothing, rows, run_with
 
 from vggtgeo.cli.address_space import check_address_space
+from vggtgeo.export import export
 from vggtgeo.io.jax_environment import cache_folder
 from vggtgeo.results import Result
 from vggtgeo.results.run_folder import taken
@@ -169,6 +170,17 @@ def limited(gigabytes: float) -> None:
         check_address_space("run")
 
 
+def exported_over(folder: Path) -> Path:
+    """A run's folder, and one with a trajectory of somebody else."""
+    (folder / "run").mkdir()
+    (folder / "mine").mkdir()
+    folder_of_run("{}")(folder / "run")
+    for name in ("trajectory", "keyframes"):
+        bad.walk(folder / f"run/{name}.txt", 0)
+    bad.walk(folder / "mine/trajectory.txt", 1)
+    return folder
+
+
 def looped(folder: Path) -> Path:
     """Two links to each other."""
     (folder / "a").symlink_to(folder / "b")
@@ -291,6 +303,11 @@ OTHERS = rows(
         ("a command that is none", nothing, {"argv": line("solv")}),
         ("a flag that is none", nothing, {"argv": line("run", "--bad")}),
         ("`demo --frames 0`", nothing, {"argv": line("demo", "--frames", "0")}),
+        (
+            "`export` over files that no export wrote",
+            exported_over,
+            {"call": lambda made: export(made / "run", "tum", made / "mine")},
+        ),
         ("`demo` of 10^20 frames", nothing, {"argv": line("demo", "--frames", "1" + "0" * 20)}),
         ("`demo --frames many`", nothing, {"argv": line("demo", "--frames", "many")}),
         ("`demo` of a scene that is none", nothing, {"argv": line("demo", "--scene", "moon")}),

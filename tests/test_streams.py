@@ -49,6 +49,14 @@ def test_a_run_that_cannot_print_is_written_as_a_whole(tmp_path: Path, stream: s
         assert done.stdout.splitlines()[-1] == "verdict: failed"
 
 
+def test_a_backend_that_matplotlib_does_not_know_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`MPLBACKEND` of another program; it was asked for when the results were written. Oracle: the files."""
+    bad.frames(tmp_path / "frames")
+    monkeypatch.setenv("MPLBACKEND", "nonsense")
+    assert called("run", tmp_path / "frames", "-o", tmp_path / "out").returncode == 3
+    assert (tmp_path / "out/report.html").is_file()
+
+
 def test_a_reader_that_went_away_is_no_error() -> None:
     """`vggtgeo data list | head -1`: nothing is said."""
     reading, writing = os.pipe()

@@ -282,6 +282,7 @@ def make_app() -> typer.Typer:
 def main() -> None:
     """Entry point of the program."""
     set_jax_flags()
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a name that Matplotlib does not know would end a run
     end_on_signals()
     use_lasting_streams()
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
