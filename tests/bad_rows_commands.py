@@ -315,6 +315,8 @@ OTHERS = rows(
         ("`simulate --size 640`", nothing, {"argv": simulated("--size", "640")}),
         ("`simulate --size 4x4`", nothing, {"argv": simulated("--size", "4x4")}),
         ("`simulate --rate 0`", nothing, {"argv": simulated("--rate", "0")}),
+        ("`simulate --rate 1e-320`", nothing, {"argv": simulated("--rate", "1e-320")}),
+        ("`simulate --speed 1e300`", nothing, {"argv": simulated("--speed", "1e300")}),
         ("`simulate --blur -1`", nothing, {"argv": simulated("--blur", "-1")}),
         ("`simulate --speed nan`", nothing, {"argv": simulated("--speed", "nan")}),
         ("`view` of a folder that is not there", nothing, {"argv": line("view", "no/such/run")}),
