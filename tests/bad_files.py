@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import tiny_sequences as tiny
+from picture_bytes import TURN
 from test_problem_file import SCENE, arrays_of
 
 from vggtgeo.bundle.problem_file import save_problem
@@ -70,8 +71,7 @@ def damaged_jpeg() -> bytes:
 
 def turned_jpeg() -> bytes:
     """A JPEG that asks to be turned by 90 degrees."""
-    tiff = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
-    part = b"Exif\0\0" + tiff
+    part = b"Exif\0\0" + TURN
     whole = encoded(".jpg")
     return whole[:2] + b"\xff\xe1" + struct.pack(">H", len(part) + 2) + part + whole[2:]
 
@@ -114,13 +114,26 @@ def write(name: str, content: str | bytes) -> Callable[[Path], Any]:
     return lambda folder: (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def video(path: Path, count: int = 12) -> Path:
-    """A video that can be read."""
+def video(path: Path, count: int = 12, walk: bool = False) -> Path:
+    """A video that can be read: pictures that have nothing in common, or a walk along one."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+    scene = picture(0, WIDTH + count, HEIGHT)
     for row in range(count):
-        writer.write(picture(row))
+        writer.write(np.ascontiguousarray(scene[:, row : row + WIDTH]) if walk else picture(row))
     writer.release()
     return path
+
+
+def holed_video(folder: Path) -> Path:
+    """A video whose data are zeros from four tenths to half, as a download in pieces leaves them."""
+    whole = bytearray(video(folder / "clip.mp4", 40, walk=True).read_bytes())
+    start = whole.index(b"mdat") + 4
+    length = int.from_bytes(whole[start - 8 : start - 4], "big") - 8
+    hole = slice(start + length * 4 // 10, start + length * 5 // 10)
+    whole[hole] = bytes(hole.stop - hole.start)
+    (folder / "clip.mp4").write_bytes(whole)
+    (folder / "calibration.txt").write_text("55 55 31.5 23.5")
+    return folder / "clip.mp4"
 
 
 def problem(**changes: Any) -> Callable[[Path], Path]:

@@ -12,6 +12,8 @@ import pytest
 import tiny_sequences as tiny
 from bad_row import Row, good, line, nothing, rows, run_with
 
+from vggtgeo.cli.address_space import check_address_space
+from vggtgeo.export import export
 from vggtgeo.io.jax_environment import cache_folder
 from vggtgeo.results import Result
 from vggtgeo.results.run_folder import taken
@@ -161,6 +163,31 @@ def without_home(folder: Path) -> None:
         assert cache_folder() is None
 
 
+def limited(gigabytes: float) -> None:
+    """What `vggtgeo run` asks first, with so large an address space."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("resource.getrlimit", lambda kind: (int(gigabytes * 1e9), -1))
+        check_address_space("run")
+
+
+def exported_over(folder: Path) -> Path:
+    """A run's folder, and one with a trajectory of somebody else."""
+    (folder / "run").mkdir()
+    (folder / "mine").mkdir()
+    folder_of_run("{}")(folder / "run")
+    for name in ("trajectory", "keyframes"):
+        bad.walk(folder / f"run/{name}.txt", 0)
+    bad.walk(folder / "mine/trajectory.txt", 1)
+    return folder
+
+
+def looped(folder: Path) -> Path:
+    """Two links to each other."""
+    (folder / "a").symlink_to(folder / "b")
+    (folder / "b").symlink_to(folder / "a")
+    return folder / "a"
+
+
 RUN = rows(
     "`vggtgeo run`",
     [
@@ -212,6 +239,18 @@ RUN = rows(
         ("`--seed` beyond 32 bits", good, flags("--seed", "99999999999")),
         ("`--depth-scale 0`", good, flags("--depth-scale", "0")),
         ("a reader that is none", good, flags("--kind", "photos")),
+        ("`--memory-limit-gb 1e400`", good, flags("--memory-limit-gb", "1e400")),
+        ("`--fps 1e-320`", good, flags("--fps", "1e-320")),
+        ("`--start 0x1`", good, flags("--start", "0x1")),
+        ("`--stride 1e0`", good, flags("--stride", "1e0")),
+        ("`--intrinsics` with 1e400", good, flags("--intrinsics", "1e400,55,31.5,23.5")),
+        ("`--depth-scale 1e400`", good, flags("--depth-scale", "1e400")),
+        ("`--save-map` onto a device", good, flags("--save-map", "/dev/full")),
+        ("`--set` of two lines", good, flags("--set", "tracking.least_inliers=5\nkeyframes.keyframe_distance=1")),
+        ("the home folder of somebody unknown", nothing, {"argv": line("run", "~no-such-user/clip")}),
+        ("two paths", good, {"argv": lambda made: ["run", made, made]}),
+        ("`-` for standard input", nothing, {"argv": line("run", "-")}),
+        ("a link to itself", looped, {"argv": lambda made: ["run", made]}),
         ("the reader of videos on a folder", good, flags("--kind", "video")),
         ("the reader of folders on a file", bad.file("clip.mp4", b"no"), flags("--kind", "tum")),
     ],
@@ -220,6 +259,7 @@ SETTINGS = rows(
     "Settings files",
     [
         ("a file that is not there", good, flags("--settings", "no.toml")),
+        ("a device that never ends", good, flags("--settings", "/dev/zero")),
         ("no TOML", None, settings("stride: 2")),
         ("not UTF-8", None, settings(b"path = '\xff\xfe'")),
         ("an unknown key", None, settings("strid = 2")),
@@ -228,6 +268,14 @@ SETTINGS = rows(
         ("an unknown group", None, settings("[trackin]\nleast_inliers = 3")),
         ("ten thousand brackets", None, settings("a = " + "[" * 10_000)),
         ("a number of 5000 digits", None, settings("stride = 1" + "0" * 5000)),
+        ("a number for a group", None, settings("tracking = 5")),
+        ("a list of tables for a group", None, settings("[[tracking]]\nleast_inliers = 3")),
+        ("a setting outside its group", None, settings("least_inliers = 5")),
+        ("a window of 10^12 keyframes", None, settings("window.size = 999999999999")),
+        ("a kernel of infinite width", None, settings("window.kernel = 'cauchy 1e400'")),
+        ("empty text for the output folder", None, settings("output = ''")),
+        ("a key twice", None, settings("stride = 1\nstride = 2")),
+        ("a date for a number", None, settings("stride = 2024-01-01")),
     ],
 )
 OUTPUT = rows(
@@ -255,12 +303,20 @@ OTHERS = rows(
         ("a command that is none", nothing, {"argv": line("solv")}),
         ("a flag that is none", nothing, {"argv": line("run", "--bad")}),
         ("`demo --frames 0`", nothing, {"argv": line("demo", "--frames", "0")}),
+        (
+            "`export` over files that no export wrote",
+            exported_over,
+            {"call": lambda made: export(made / "run", "tum", made / "mine")},
+        ),
+        ("`demo` of 10^20 frames", nothing, {"argv": line("demo", "--frames", "1" + "0" * 20)}),
         ("`demo --frames many`", nothing, {"argv": line("demo", "--frames", "many")}),
         ("`demo` of a scene that is none", nothing, {"argv": line("demo", "--scene", "moon")}),
         ("`simulate --frames 0`", nothing, {"argv": simulated("--frames", "0")}),
         ("`simulate --size 640`", nothing, {"argv": simulated("--size", "640")}),
         ("`simulate --size 4x4`", nothing, {"argv": simulated("--size", "4x4")}),
         ("`simulate --rate 0`", nothing, {"argv": simulated("--rate", "0")}),
+        ("`simulate --rate 1e-320`", nothing, {"argv": simulated("--rate", "1e-320")}),
+        ("`simulate --speed 1e300`", nothing, {"argv": simulated("--speed", "1e300")}),
         ("`simulate --blur -1`", nothing, {"argv": simulated("--blur", "-1")}),
         ("`simulate --speed nan`", nothing, {"argv": simulated("--speed", "nan")}),
         ("`view` of a folder that is not there", nothing, {"argv": line("view", "no/such/run")}),
@@ -336,6 +392,10 @@ RESULTS = rows(
 )
 ENVIRONMENT = rows(
     "Environment",
-    [("no home folder, or one that cannot be written: nothing is cached", nothing, {"call": without_home})],
+    [
+        ("no home folder, or one that cannot be written: nothing is cached", nothing, {"call": without_home}),
+        ("`ulimit -v` that is too small", nothing, {"call": lambda made: limited(2.5)}),
+        ("`ulimit -v` that is small", nothing, {"call": lambda made: limited(4.0)}),
+    ],
 )
 COMMANDS: list[Row] = [*RUN, *SETTINGS, *OUTPUT, *OTHERS, *TRAJECTORIES, *NETWORKS, *RESULTS, *ENVIRONMENT]

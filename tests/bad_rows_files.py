@@ -179,7 +179,8 @@ LISTS = rows(
         ("truth that is a folder", bad.rgbd(truth_folder), OPENED),
         ("a pose file of 7-Scenes with NaN", poses("nan " * 16)),
         ("a pose file of 7-Scenes with nine numbers", poses("1 " * 9), OPENED),
-        ("a pose file of 7-Scenes that is no rotation", poses("2 " * 16), OPENED),
+        ("a pose file of 7-Scenes with another last row", poses("1 0 0 0 0 1 0 0 0 0 1 0 5 5 5 5"), OPENED),
+        ("a pose file of 7-Scenes that is no rotation", poses("2 " * 12 + "0 0 0 1"), OPENED),
     ],
     call=read_frames,
 )
@@ -210,6 +211,7 @@ VIDEOS = rows(
         ("text", bad.file("clip.mp4", "no video")),
         ("no bytes", bad.file("clip.mp4", b"")),
         ("cut off", cut_video),
+        ("zeros in its middle", bad.holed_video),
         ("no regular file", lambda folder: Path("/dev/null")),
         ("text: FFmpeg draws its letters", bad.file("clip.mp4", "1305031102.175 rgb/1.png\n" * 99)),
         ("a list of other files for FFmpeg", bad.file("clip.mp4", "ffconcat version 1.0\nfile /etc/passwd\n")),

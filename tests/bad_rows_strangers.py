@@ -85,6 +85,11 @@ def pipe_in_list(folder: Path) -> None:
     (folder / "rgb.txt").write_text("9.0 pipe.png\n" + (folder / "rgb.txt").read_text())
 
 
+def depth_for_images(folder: Path) -> None:
+    """The list of images names the depth."""
+    (folder / "rgb.txt").write_text((folder / "depth.txt").read_text())
+
+
 def pipe_for(name: str) -> Callable[[Path], None]:
     """A pipe in the place of a file."""
 
@@ -111,6 +116,18 @@ IMAGES = rows(
         ("16-bit PNG with transparency", image(bytes_of.deep_png(PICTURE))),
         ("CMYK JPEG", image(bytes_of.cmyk_jpeg(SIZE), ".jpg")),
         ("TIFF of several pages: the first", image(cv2.imencodemulti(".tiff", [PICTURE] * 2)[1].tobytes(), ".tiff")),
+        ("a PNG that asks to be turned (EXIF)", image(bytes_of.turned_png(bad.encoded(".png")))),
+        ("a WebP that asks to be turned (EXIF)", image(bytes_of.turned_webp(bad.encoded(".webp"), SIZE), ".webp")),
+        ("a TIFF that asks to be turned", image(bytes_of.turned_tiff(bad.encoded(".tiff")), ".tiff")),
+        ("a BigTIFF's header of 30000 x 30000 pixels", image(bytes_of.big_tiff_header(30000, 30000), ".tiff")),
+        ("a JPEG 2000 that is called .png", image(bad.encoded(".jp2"))),
+        ("a HEIC that is called .jpg", image(b"\0\0\0\x18ftypheic" + b"\0" * 500, ".jpg")),
+        ("a GIF that is called .png", image(b"GIF89a" + b"\0" * 500)),
+        ("a PNG whose check sum is wrong", image(bad.encoded(".png")[:29] + b"\0" + bad.encoded(".png")[30:])),
+        ("a file behind the PNG's end", image(bad.encoded(".png") + b"x" * 9999)),
+        ("two JPEGs in one file: the first", image(bad.encoded(".jpg") * 2, ".jpg")),
+        ("a PPM of 16 bits", image(b"P6 64 48 65535\n" + (PICTURE.astype(">u2") * 257).tobytes(), ".ppm")),
+        ("one pixel", image(bad.encoded(".png", PICTURE[:1, :1]))),
         ("a JPEG that is called .png", image(bad.encoded(".jpg"))),
         ("colour, grey and 16 bits mixed", beside(other_kinds)),
         ("what macOS puts beside an image (`._1.png`)", beside(lambda folder: (folder / "._1.png").write_bytes(b"\0"))),
@@ -153,6 +170,7 @@ LISTS = rows(
         ("names with backslashes", listed(lambda text: text.replace("rgb/", "rgb\\"))),
         ("a time of 1e300", listed(lambda text: text + "1e300 rgb/10.000000.png\n")),
         ("times in nanoseconds", listed(lambda text: "1403636579763555584 rgb/10.000000.png\n")),
+        ("the depth's list in the place of the images'", bad.rgbd(depth_for_images)),
         ("truth of 1e300 metres", listed(lambda text: "1 1e300 0 0 0 0 0 1\n", "groundtruth.txt"), OPENED),
         ("truth that is a pipe", bad.rgbd(pipe_for("groundtruth.txt")), OPENED),
     ],
@@ -175,4 +193,30 @@ CALIBRATION = rows(
     ],
     call=read_frames,
 )
-STRANGERS: list[Row] = [*IMAGES, *DEPTH, *LISTS, *CALIBRATION]
+
+
+def named(name: str | bytes, make: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """Something under this name."""
+
+    def both(folder: Path) -> Path:
+        make(folder / "clip.mp4")
+        place = Path(os.fsdecode(os.fsencode(folder) + b"/" + os.fsencode(name)))
+        (folder / "clip.mp4").rename(place)
+        return place
+
+    return both
+
+
+VIDEOS = rows(
+    "Videos",
+    [
+        ("a name that is no UTF-8", named(b"clip\xff.mp4", bad.video)),
+        ("no frame", named("c.mp4", lambda path: bad.video(path, 0))),
+        ("a pipe", named("c.mp4", os.mkfifo)),
+        ("a bag of ROS that is a pipe", named("c.bag", os.mkfifo)),
+        ("a video that is called .png", named("c.png", bad.video)),
+        ("a zip archive", bad.file("clip.mp4", b"PK\x03\x04" + b"\0" * 999)),
+    ],
+    call=read_frames,
+)
+STRANGERS: list[Row] = [*IMAGES, *DEPTH, *LISTS, *CALIBRATION, *VIDEOS]

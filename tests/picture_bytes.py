@@ -67,12 +67,47 @@ def cmyk_jpeg(size: tuple[int, int]) -> bytes:
     return b"\xff\xd8" + b"".join(parts) + b"\0" * (2 * blocks // 8) + b"\xff\xd9"
 
 
+TURN = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
+"""EXIF data that ask for a turn by 90 degrees."""
+
+
+def turned_png(whole: bytes) -> bytes:
+    """A PNG that asks to be turned."""
+    return whole[:33] + chunk(b"eXIf", TURN) + whole[33:]
+
+
+def turned_webp(whole: bytes, size: tuple[int, int]) -> bytes:
+    """A WebP that asks to be turned: its picture in the extended form, with EXIF data."""
+    sides = b"".join((side - 1).to_bytes(3, "little") for side in size)
+    part = lambda name, data: name + struct.pack("<I", len(data)) + data
+    inside = b"WEBP" + part(b"VP8X", b"\x08\0\0\0" + sides) + whole[12:] + part(b"EXIF", TURN)
+    return part(b"RIFF", inside)
+
+
+def turned_tiff(whole: bytes) -> bytes:
+    """A TIFF that asks to be turned: its directory again at its end, with one tag more."""
+    (start,) = struct.unpack_from("<I", whole, 4)
+    (count,) = struct.unpack_from("<H", whole, start)
+    entries = [whole[start + 2 + 12 * row :][:12] for row in range(count)]
+    turned = sorted([*entries, TURN[10:22]], key=lambda entry: struct.unpack_from("<H", entry))
+    end = struct.pack("<H", count + 1) + b"".join(turned) + b"\0" * 4
+    return whole[:4] + struct.pack("<I", len(whole)) + whole[8:] + end
+
+
 def tiff_header(width: int, height: int) -> bytes:
     """A TIFF that declares so many pixels and has hardly any."""
     tags = ((256, 4, width), (257, 4, height), (258, 3, 8), (259, 3, 1), (262, 3, 2), (273, 4, 8), (277, 3, 3))
     tags = (*tags, (278, 4, height), (279, 4, 10))
     entries = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in tags)
     return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + b"\0" * 24
+
+
+def big_tiff_header(width: int, height: int) -> bytes:
+    """The same as a BigTIFF, whose offsets have eight bytes."""
+    tags = ((256, 4, width), (257, 4, height), (258, 3, 8), (259, 3, 1), (262, 3, 2), (273, 4, 16), (277, 3, 3))
+    tags = (*tags, (278, 4, height), (279, 4, 10))
+    entries = b"".join(struct.pack("<HHQQ", tag, kind, 1, value) for tag, kind, value in tags)
+    return b"II+\0" + struct.pack("<HHQQ", 8, 0, 16, len(tags)) + entries + b"\0" * 24
 
 
 def webp_header(width: int, height: int) -> bytes:

@@ -5,6 +5,7 @@ from pathlib import Path
 import bad_files as bad
 import cv2
 import numpy as np
+import picture_bytes as bytes_of
 import pytest
 import tiny_sequences as tiny
 
@@ -21,7 +22,7 @@ from vggtgeo.datasets import (
     with_rate,
     without_depth,
 )
-from vggtgeo.datasets.image_files import read_image_file
+from vggtgeo.datasets.image_files import MILLIMETRES, read_depth, read_image_file
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -323,6 +324,18 @@ def test_images_are_used_as_they_are_stored(tmp_path: Path) -> None:
     turned, plain = (read_image_file(tmp_path / f"{name}.jpg") for name in ("turned", "plain"))
     assert (turned.orientation, plain.orientation) == (6, 1)
     np.testing.assert_array_equal(turned.image, plain.image)
+    size = (bad.WIDTH, bad.HEIGHT)
+    turns = {".png": bytes_of.turned_png, ".webp": lambda whole: bytes_of.turned_webp(whole, size)}
+    for suffix, turn in {**turns, ".tiff": bytes_of.turned_tiff}.items():
+        (tmp_path / f"turned{suffix}").write_bytes(turn(bad.encoded(suffix)))
+        (tmp_path / f"plain{suffix}").write_bytes(bad.encoded(suffix))
+        turned, plain = (read_image_file(tmp_path / f"{name}{suffix}") for name in ("turned", "plain"))
+        assert (turned.orientation, plain.orientation) == (6, 1)
+        np.testing.assert_array_equal(turned.image, plain.image)
+    for suffix, turn in ((".png", bytes_of.turned_png), (".tiff", bytes_of.turned_tiff)):
+        (tmp_path / f"depth{suffix}").write_bytes(turn(bad.encoded(suffix, tiny.depth_codes(1))))
+        depth = read_depth(tmp_path / f"depth{suffix}", MILLIMETRES)
+        np.testing.assert_array_equal(depth, _expected_depth(1, 1000.0, MILLIMETRES.invalid))
     picture = bad.picture(1)
     picture[0, 0] = 255
     (tmp_path / "twelve.png").write_bytes(bad.encoded(".png", picture[..., ::-1].astype(np.uint16) << 4))

@@ -87,6 +87,26 @@ REFUSED: tuple[tuple[str, Change, str], ...] = (
     ("EuRoC camera", put(b"intrinsics: [", b"intrinsics: [1e-9, 1e-9, 9, 9] #"), r"the camera of .* must be in pixels"),
     ("Tanks crop", lambda _: b"1", r"c.json`: expected orthogonal_axis, axis_min, axis_max, bounding_polygon"),
     ("Tanks crop", put(b'bounding_polygon": [[', b'bounding_polygon": [1], "x": [['), r"c.json`: expected orthogonal"),
+    (
+        "Tanks poses",
+        put(b"0 0 0\n", b"zero 0 0\n"),
+        r"data_COLMAP_SfM.log`, line 1: found 'zero 0 0'; expected the num",
+    ),
+    ("Tanks poses", put(b"1 1 0\n", b"-1 1 0\n"), r"log`, line 6: found '-1 1 0'; expected the number of an image"),
+    ("Tanks poses", put(b"1 1 0\n", b"1" * 5000 + b"\n"), r"log`, line 6: found '1111.*'; expected the number of an"),
+    ("Tanks poses", put(b"\n0", b"\nx"), r"log`, line 3: found 'x.*'; expected row 2 of a pose's 4 x 4 matrix, four n"),
+    ("Tanks poses", put(b"\n0", b"\n1 2 3\n0"), r"log`, line 3: found '1 2 3'; expected row 2 of a pose's 4 x 4"),
+    (
+        "Tanks poses",
+        lambda whole: whole[: len(whole) * 2 // 5],
+        r"log`.* 4 x 4 matrix, four numbers|ends within a pose",
+    ),
+    (
+        "Tanks poses",
+        lambda whole: b"\n".join(whole.splitlines()[:7]),
+        r"log` ends within a pose \(line 7\); expected a",
+    ),
+    ("Tanks poses", lambda _: bytes(range(256)), r"log`, line 1: found .*; expected the number of an image"),
     ("scene", array("frames", np.zeros(0, int)), r"scene.npz` cannot be read|expected numbers"),
     ("scene", array("intrinsics", np.array([1.0, np.nan, 1.0, 1.0])), r"its intrinsics are \[ 1. nan"),
     ("scene", array("poses", np.zeros((2, 4, 4))), r"its poses are not all rigid"),
@@ -125,6 +145,13 @@ def test_a_pose_of_zeros_is_no_truth(tmp_path: Path) -> None:
     """ScanNet's lost frames hold infinities, other exporters write zeros; oracle: the warning."""
     with pytest.warns(InputWarning, match="1 of 3 poses have no rotation"):
         read("ScanNet pose", lambda _: b"0 " * 16, tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore:.*no intrinsics found")
+def test_a_pose_with_another_last_row_is_no_truth(tmp_path: Path) -> None:
+    """It is no rigid motion, and was taken for one; oracle: the warning."""
+    with pytest.warns(InputWarning, match="1 of 3 poses have no rotation"):
+        read("Tanks poses", put(b" 1.000000000\n1 1 0", b" 7.000000000\n1 1 0"), tmp_path)
 
 
 def test_the_size_is_that_of_the_first_depth_that_can_be_read(tmp_path: Path) -> None:

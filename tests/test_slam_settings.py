@@ -143,7 +143,7 @@ def test_no_group_has_the_name_of_a_flag() -> None:
         ("least_inliers=20", "`least_inliers` is no setting; the nearest is `tracking.least_inliers`"),
         ("window.window=4", "`window.window` is no setting; the nearest is `window.window_iterations`"),
         ("window.size", "`window.size` sets nothing; write `group.field=value`"),
-        ("window.size=four", "`window.size` is 'four'; it must be a whole number, 3 or more"),
+        ("window.size=four", "`window.size` is 'four'; it must be a whole number from 3 to 1000"),
         ("line.use_lines=1", "`line.use_lines` is 1; it must be true or false"),
         ("window.kernel=tukey 3", "`window.kernel` is 'tukey 3'; it must be one of barron, cauchy"),
     ],

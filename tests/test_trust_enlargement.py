@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from recorded_run import recorded_run
+from same_leaves import differences
+from test_state_file import rewritten
 from witness import walk
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.results.checkpoints import CHECKPOINT
 from vggtgeo.slam.trust.enlargement import check_enlargements, followed_enlargement, matched_enlargement
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.judge import judge
@@ -72,6 +77,28 @@ def test_what_the_camera_carries_has_no_say() -> None:
     assert seen is not None
     assert abs(seen) < 0.02
     assert matched_enlargement(before, after, left_out) == pytest.approx(np.log(1.5), abs=0.05)
+
+
+def test_an_older_checkpoint_notes_nothing(tmp_path: Path) -> None:
+    """Version 5 had no factor; what it noted is read, without one."""
+    run = recorded_run()
+    recorder = EvidenceRecorder(run.sequence.camera)
+    for frame in run.frames[:3]:
+        recorder.add(frame)
+    noted = tuple(recorder.frames)
+    assert noted[1].enlarged is not None
+    CHECKPOINT.write(tmp_path / "kept.npz", noted)
+
+    def older(header: dict[str, Any]) -> None:
+        header["version"] = 5
+        ((_, fields),) = header["classes"]
+        assert fields.pop() == "enlarged"
+        for part in header["tree"]:
+            part["v"].pop()
+
+    found, _ = CHECKPOINT.read(rewritten(tmp_path / "kept.npz", older))
+    plain = tuple(replace(one, enlarged=None) for one in noted)
+    assert list(differences(plain, found)) == []
 
 
 def test_a_steady_growth_is_no_change_of_the_lens() -> None:

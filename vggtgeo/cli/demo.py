@@ -19,7 +19,7 @@ def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("runs/demo"),
     settings: SettingsOption = None,
     scene: Annotated[str, typer.Option(help="Scene: office, hall, corridor, staircase, building, room.")] = "office",
-    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 45,
+    frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of frames.")] = 45,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the scene and its noise.")] = 0,
     assignments: AssignmentsOption = None,
     rerun: RerunOption = None,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import io
 import os
 import sys
 import warnings
@@ -14,8 +13,10 @@ from typing import Annotated, Any, NamedTuple, NoReturn, TextIO
 import typer
 from typer.core import TyperGroup
 
+from vggtgeo.cli.address_space import check_address_space
 from vggtgeo.cli.jax_flags import set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
+from vggtgeo.cli.streams import exit_code, use_lasting_streams
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.interruption import end_on_signals
 from vggtgeo.io.one_line import one_line
@@ -153,6 +154,8 @@ class _LazyGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, stand_in, rest = super().resolve_command(ctx, args)
         entry = next((entry for entry in COMMANDS if entry.name == name), None)
+        if entry is not None and not set(ctx.help_option_names) & set(rest):
+            check_address_space(entry.name)
         return name, load_command(entry) if entry else stand_in, rest
 
     def invoke(self, ctx: Any) -> Any:
@@ -201,8 +204,9 @@ def _leave(error: BaseException) -> NoReturn:
         message, code = f"error: `{error.filename}`: {error.strerror}", EXIT_INPUT
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
-    elif isinstance(error, MemoryError):
-        message, code = f"error: there is not enough memory ({error}); give fewer or smaller images", EXIT_INPUT
+    elif _is_short_of_memory(error):
+        message = f"error: there is not enough memory ({error}); give fewer or smaller images, or smaller settings"
+        code = EXIT_INPUT
     elif _is_usage_error(error):
         message, code = f"error: {_usage_message(error)}", EXIT_INPUT
     elif _lacks_platform():
@@ -213,6 +217,12 @@ def _leave(error: BaseException) -> NoReturn:
         code = EXIT_INTERNAL
     typer.echo(one_line(message), err=True)
     raise typer.Exit(code) from None
+
+
+def _is_short_of_memory(error: BaseException) -> bool:
+    """Whether memory ran out, or what a thread needs: NumPy, Python and JAX each have a word of their own for it."""
+    words = ("RESOURCE_EXHAUSTED", "can't start new thread")
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(words))
 
 
 def _lacks_platform() -> bool:
@@ -272,12 +282,14 @@ def make_app() -> typer.Typer:
 def main() -> None:
     """Entry point of the program."""
     set_jax_flags()
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a name that Matplotlib does not know would end a run
     end_on_signals()
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal may know fewer letters than names have
-            stream.reconfigure(errors="replace")
+    use_lasting_streams()
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
-    make_app()(prog_name="vggtgeo")
+    try:
+        make_app()(prog_name="vggtgeo")
+    except SystemExit as end:
+        raise SystemExit(exit_code(end.code, EXIT_INPUT)) from None
 
 
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:

@@ -122,6 +122,8 @@ def check_map_file(file: Path, output: Path) -> None:
         raise InputError(f"`--save-map` is `{file}`, which is a folder; give the name of a file")
     from vggtgeo.results.run_folder import is_result
 
+    if file.exists() and not file.is_file():
+        raise InputError(f"`--save-map` is `{file}`, which is a device, a pipe or a socket; give the name of a file")
     if file.is_file() and file.stat().st_size and not _is_map(file):
         raise InputError(f"`--save-map` is `{file}`, which is there and is no map; give the name of a new file")
     if is_result(output, file):
@@ -144,8 +146,8 @@ def check_flags(preset: str, features: str, memory_limit_gb: float | None, fps: 
     """InputError for flags that do not go together, or cannot be."""
     if preset == "paper" and features != "sift":
         raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
-    if memory_limit_gb is not None and not memory_limit_gb > 0:
-        raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be positive")
+    if memory_limit_gb is not None and not 0 < memory_limit_gb < float("inf"):
+        raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be a positive number")
     if fps is not None and not 0 < fps < float("inf"):
         raise InputError(f"`--fps` is {fps:g}; it must be a positive number of frames a second")
 

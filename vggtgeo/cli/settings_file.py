@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,6 +21,8 @@ import typer
 from vggtgeo.io.errors import InputError
 
 _NOT_SETTINGS = ("settings", "help", "assignments", "resume", "checkpoint_every")
+_LONGEST = 60
+_MOST_BYTES = 1_000_000
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("true or false", (bool,)),
     int: ("a whole number", (int,)),
@@ -54,10 +56,16 @@ def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
         return SettingsInUse(context)
     given = _read(path)
     tables: dict[str, dict[str, Any]] = {}
+    settings: dict[str, list[str]] = {}
     if any(parameter.name == "assignments" for parameter in context.command.params):
+        from vggtgeo.slam.settings_table import names  # slow: it brings JAX
+
+        for name in names():
+            group, _, setting = name.partition(".")
+            settings.setdefault(group, []).append(setting)
         tables = {key: value for key, value in given.items() if isinstance(value, dict)}
     flags = {key: value for key, value in given.items() if key not in tables}
-    context.default_map = _checked(path, _affirmed(path, flags, context), _keys(context), _types(context))
+    context.default_map = _checked(path, _affirmed(path, flags, context), _keys(context), _types(context), settings)
     return SettingsInUse(context, tables)
 
 
@@ -78,24 +86,53 @@ that is no flag of the command, and for a value of a wrong type."""
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:  # a device that never ends, or something that is no settings file
+            raise InputError(f"`--settings` is `{path}`, which has more than {_MOST_BYTES} bytes; give a TOML file")
+        return tomllib.loads(content.decode("utf-8-sig"))
     except OSError as error:
         raise InputError(
             f"`--settings` is `{path}`, which cannot be read ({error.strerror}); give a TOML file"
         ) from None
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
         raise InputError(f"`{path}` is no TOML file: {error}; a line is `key = value`, text in quotes") from None
 
 
-def _checked(path: Path, given: dict[str, Any], names: dict[str, str], types: dict[str, Any]) -> dict[str, Any]:
+def _checked(
+    path: Path,
+    given: dict[str, Any],
+    names: dict[str, str],
+    types: dict[str, Any],
+    settings: Mapping[str, Sequence[str]],
+) -> dict[str, Any]:
+    """The values by the names of their parameters. settings: the pipeline's, names of fields by group."""
     for key, value in given.items():
+        if key in settings:
+            raise InputError(
+                f"`{path}`: `{key}` is {_short(value)}; it must be a table of settings: a line `[{key}]`, and below it "
+                "lines `name = value`"
+            )
         if key not in names:
+            group = next((group for group, fields in settings.items() if key in fields), None)
+            if group is not None:
+                raise InputError(f"`{path}`: `{key}` is a setting of `{group}`: write it below a line `[{group}]`")
             near = difflib.get_close_matches(key, names, 1, 0.0)[0]
             raise InputError(f"`{path}`: `{key}` is no setting of this command; the nearest is `{near}`")
+        if value == "":
+            raise InputError(f"`{path}`: `{key}` is empty; give a value, or leave the line out")
         wanted, accepted = _KINDS.get(types[names[key]], ("text in quotes", (str,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
-            raise InputError(f"`{path}`: `{key}` is {value!r}; it must be {wanted}")
+            raise InputError(f"`{path}`: `{key}` is {_short(value)}; it must be {wanted}")
     return {names[key]: value for key, value in given.items()}
+
+
+def _short(value: Any) -> str:
+    """A value as text of one line, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
 
 
 def _affirmed(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from vggtgeo.io.errors import InputError
 def simulate(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="room, office, hall, corridor, staircase or building.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder for the sequence.")],
-    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 300,
+    frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of frames.")] = 300,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Decides everything that is random.")] = 0,
     size: Annotated[str, typer.Option(metavar="WxH", help="Image size, pixels.")] = "640x480",
     rate: Annotated[float, typer.Option(help="Frames a second.")] = 30.0,

@@ -129,6 +129,8 @@ def _reader(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise InputError("bags of ROS need the package rosbags: pip install 'vggtgeo[bags]'") from None
+    if not path.is_dir() and not path.is_file():  # a pipe has no end
+        raise InputError(f"`{path}` is no regular file; give a bag of ROS")
     place = path.parent if path.suffix in (".db3", ".mcap") else path
     try:
         with AnyReader([place], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

@@ -55,6 +55,10 @@ class FolderSequence:
         for file in self.files:
             if not math.isfinite(file.timestamp):
                 raise InputError(f"`{self.folder}`: `{file.image}` has the time {file.timestamp}; expected seconds")
+            if file.image == file.depth:
+                raise InputError(
+                    f"`{self.folder}`: `{file.image}` is listed as an image and as depth; expected two files"
+                )
 
     def __len__(self) -> int:
         return len(self.files)

@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterator
 
 from vggtgeo.datasets import image_sizes
 
 MOST_PIXELS = 100_000_000
 """Pixels of an image that are decoded: 0.3 GB."""
+_OTHER_FORMATS = (b"GIF8", b"\xff\x4f\xff\x51")
+_OTHER_BOXES = (b"jP  \r\n\x87\n", *(b"ftyp" + kind for kind in (b"avif", b"avis", b"heic", b"heix", b"mif1", b"msf1")))
+"""OpenCV takes them by their content. Some hundred bytes of them may declare gigabytes of pixels, at places of the file
+that nobody here reads, and their own kind of turning is applied without a word."""
 _LEFT_OVER = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MOST_LEFT_OVER = 4
-_ORIENTATION = 0x0112
 
 
 def defect(content: bytes) -> str:
@@ -30,6 +34,8 @@ def defect(content: bytes) -> str:
         return "is cut off: the JPEG has no end"
     if _lacks_scans(content):
         return "is cut off: scans of the progressive JPEG are missing"
+    if content.startswith(_OTHER_FORMATS) or content[4:12] in _OTHER_BOXES:
+        return "is a GIF, JPEG 2000, AVIF or HEIC, whatever its name: convert it to PNG or JPEG"
     width, height = declared_size(content)
     if width * height > MOST_PIXELS:
         return f"declares {width} x {height} pixels, more than {MOST_PIXELS // 10**6} million: not decoded"
@@ -48,40 +54,35 @@ def decoding_defect(message: str) -> str:
     return ""
 
 
-def orientation(content: bytes) -> int:
-    """The EXIF orientation of a JPEG, 1 to 8; 1, as it is stored, where it has none."""
-    for marker, part in _segments(content):
-        if marker == 0xE1 and part.startswith(b"Exif\0\0"):
-            return _tag_of(part[6:])
-    return 1
-
-
 def declared_size(content: bytes) -> tuple[int, int]:
     """Width and height that the header of an image declares; (0, 0) for what is none that is known."""
     if content.startswith(b"\x89PNG") and len(content) >= 24:
         width, height = struct.unpack(">II", content[16:24])
         return width, height
-    for marker, part in _segments(content):
+    for marker, part in jpeg_segments(content):
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(part) >= 5:
             height, width = struct.unpack(">HH", part[1:5])
             return width, height
     return image_sizes.declared_size(content)
 
 
-def _chunks_fit(content: bytes) -> bool:
-    """Whether each chunk of a PNG up to its end lies in the file: the decoder takes memory for what one declares."""
-    position = 8
-    while position + 8 <= len(content):
+def png_chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Kind and content of each chunk of a PNG that lies in the file, its end the last."""
+    position, kind = 8, b""
+    while position + 8 <= len(content) and kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", content, position)
         if position + 12 + length > len(content):
-            return False
-        if kind == b"IEND":
-            return True
+            return
+        yield kind, content[position + 8 : position + 8 + length]
         position += 12 + length
-    return False
 
 
-def _segments(content: bytes) -> list[tuple[int, bytes]]:
+def _chunks_fit(content: bytes) -> bool:
+    """Whether each chunk of a PNG up to its end lies in the file: the decoder takes memory for what one declares."""
+    return any(kind == b"IEND" for kind, _ in png_chunks(content))
+
+
+def jpeg_segments(content: bytes) -> list[tuple[int, bytes]]:
     """Marker and content of each segment of a JPEG before its image data."""
     found, position = [], 2
     while content.startswith(b"\xff\xd8") and position + 4 <= len(content) and content[position] == 0xFF:
@@ -95,7 +96,7 @@ def _segments(content: bytes) -> list[tuple[int, bytes]]:
 
 def _lacks_scans(content: bytes) -> bool:
     """Whether a progressive JPEG ends before each component has its DC and all 63 AC coefficients to the last bit."""
-    frame = next((part for marker, part in _segments(content) if marker == 0xC2), None)
+    frame = next((part for marker, part in jpeg_segments(content) if marker == 0xC2), None)
     if frame is None or len(frame) < 6:
         return False
     missing = {component: set(range(64)) for component in frame[6 : 6 + 3 * frame[5] : 3]}
@@ -121,20 +122,3 @@ def _start_of_scan(content: bytes) -> int:
             return position
         position += 2 + int.from_bytes(content[position + 2 : position + 4])
     return len(content)
-
-
-def _tag_of(tiff: bytes) -> int:
-    """The orientation in the first directory of EXIF data."""
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    try:
-        if order is None:
-            return 1
-        (offset,) = struct.unpack_from(f"{order}I", tiff, 4)
-        (count,) = struct.unpack_from(f"{order}H", tiff, offset)
-        for row in range(count):
-            tag, _, _, value = struct.unpack_from(f"{order}HHIH", tiff, offset + 2 + 12 * row)
-            if tag == _ORIENTATION:
-                return value if 1 <= value <= 8 else 1
-    except struct.error:
-        pass
-    return 1

@@ -14,7 +14,8 @@ import numpy as np
 import simplejpeg
 from jaxtyping import Float, UInt8
 
-from vggtgeo.datasets.image_defects import decoding_defect, defect, orientation
+from vggtgeo.datasets.image_defects import decoding_defect, defect
+from vggtgeo.datasets.image_orientation import as_stored, orientation
 from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
@@ -101,7 +102,7 @@ def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
         if wrong:
             raise InputError(f"`{path}` {wrong}")
     try:  # JPEGs too that simplejpeg does not know: of rare samplings, of arithmetic coding
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(as_stored(content), np.uint8), flags)
     except cv2.error as error:
         raise InputError(f"`{path}` cannot be decoded: {error.err}") from None
     if image is None:

@@ -5,22 +5,16 @@ from __future__ import annotations
 import re
 import struct
 
+from vggtgeo.datasets.tiff_tags import STARTS, tiff_tags
+
 _PNM = re.compile(rb"P[1-6]\s+(?:#[^\n]*\n\s*)*(\d{1,12})\s+(?:#[^\n]*\n\s*)*(\d{1,12})\s")
 _WIDTH, _HEIGHT = 256, 257
-_SHORT = 3
 
 
 def size_of_tiff(content: bytes) -> tuple[int, int]:
-    """Of the first image of a TIFF."""
-    order = {b"II": "<", b"MM": ">"}[content[:2]]
-    found = {}
-    (place,) = struct.unpack_from(f"{order}I", content, 4)
-    (count,) = struct.unpack_from(f"{order}H", content, place)
-    for entry in range(count):
-        at = place + 2 + 12 * entry
-        tag, kind = struct.unpack_from(f"{order}HH", content, at)
-        found[tag] = struct.unpack_from(f"{order}{'H' if kind == _SHORT else 'I'}", content, at + 8)[0]
-    return found.get(_WIDTH, 0), found.get(_HEIGHT, 0)
+    """Of the first image of a TIFF or BigTIFF."""
+    found = tiff_tags(content)
+    return (found[_WIDTH].value, found[_HEIGHT].value) if _WIDTH in found and _HEIGHT in found else (0, 0)
 
 
 def size_of_webp(content: bytes) -> tuple[int, int]:
@@ -44,7 +38,7 @@ def size_of_bmp(content: bytes) -> tuple[int, int]:
 def declared_size(content: bytes) -> tuple[int, int]:
     """Of a TIFF, WebP, BMP, PBM, PGM or PPM; (0, 0) for any other file, and where the header ends too early."""
     try:
-        if content[:4] in (b"II*\0", b"MM\0*"):
+        if content.startswith(STARTS):
             return size_of_tiff(content)
         if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
             return size_of_webp(content)

@@ -79,7 +79,11 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
         raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(KINDS)}")
     if kind == "live" or (kind is None and is_live(os.fspath(path))):
         return LiveCamera.open(os.fspath(path))
-    sequence = _open_place(Path(path).expanduser(), kind)
+    try:
+        place = Path(path).expanduser()
+    except RuntimeError:  # `~name` of a user whom this computer does not know, or no home folder at all
+        place = Path(path)
+    sequence = _open_place(place, kind)
     if sequence.camera.known:
         check_plausible(f"the camera of `{os.fspath(path)}`", sequence.camera)
     return sequence if rate is None else with_rate(sequence, rate)

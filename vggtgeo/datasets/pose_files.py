@@ -21,7 +21,7 @@ _MOST_STRETCH = 0.1
 def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
     """Lines of `columns` numbers, blanks or commas in between; InputError with the line of one that is not so."""
     rows = []
-    for number, line in enumerate(_text(file).splitlines(), start=1):
+    for number, line in enumerate(read_text(file).splitlines(), start=1):
         words = line.split(skip, 1)[0].replace(",", " ").split()
         if not words:
             continue
@@ -38,7 +38,7 @@ def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray
 def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
     """One matrix; InputError where the file holds another count of numbers."""
     try:
-        return np.array(_text(file).replace(",", " ").split(), np.float64).reshape(shape)
+        return np.array(read_text(file).replace(",", " ").split(), np.float64).reshape(shape)
     except ValueError:
         raise InputError(f"`{file}`: expected a matrix of {shape[0]} x {shape[1]} numbers") from None
 
@@ -86,7 +86,7 @@ def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
 
     InputError where it is not there, or has not `count` of them (None: any count will do).
     """
-    found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", _text(file), re.MULTILINE)
+    found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", read_text(file), re.MULTILINE)
     if found is None:
         raise InputError(f"`{file}` has no list `{key}: [...]`")
     words = found.group(1).replace(",", " ").split()
@@ -103,29 +103,33 @@ def numbers_of(words: Sequence[str], what: str) -> list[float]:
         raise InputError(f"{what} is {' '.join(words)[:60]!r}; expected numbers") from None
 
 
+def read_text(file: Path) -> str:
+    """The text of a file, other letters than those of UTF-8 replaced; InputError where it cannot be read."""
+    try:
+        if file.exists() and not file.is_file():  # a pipe has no end
+            raise InputError(f"`{file}` is no regular file")
+        return file.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None
+
+
 def read_json(file: Path) -> Any:
     """The content of a JSON file; InputError where it is none."""
     try:
-        return json.loads(_text(file))
+        return json.loads(read_text(file))
     except (ValueError, RecursionError) as error:  # numbers of too many digits and too many brackets are neither
         raise InputError(f"`{file}` is no JSON: {error}") from None
 
 
 def _have_rotations(poses: np.ndarray) -> np.ndarray:
-    """Whether the axes of each pose have nearly unit length and are no mirror image."""
+    """Whether the axes of each pose have nearly unit length and are no mirror image, above a last row 0 0 0 1."""
+    last = (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) < _MOST_STRETCH).all(axis=1)
     lengths = np.linalg.norm(poses[:, :3, :3], axis=1)
     near = (np.abs(lengths - 1.0) < _MOST_STRETCH).all(axis=1)
-    return np.asarray(near & (np.linalg.det(poses[:, :3, :3]) > 0.0), bool)
+    return np.asarray(last & near & (np.linalg.det(poses[:, :3, :3]) > 0.0), bool)
 
 
 def _orthonormal(poses: np.ndarray) -> np.ndarray:
     """The nearest rotations: files with few digits, or with a scale of 1 +- 1e-3, are no exact ones."""
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     return np.concatenate([np.concatenate([u @ vt, poses[:, :3, 3:]], axis=2), poses[:, 3:]], axis=1)
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None

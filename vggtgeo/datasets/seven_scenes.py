@@ -136,6 +136,8 @@ def _read_pose(file: Path) -> np.ndarray | None:
         pose = np.array(file.read_text(encoding="utf-8-sig").replace(",", " ").split(), np.float64).reshape(4, 4)
     except ValueError:
         raise InputError(f"`{file}`: expected a 4 x 4 matrix of numbers, camera to world") from None
+    if np.isfinite(pose).all() and not np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), atol=1e-3):
+        raise InputError(f"`{file}`: the last row of the matrix is {pose[3].tolist()}; it must be 0 0 0 1")
     if not np.isfinite(pose).all():
         warnings.warn(f"`{file}` has a NaN or an infinity; left out of the truth", InputWarning, stacklevel=3)
         return None

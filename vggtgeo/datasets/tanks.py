@@ -14,13 +14,14 @@ from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
-from vggtgeo.datasets.pose_files import read_json, read_matrix, trajectory_of
+from vggtgeo.datasets.pose_files import read_json, read_matrix, read_text, trajectory_of
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
 _LOG = "_COLMAP_SfM.log"
 _LINES = 5
 """Of a pose in the log: its numbers, and four rows of a matrix camera -> world."""
+_MOST_DIGITS = 9
 
 
 @dataclass(frozen=True)
@@ -97,13 +98,36 @@ def _images(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (natural_key(path.name), path.name))
 
 
-def _read_log(file: Path) -> tuple[list[int], np.ndarray]:
-    lines = [line.split() for line in file.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:
+    """Number of the image, and camera -> world, of each pose."""
+    lines = [(place, line) for place, line in enumerate(read_text(file).splitlines(), start=1) if line.strip()]
+    numbers, rows = [], []
+    for count, (place, line) in enumerate(lines):
+        words = line.split()
+        row = _floats(words)
+        if count % _LINES == 0:
+            if not words[0].isdecimal() or len(words[0]) > _MOST_DIGITS:
+                raise _not_in_log(file, place, line, "the number of an image, which a pose begins with, as in `0 0 0`")
+            numbers.append(int(words[0]))
+        elif len(row) != 4:
+            raise _not_in_log(file, place, line, f"row {count % _LINES} of a pose's 4 x 4 matrix, four numbers")
+        else:
+            rows.append(row)
+    if len(lines) % _LINES:
+        raise InputError(
+            f"`{file}` ends within a pose (line {lines[-1][0]}); expected a line of numbers and four rows of a matrix "
+            "each: is the file cut off?"
+        )
+    return numbers, np.array(rows, np.float64).reshape(-1, 4, 4)
+
+
+def _floats(words: list[str]) -> list[float]:
+    """The words as numbers; none where one is no number."""
     try:
-        if len(lines) % _LINES:
-            raise ValueError
-        numbers = [int(lines[row][0]) for row in range(0, len(lines), _LINES)]
-        rows = [[float(word) for word in line] for number, line in enumerate(lines) if number % _LINES]
-        return numbers, np.array(rows).reshape(-1, 4, 4)
-    except (ValueError, IndexError):
-        raise InputError(f"`{file}`: expected, a pose, a line of numbers and four rows of a 4 x 4 matrix") from None
+        return [float(word) for word in words]
+    except ValueError:
+        return []
+
+
+def _not_in_log(file: Path, place: int, line: str, expected: str) -> InputError:
+    return InputError(f"`{file}`, line {place}: found {line.strip()[:60]!r}; expected {expected}")

@@ -20,6 +20,9 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 _FALLBACK_RATE = 30.0
 _LOOKED_AT = 4096
+_MOST_MISSED = 1000
+"""Frames in a row that are tried: a damaged header may declare 10^9 where the file ends."""
+_MADE_OF_OTHERS = tuple(map(ord, "PB"))
 _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 """Control characters other than those of text and terminals; no container of videos is without them."""
 
@@ -70,23 +73,55 @@ class VideoFile:
         return None
 
     def _decode(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
-        time = -math.inf
-        index = 0
+        time, index = -math.inf, 0
+        damaged: int | None = None  # the first frame of those that cannot be decoded, while they last
         with _capture(self.path) as capture:
-            while (end is None or index < end) and _grabbed(capture):
+            while end is None or index < end:
+                missed = self._missed(capture, self.count - index - 1)
+                if missed is None:
+                    break
+                damaged = index if missed and damaged is None else damaged
+                index += missed
                 time = self._time(capture, index, time)
-                if index >= start and (index - start) % stride == 0:
+                if damaged is not None and _stands_alone(capture):
+                    self._tell_damaged(damaged, index, _chosen(start, end, stride, damaged, index))
+                    damaged = None
+                chosen = index >= start and (end is None or index < end) and (index - start) % stride == 0
+                if chosen and damaged is None:
                     readable, image = _decoded(capture.retrieve)
                     wrong = self._wrong(image if readable else None)
                     if wrong:
-                        _warn(f"`{self.name}`: frame {index} {wrong}; it is skipped", LeftOutWarning)
+                        _warn(LeftOutWarning(f"`{self.name}`: frame {index} {wrong}; it is skipped"))
                     else:
                         colour = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
                         yield Frame(index, time, colour, None, f"{self.name}, frame {index}")
                 index += 1
+        if damaged is not None:
+            self._tell_damaged(damaged, index, _chosen(start, end, stride, damaged, index))
         wanted = self.count if end is None else min(end, self.count)
         if index < wanted:
-            _warn(f"`{self.name}` ends after {index} frames; its header says {self.count}: is the file cut off?")
+            text = f"`{self.name}` ends after {index} frames; its header says {self.count}: is the file cut off?"
+            _warn(InputWarning(text))  # not as left out: where the rate varies, the header of an MKV only guesses
+
+    def _missed(self, capture: Any, more: int) -> int | None:
+        """Frames that cannot be decoded before the next one, which is grabbed; None at the end.
+
+        OpenCV answers damaged data as it answers the end, but goes on behind them when it is asked again. It passes
+        some without a word, so the times are asked, too. more: frames that the container says are behind the next one.
+        """
+        before = capture.get(cv2.CAP_PROP_POS_MSEC)
+        attempts = range(1 + min(max(more, 0), _MOST_MISSED))
+        missed = next((number for number in attempts if _grabbed(capture)), None)
+        if not missed:
+            return missed
+        passed = (capture.get(cv2.CAP_PROP_POS_MSEC) - before) * 1e-3 * self.rate - 1.0
+        return max(missed, min(more, round(passed))) if math.isfinite(passed) else missed
+
+    def _tell_damaged(self, first: int, behind: int, chosen: int) -> None:
+        """Of the frames from `first` to before `behind`, so many were chosen."""
+        if chosen:
+            text = f"`{self.name}` is damaged: frames {first} to {behind - 1} cannot be decoded, or are made of such"
+            _warn(LeftOutWarning(f"{text}; they are skipped", chosen))
 
     def _wrong(self, image: np.ndarray | None) -> str:
         """What is wrong with a decoded frame, as the end of a sentence; empty for nothing."""
@@ -104,6 +139,17 @@ class VideoFile:
             return index / self.given_rate
         time = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         return time if math.isfinite(time) and time > previous else previous + 1.0 / self.rate
+
+
+def _stands_alone(capture: Any) -> bool:
+    """Whether the frame is decoded from its own data: others, after damaged ones, are made of what is not there."""
+    return int(capture.get(cv2.CAP_PROP_FRAME_TYPE)) not in _MADE_OF_OTHERS
+
+
+def _chosen(start: int, end: int | None, stride: int, first: int, behind: int) -> int:
+    """How many frames of a selection lie from `first` to before `behind`."""
+    steps = max(0, -((start - first) // stride))
+    return len(range(start + steps * stride, behind if end is None else min(end, behind), stride))
 
 
 def _grabbed(capture: Any) -> bool:
@@ -135,11 +181,13 @@ def _capture(path: Path) -> Iterator[Any]:
     if _is_text(path):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
     try:
-        capture = cv2.VideoCapture(str(path))
+        name = str(path).encode().decode()
+    except UnicodeError:  # OpenCV 5 ends the process over such a name
+        raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
+    try:
+        capture = cv2.VideoCapture(name)
     except cv2.error as error:
         raise InputError(f"`{path}` cannot be opened as a video: {error.err}") from None
-    except UnicodeError:
-        raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
     try:
         if not capture.isOpened():
             raise InputError(f"`{path}` cannot be opened as a video: it is damaged, or no video that OpenCV knows")
@@ -148,5 +196,5 @@ def _capture(path: Path) -> Iterator[Any]:
         capture.release()
 
 
-def _warn(message: str, category: type[InputWarning] = InputWarning) -> None:
-    warnings.warn(message, category, stacklevel=3)
+def _warn(warning: InputWarning) -> None:
+    warnings.warn(warning, stacklevel=3)

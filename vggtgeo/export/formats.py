@@ -24,6 +24,8 @@ FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
     "kitti": write_kitti,
 }
 """Each writes below a folder what the format wants of a run's folder, and returns what was written, in numbers."""
+_RECORD = ".vggtgeo-export"
+"""Names of the files that exports wrote into a folder: those an export may replace, and no others."""
 
 
 def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[str] | None = None) -> dict[str, float]:
@@ -39,7 +41,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
 
     Raises:
         InputError: an unknown format, no run in `source`, or files of it that are damaged, `target` is the run itself,
-            or a package is not installed.
+            or has files in the way that no export wrote, or a package is not installed.
 
     """
     place = Path(source)
@@ -50,14 +52,37 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     output = Path(target) if target is not None else place / "export" / to
     if output.resolve() == place.resolve():
         raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
+    made = not output.exists()
     output.mkdir(parents=True, exist_ok=True)
     stage = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=output))
     try:  # what is there already stays until all is written
         written = FORMATS[to](place, stage)
-        for file in sorted(path for path in stage.rglob("*") if path.is_file()):
-            final = output / file.relative_to(stage)
-            final.parent.mkdir(parents=True, exist_ok=True)
-            file.replace(final)
+        names = sorted(str(path.relative_to(stage)) for path in stage.rglob("*") if path.is_file())
+        _claim(output, names, ours=target is None)
+        for name in names:
+            (output / name).parent.mkdir(parents=True, exist_ok=True)
+            (stage / name).replace(output / name)
     finally:
         shutil.rmtree(stage, ignore_errors=True)
+        if made and not any(output.iterdir()):
+            output.rmdir()
     return written
+
+
+def _claim(output: Path, names: list[str], ours: bool) -> None:
+    """Notes the files that an export writes into a folder; InputError where one is there that no export wrote.
+
+    ours: whether the folder is of exports alone.
+    """
+    record = output / _RECORD
+    try:
+        known = set(record.read_text(encoding="utf-8").splitlines())
+    except (OSError, UnicodeDecodeError):
+        known = set()
+    strange = [name for name in names if name not in known and os.path.lexists(output / name)]
+    if strange and not ours:
+        raise InputError(
+            f"`{output / strange[0]}` is there and was not written by an export, which would replace it; give a new "
+            "folder with `-o`"
+        )
+    record.write_text("\n".join(sorted({*known, *names})) + "\n", encoding="utf-8")

@@ -20,6 +20,9 @@ from vggtgeo.simulation.worlds import WORLDS
 
 _BAND = 16  # rows that share one pose under rolling exposure
 
+_LEAST, _MOST = 1e-4, 1e4
+"""Frames a second, and metres a second, that a walk is simulated at."""
+
 
 @dataclass(frozen=True, eq=False)
 class SyntheticSequence:
@@ -139,6 +142,9 @@ def simulate(
     ):
         if not 0 < value < math.inf:
             raise InputError(f"`{name}` is {value}; it must be positive")
+    for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
+        if not _LEAST <= value <= _MOST:  # times or places that are the same, or none
+            raise InputError(f"`{name}` is {value}; it must be from {_LEAST:g} to {_MOST:g}")
     build, walk = WORLDS[scene]
     motion = HandheldMotion.along(walk, seed)
     if speed is not None:

@@ -24,10 +24,10 @@ def switch(default: bool) -> Any:
     return _field(default, Expected("true or false", lambda value: isinstance(value, bool)))
 
 
-def whole(default: int, at_least: int) -> Any:
-    """A setting that is a whole number."""
-    holds = lambda value: _is_whole(value) and value >= at_least
-    return _field(default, Expected(f"a whole number, {at_least} or more", holds))
+def whole(default: int, at_least: int, at_most: int = 1_000_000) -> Any:
+    """A setting that is a whole number. at_most: arrays are made of such sizes, and JAX counts in 32 bits."""
+    holds = lambda value: _is_whole(value) and at_least <= value <= at_most
+    return _field(default, Expected(f"a whole number from {at_least} to {at_most}", holds))
 
 
 def positive(default: float, at_most: float = math.inf) -> Any:

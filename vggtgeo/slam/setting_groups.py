@@ -171,7 +171,7 @@ class CameraSettings(CheckedSettings):
     """Of their principal point, in image widths and heights: published calibrations of TUM RGB-D, EuRoC, KITTI and
     ICL-NUIM are 0.014 off the middle (root mean square). Left as free as the focal length, it took up errors of the
     poses: 110 px in 40 frames of redkitchen."""
-    most_pixels: int = whole(500_000, at_least=0)
+    most_pixels: int = whole(500_000, at_least=0, at_most=100_000_000)
     """Of an image: larger ones are reduced to about that many on the way in, and the camera with them (1920 x 1080
     to 943 x 530), see `datasets/reduced.py`; 0: never. Dense maps and exports are of the reduced images."""
     first_pass: int = whole(150, at_least=0)
@@ -191,8 +191,8 @@ _KERNEL = "a kernel of a width above 0, such as `cauchy 2.0` (`vggtgeo.Cauchy(2.
 
 
 def is_kernel(value: Any) -> bool:
-    """Whether it is a robust kernel whose width, where it has one, is above 0."""
-    return isinstance(value, AbstractKernel) and float(getattr(value, "delta", 1.0)) > 0
+    """Whether it is a robust kernel whose width, where it has one, is finite and above 0."""
+    return isinstance(value, AbstractKernel) and 0 < float(getattr(value, "delta", 1.0)) < math.inf
 
 
 @dataclass(frozen=True)
@@ -207,15 +207,15 @@ class WindowSettings(CheckedSettings):
     """
 
     group: ClassVar[str] = "window"
-    size: int = whole(10, at_least=3)
-    """Keyframes adjusted together."""
-    point_slots: int = whole(320, at_least=1)
-    line_slots: int = whole(192, at_least=1)
+    size: int = whole(10, at_least=3, at_most=1000)
+    """Keyframes adjusted together. Memory grows with the square: each may see the points of each, 30 GB at the most."""
+    point_slots: int = whole(320, at_least=1, at_most=100_000)
+    line_slots: int = whole(192, at_least=1, at_most=100_000)
     kernel: AbstractKernel = field(
         default_factory=lambda: Cauchy(jnp.asarray(2.0)), metadata={"expected": Expected(_KERNEL, is_kernel)}
     )
     """Robust kernel of points and lines, in the last adjustment too; widths in pixels."""
-    window_iterations: int = whole(12, at_least=1)
+    window_iterations: int = whole(12, at_least=1, at_most=10_000)
     record_iterations: bool = switch(False)
     """Keep what each iteration of the window's solver did in `Slam.iterations`, for a viewer; changes no result."""
 
@@ -234,7 +234,7 @@ class RefinementSettings(CheckedSettings):
     group: ClassVar[str] = "refinement"
     global_adjustment: bool = switch(True)
     """Adjust all keyframes together; without it, the sliding window alone."""
-    global_iterations: int = whole(40, at_least=1)
+    global_iterations: int = whole(40, at_least=1, at_most=10_000)
     global_rounds: int = whole(3, at_least=1)
     """Adjustments, each after relinearising the dense depth between keyframes."""
     global_neighbours: int = whole(16, at_least=1)

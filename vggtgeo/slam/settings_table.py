@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import tomllib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -64,11 +65,15 @@ def parsed(assignment: str) -> Tables:
     _check_name(name)
     group, field = name.split(".")
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        read = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
         value = text
     except (ValueError, RecursionError) as error:  # more digits or brackets than Python reads
         raise InputError(f"`{name}` cannot be read: {error}") from None
+    else:
+        if len(read) > 1:  # a line break begins another setting
+            raise InputError(f"`{name}` is set beside others, of {len(read)} lines; give each a `--set` of its own")
+        value = read["value"]
     return {group: {field: value}}
 
 
@@ -111,7 +116,8 @@ def _kernel(name: str, text: str) -> AbstractKernel:
     kind, *numbers = text.split() or [""]
     kernel: AbstractKernel | None
     try:
-        kernel = KERNELS[kind.lower()](*map(float, numbers))
+        values = [float(number) for number in numbers]
+        kernel = KERNELS[kind.lower()](*values) if all(map(math.isfinite, values)) else None
     except (KeyError, TypeError, ValueError):
         kernel = None
     if kernel is None or not is_kernel(kernel):

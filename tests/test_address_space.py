@@ -1,0 +1,45 @@
+"""A small address space (`ulimit -v`). Oracle: one line and code 2, where libraries would end the process."""
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vggtgeo.cli.address_space import LEAST, check_address_space
+from vggtgeo.cli.main import COMMANDS
+
+
+def limited(megabytes: int, *words: object) -> subprocess.CompletedProcess[str]:
+    limit = f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({megabytes * 10**6},) * 2)"
+    command = [sys.executable, "-c", f"{limit}; from vggtgeo.cli import main; main()", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_a_command_that_would_be_aborted_does_not_begin(tmp_path: Path) -> None:
+    """The limit and the need, in one line; nothing is made. Help needs no memory."""
+    done = limited(1500, "demo", "-o", tmp_path / "out")
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: the address space is limited to 1.5 GB (`ulimit -v`); `demo` needs 3 GB at least: raise the limit, or "
+        "lift it\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+    assert limited(500, "run", "--help").returncode == 0
+    assert limited(500, "data", "list").returncode == 0
+
+
+def test_memory_that_runs_out_is_told(tmp_path: Path) -> None:
+    """The check lets through what NumPy or a thread is then refused: one line, the code of what is given wrongly."""
+    done = limited(2000, "simulate", "office", "--size", "8000x8000", "--frames", "2", "-o", tmp_path / "new")
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.splitlines()[-1].startswith("error: there is not enough memory"), done.stderr
+
+
+def test_each_command_of_the_table_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And without a limit nothing is asked of any."""
+    assert set(LEAST) <= {entry.name for entry in COMMANDS}
+    monkeypatch.setattr("resource.getrlimit", lambda kind: (resource.RLIM_INFINITY,) * 2)
+    for entry in COMMANDS:
+        check_address_space(entry.name)

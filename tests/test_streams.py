@@ -1,0 +1,75 @@
+"""Standard output and error that cannot be written. Oracle: the exit code, the lines on stderr, the run's files."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import bad_files as bad
+import pytest
+
+FULL = Path("/dev/full")
+PROGRAM = (sys.executable, "-c", "from vggtgeo.cli import main; main()")
+LOST = "error: standard output cannot be written (No space left on device): what is printed there is lost, files are"
+pytestmark = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
+
+
+def called(*words: object, unbuffered: bool = False, **streams: object) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    environment |= {"PYTHONUNBUFFERED": "1"} if unbuffered else {}
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **streams}
+    command = [*PROGRAM, *map(str, words)]
+    return subprocess.run(command, text=True, env=environment, timeout=120, check=False, **streams)
+
+
+@pytest.mark.parametrize("unbuffered", [False, True])
+@pytest.mark.parametrize("words", [("--version",), ("--help",), ("data", "list")], ids=" ".join)
+def test_what_cannot_be_printed_is_told(words: tuple[str, ...], unbuffered: bool) -> None:
+    """One line and the code of what is given wrongly; no traceback, nor a second line when Python ends."""
+    with FULL.open("w") as full:
+        done = called(*words, unbuffered=unbuffered, stdout=full)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith(LOST)
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_run_that_cannot_print_is_written_as_a_whole(tmp_path: Path, stream: str) -> None:
+    """Its verdict is failed, which its code says; all its files are there."""
+    bad.frames(tmp_path / "frames")
+    with FULL.open("w") as full:
+        done = called("run", tmp_path / "frames", "-o", tmp_path / "out", **{stream: full})
+    assert done.returncode == 3
+    assert {"summary.json", "trajectory.txt", "report.html"} <= {file.name for file in (tmp_path / "out").iterdir()}
+    if stream == "stdout":
+        assert done.stderr.splitlines()[-1].startswith(LOST)
+    else:
+        assert done.stdout.splitlines()[-1] == "verdict: failed"
+
+
+def test_a_backend_that_matplotlib_does_not_know_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`MPLBACKEND` of another program; it was asked for when the results were written. Oracle: the files."""
+    bad.frames(tmp_path / "frames")
+    monkeypatch.setenv("MPLBACKEND", "nonsense")
+    assert called("run", tmp_path / "frames", "-o", tmp_path / "out").returncode == 3
+    assert (tmp_path / "out/report.html").is_file()
+
+
+def test_a_reader_that_went_away_is_no_error() -> None:
+    """`vggtgeo data list | head -1`: nothing is said."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = called("data", "list", stdout=writing)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_the_number_of_a_closed_stream_is_no_results_file() -> None:
+    """With 1 and 2 closed, a file that is opened gets another number."""
+    script = (
+        "import os; os.close(1); os.close(2); from vggtgeo.cli.streams import use_lasting_streams as use; use(); "
+        "os._exit(os.open(os.devnull, os.O_RDONLY))"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode > 2
