@@ -65,7 +65,7 @@ test-newest: $(READY)  ## test the core with the newest versions that are out, i
 
 # The reference is read from an installed copy, where `vggtgeo.solvers` and `vggtgeo.models` are in place.
 docs: $(READY)  ## build the documentation site into site/ (open site/index.html); broken links are errors
-	$(BIN)/python -m pip install --quiet --no-build-isolation --editable ".[docs]"
+	$(BIN)/python -m pip install --quiet --require-hashes --requirement requirements-docs.lock
 	rm -rf build
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/docs .
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
@@ -98,6 +98,9 @@ lock: $(READY)  ## renew requirements.lock for all supported Pythons and platfor
 	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --fork-strategy fewest --extra dev \
 		--generate-hashes --no-annotate --no-header --no-emit-index-url --no-emit-find-links \
 		--output-file requirements.lock pyproject.toml
+	$(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --fork-strategy fewest --extra docs \
+		--constraint requirements.lock --generate-hashes --no-annotate --no-header --no-emit-index-url \
+		--no-emit-find-links --output-file requirements-docs.lock pyproject.toml
 
 clean:  ## remove what was built, keep .venv and runs
 	rm -rf build dist site .cache .mypy_cache .pytest_cache .ruff_cache *.egg-info
