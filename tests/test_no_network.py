@@ -12,6 +12,7 @@ import pytest
 import tiny_sequences as tiny
 from bad_files import problem, walk
 
+SWITCH = "ORT_DISABLE_TELEMETRY"
 DENIED = """
 import socket, sys
 
@@ -34,6 +35,25 @@ for line in sys.argv[1].split("|"):
         assert end.code in (0, 3), (line, end.code)
 print("done")
 """
+
+
+TOLD = """
+from vggtgeo.models.onnx.session import onnxruntime
+from onnx import TensorProto, helper
+
+ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in "xy"]
+graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "one", ends[:1], ends[1:])
+model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+"""
+
+
+def test_onnxruntime_tells_nobody(tmp_path: Path) -> None:
+    """Its telemetry, which is native code, begins with a file in the home folder. Oracle: an empty home stays empty."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("XDG_CACHE_HOME", SWITCH)}
+    environment |= {"HOME": str(tmp_path), "USERPROFILE": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    subprocess.run([sys.executable, "-c", TOLD], env=environment, timeout=120, check=True)
+    assert list(tmp_path.rglob("*")) == []
 
 
 @pytest.mark.long

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import re
 import time
 from collections.abc import Iterable, Mapping
@@ -13,6 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+
+# From 1.31 on, onnxruntime numbers the device in a file of the home folder and tells its makers what is run, on Linux,
+# too, unless this is set before it is imported (`disable_telemetry_events` comes too late for the number).
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime
 from onnxruntime.capi import onnxruntime_pybind11_state as raised
 from vggtgeo.models.onnx.contracts import METADATA_WEIGHTS, RANDOM_WEIGHTS, Contract
