@@ -156,19 +156,15 @@ def barrel(recording: Recording, rng: np.random.Generator) -> Recording:
 def zooming(recording: Recording, rng: np.random.Generator) -> Recording:
     """A lens that zooms while it films: the picture grows steadily, by 1.3 in the end."""
     del rng
-    cx, cy = recording.camera.intrinsics[2:]
     last = max(len(recording.frames) - 1, 1)
-    nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
+    return _through_lens(recording, lambda row: 1.0 + 0.3 * row / last)
 
-    def grown(row: int) -> np.ndarray:
-        factor = 1.0 + 0.3 * row / last
-        return np.array([[factor, 0.0, (1.0 - factor) * cx], [0.0, factor, (1.0 - factor) * cy]])
 
-    def depth_through(depth: np.ndarray, row: int) -> np.ndarray:
-        return cv2.warpAffine(depth, grown(row), depth.shape[::-1], flags=cv2.INTER_NEAREST, **nothing)
-
-    seen = _images(recording, lambda image, row: cv2.warpAffine(image, grown(row), image.shape[1::-1]))
-    return _depths(seen, depth_through)
+def changed_lens(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A phone that changes its lens in the middle, for one of 1.7 times the focal length."""
+    del rng
+    middle = len(recording.frames) // 2
+    return _through_lens(recording, lambda row: 1.7 if row >= middle else 1.0)
 
 
 def wrong_focal(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -197,8 +193,24 @@ DEGRADATIONS: dict[str, Degradation] = {
     "base": as_it_is,
     **{change.__name__: change for change in (dirty_lens, bars, text, board, person, dark, centimetres)},
     **{change.__name__: change for change in (growing_depth, other_depth, shuffled, barrel)},
-    **{change.__name__: change for change in (zooming, wrong_focal, covered, without_depth)},
+    **{change.__name__: change for change in (zooming, changed_lens, wrong_focal, covered, without_depth)},
 }
+
+
+def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recording:
+    """Images and depth of a lens of so many times the focal length."""
+    cx, cy = recording.camera.intrinsics[2:]
+    nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
+
+    def grown(row: int) -> np.ndarray:
+        times = factor(row)
+        return np.array([[times, 0.0, (1.0 - times) * cx], [0.0, times, (1.0 - times) * cy]])
+
+    def depth_through(depth: np.ndarray, row: int) -> np.ndarray:
+        return cv2.warpAffine(depth, grown(row), depth.shape[::-1], flags=cv2.INTER_NEAREST, **nothing)
+
+    seen = _images(recording, lambda image, row: cv2.warpAffine(image, grown(row), image.shape[1::-1]))
+    return _depths(seen, depth_through)
 
 
 def _images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
