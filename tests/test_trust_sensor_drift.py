@@ -14,7 +14,7 @@ from vggtgeo.models import pinhole
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.judge import judge
-from vggtgeo.slam.trust.sensor_drift import MOST_ZOOM, Change, DepthPair, change, compare, depth_pairs
+from vggtgeo.slam.trust.sensor_drift import MOST_ZOOM, Change, DepthPair, change, compare, depth_pairs, stretches
 
 K = np.array([500.0, 500.0, 320.0, 240.0])
 KEYFRAMES = 20
@@ -108,13 +108,25 @@ def test_what_changes_is_found_and_what_stays_is_not(curve: Curve, seed: int) ->
 def test_keyframes_of_a_run_agree() -> None:
     """Pairs of a simulated run, whose lens and depth stay; oracle: none, within five standard deviations and 1 %."""
     slam = recorded_run().slam
-    pairs = list(depth_pairs(slam))
-    assert pairs
+    pairs = list(depth_pairs(slam, range(len(slam.keyframes))))
+    assert {pair.numbers for pair in pairs} == {way for pair in slam.pairs for way in (pair.key, pair.key[::-1])}
+    assert [pair.numbers for pair in depth_pairs(slam, range(1, 3))] == [(1, 2), (2, 1)]
+    assert list(depth_pairs(slam, range(2, 3))) == []
     for pair in pairs:
         found = compare(pair, np.asarray(slam.intrinsics, np.float64))
         for value, sigma in (found.focal, found.depth):
             assert abs(value) < 5 * sigma + 0.01
             assert sigma < 0.05
+
+
+def test_every_keyframe_is_in_one_stretch() -> None:
+    """Stretches of about a hundred, in order; oracle: counting."""
+    for count in (1, 3, 99, 149, 151, 1000, 1234):
+        parts = stretches(count)
+        assert [number for part in parts for number in part] == list(range(count))
+        assert all(len(part) <= 150 for part in parts)
+    assert stretches(0) == []
+    assert len(stretches(1234)) == 12
 
 
 def test_few_keyframes_say_nothing() -> None:
@@ -149,7 +161,7 @@ def test_a_run_whose_sensors_change_is_told(
     told = lambda evidence: [reason for reason in judge(slam, evidence).reasons if text in reason]
     assert told(recorder.frames) == []
     pairs = _run(*curves)
-    monkeypatch.setattr("vggtgeo.slam.trust.sensor_drift.depth_pairs", lambda slam: pairs)
+    monkeypatch.setattr("vggtgeo.slam.trust.sensor_drift.depth_pairs", lambda slam, stretch: pairs)
     (reason,) = told(recorder.frames)
     assert 25 <= float(reason.split("about ")[1].split(" %")[0]) <= 35
     assert told([replace(noted, depth_median=float("nan")) for noted in recorder.frames]) == []
