@@ -43,7 +43,11 @@ def there_and_back(share: float) -> float:
 
 
 def _pair(
-    rng: np.random.Generator, numbers: tuple[int, int], focal: tuple[float, float], unit: tuple[float, float]
+    rng: np.random.Generator,
+    numbers: tuple[int, int],
+    focal: tuple[float, float],
+    unit: tuple[float, float],
+    noise: float = 0.01,
 ) -> DepthPair:
     """Two pictures of sixty points 2 to 8 m away: half a pixel of noise, 1 % in depth, every tenth matched wrongly. The
     camera goes 30 cm forward and turns, and its pose is taken 2 cm and half a degree off. focal, unit: factors of each.
@@ -57,16 +61,16 @@ def _pair(
     after = pinhole.project(points, second) + rng.normal(0, 0.5, (60, 2))
     after[::10] += rng.normal(0, 50, (6, 2))
     wrong = rigid.moved(motion[None], np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, 0.005, 3)])[None])[0]
-    measured = [unit[0] * depth, unit[1] * points[:, 2]] * (1 + rng.normal(0, 0.01, (2, 60)))
+    measured = [unit[0] * depth, unit[1] * points[:, 2]] * (1 + rng.normal(0, noise, (2, 60)))
     return DepthPair(numbers, before, after, measured[0], measured[1], wrong)
 
 
-def _run(focal: Curve, unit: Curve, seed: int = 0, keyframes: int = KEYFRAMES) -> list[DepthPair]:
+def _run(focal: Curve, unit: Curve, seed: int = 0, keyframes: int = KEYFRAMES, noise: float = 0.01) -> list[DepthPair]:
     """Each keyframe with the next two, both ways."""
     rng = np.random.default_rng(seed)
     at = lambda curve, way: (curve(way[0] / (keyframes - 1)), curve(way[1] / (keyframes - 1)))
     ends = [(i, j) for i in range(keyframes) for j in (i + 1, i + 2) if j < keyframes]
-    return [_pair(rng, way, at(focal, way), at(unit, way)) for pair in ends for way in (pair, pair[::-1])]
+    return [_pair(rng, way, at(focal, way), at(unit, way), noise) for pair in ends for way in (pair, pair[::-1])]
 
 
 def _changes(pairs: list[DepthPair]) -> tuple[Change, Change]:
@@ -158,10 +162,12 @@ def test_a_run_whose_sensors_change_is_told(
     for frame in run.frames:
         recorder.add(frame)
     slam = replace(run.slam, intrinsics=K)
+    drift = "vggtgeo.slam.trust.sensor_drift.depth_pairs"
     told = lambda evidence: [reason for reason in judge(slam, evidence).reasons if text in reason]
     assert told(recorder.frames) == []
-    pairs = _run(*curves)
-    monkeypatch.setattr("vggtgeo.slam.trust.sensor_drift.depth_pairs", lambda slam, stretch: pairs)
+    monkeypatch.setattr(drift, lambda slam, stretch: _run(*curves))
     (reason,) = told(recorder.frames)
     assert 25 <= float(reason.split("about ")[1].split(" %")[0]) <= 35
     assert told([replace(noted, depth_median=float("nan")) for noted in recorder.frames]) == []
+    monkeypatch.setattr(drift, lambda slam, stretch: _run(*curves, noise=0.1))
+    assert told(recorder.frames) == [], "steps forward past depth that is noise look like a zoom"
