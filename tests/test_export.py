@@ -176,6 +176,27 @@ def _changed(folder: Path, place: Path) -> Path:
     return Path(shutil.copytree(folder, place / "copy", ignore=shutil.ignore_patterns("export")))
 
 
+def test_an_export_again_replaces_what_an_export_wrote(folder: Path, tmp_path: Path) -> None:
+    # Proves that a second export replaces the first, in the run's own place also where an older version, which kept no
+    # record, wrote it; and that somebody's file elsewhere stays. Oracle: the files.
+    copy = _changed(folder, tmp_path)
+    own = copy / "export/tum"
+    for target in (None, own, tmp_path / "out"):
+        place = target or own
+        export(copy, "tum", target)
+        written = (place / "trajectory.txt").read_bytes()
+        (place / "trajectory.txt").write_text("old")
+        if place == own:
+            (place / ".vggtgeo-export").unlink()
+        export(copy, "tum", target)
+        assert (place / "trajectory.txt").read_bytes() == written
+    (tmp_path / "out/.vggtgeo-export").unlink()
+    (tmp_path / "out/trajectory.txt").write_text("somebody's")
+    with pytest.raises(vg.InputError, match="was not written by an export"):
+        export(copy, "tum", tmp_path / "out")
+    assert (tmp_path / "out/trajectory.txt").read_text() == "somebody's"
+
+
 def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) -> None:
     # Proves that pictures and depth that are none are named, and that what an earlier export wrote stays as it was,
     # without a trace of the new one. Oracle: the files before.

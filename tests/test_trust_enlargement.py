@@ -113,3 +113,29 @@ def test_a_steady_growth_is_no_change_of_the_lens() -> None:
     assert told([nothing, -0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.6]) == ["frames 0 to 1", "frames 6 to 7"]
     assert told([nothing, nothing, nothing, 0.5, nothing, nothing, 0.0, 0.0]) == []
     assert told([nothing] * 8) == []
+
+
+@pytest.mark.parametrize("walks", [[0.3] * 4 + [0.0], [0.0] + [0.3] * 4, [0.3, 0.3, 0.0, 0.0, 0.0]])
+def test_who_stops_or_starts_is_told_nothing(walks: list[float]) -> None:
+    """A step of no growth beside large ones is none of another lens, also where one neighbour alone is known."""
+    estimate = walk(count=6).estimate
+    assert check_enlargements(estimate, np.array([float("nan"), *walks])) == []
+
+
+def test_a_quiet_step_beside_another_lens_is_not_told() -> None:
+    """Only the step of the other lens is; what the first frame says is of nobody."""
+    estimate = walk(count=6).estimate
+    told = lambda values: [finding.text.split(":")[0] for finding in check_enlargements(estimate, np.array(values))]
+    assert told([float("nan"), 0.0, 0.5, 0.0, 0.0, 0.0]) == ["frames 1 to 2"]
+    assert told([0.9, 0.0, 0.0, 0.0, 0.5, 0.0]) == ["frames 3 to 4"]
+    assert told([float("nan"), 0.0, float("nan"), 0.0, 0.5, 0.0]) == ["frames 3 to 4"]
+
+
+def test_a_step_over_missing_frames_may_be_larger() -> None:
+    """Whoever walks on while five frames are missing comes as much nearer; 1.7 after a pause of one is told."""
+    estimate = walk(count=8).estimate
+    late = lambda frames: replace(estimate, times=estimate.times + np.where(np.arange(8) >= 4, 0.1 * frames, 0.0))
+    over = lambda factor: np.array([float("nan"), 0.0, 0.0, 0.0, np.log(factor), 0.0, 0.0, 0.0])
+    assert check_enlargements(late(5), over(1.4)) == []
+    assert len(check_enlargements(late(0), over(1.4))) == 1
+    assert len(check_enlargements(late(1), over(1.7))) == 1

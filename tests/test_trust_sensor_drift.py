@@ -145,6 +145,11 @@ def test_pictures_of_which_nothing_fits_say_nothing() -> None:
     pair = _pair(np.random.default_rng(0), (0, 1), (1.0, 1.0), (1.0, 1.0))
     found = compare(replace(pair, after=pair.after + 1000.0), K)
     assert found.focal[1] == found.depth[1] == np.inf
+    rng = np.random.default_rng(1)
+    for _ in range(50):  # of which some come to no rest
+        pair = _pair(rng, (0, 1), (1.0, 1.0), (1.0, 1.0))
+        value, sigma = compare(replace(pair, after=pair.after + rng.normal(0, 15, pair.after.shape)), K).focal
+        assert abs(value) < 5 * sigma
     without = compare(replace(pair, depth_after=np.full(60, np.nan)), K)
     assert np.isfinite(without.focal[1])
     assert without.depth[1] == np.inf

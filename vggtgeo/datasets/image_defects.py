@@ -15,7 +15,7 @@ from vggtgeo.datasets import image_sizes
 MOST_PIXELS = 100_000_000
 """Pixels of an image that are decoded: 0.3 GB."""
 _OTHER_FORMATS = (b"GIF8", b"\xff\x4f\xff\x51")
-_OTHER_BOXES = (b"jP  \r\n\x87\n", *(b"ftyp" + kind for kind in (b"avif", b"avis", b"heic", b"heix", b"mif1", b"msf1")))
+_OTHER_BOXES = (b"jP  ", b"ftyp")
 """OpenCV takes them by their content. Some hundred bytes of them may declare gigabytes of pixels, at places of the file
 that nobody here reads, and their own kind of turning is applied without a word."""
 _LEFT_OVER = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
@@ -34,7 +34,7 @@ def defect(content: bytes) -> str:
         return "is cut off: the JPEG has no end"
     if _lacks_scans(content):
         return "is cut off: scans of the progressive JPEG are missing"
-    if content.startswith(_OTHER_FORMATS) or content[4:12] in _OTHER_BOXES:
+    if content.startswith(_OTHER_FORMATS) or content[4:8] in _OTHER_BOXES:
         return "is a GIF, JPEG 2000, AVIF or HEIC, whatever its name: convert it to PNG or JPEG"
     width, height = declared_size(content)
     if width * height > MOST_PIXELS:

@@ -35,7 +35,7 @@ def tiff_tags(content: bytes) -> dict[int, Tag]:
             tag, kind = struct.unpack_from(f"{order}HH", content, entry)
             form = f"{order}{_FORMATS.get(kind, 'I')}"
             place = entry + width - (8 if big else 4)
-            found[tag] = Tag(struct.unpack_from(form, content, place)[0], place, form)
+            found.setdefault(tag, Tag(struct.unpack_from(form, content, place)[0], place, form))  # as libtiff
     except (struct.error, OverflowError):  # an offset may be beyond all places
         pass
     return found

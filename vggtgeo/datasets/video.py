@@ -100,7 +100,8 @@ class VideoFile:
             self._tell_damaged(damaged, index, _chosen(start, end, stride, damaged, index))
         wanted = self.count if end is None else min(end, self.count)
         if index < wanted:
-            text = f"`{self.name}` ends after {index} frames; its header says {self.count}: is the file cut off?"
+            counts = f"ends after {index} frames; its header says {self.count}"
+            text = f"`{self.name}` {counts}: is the file cut off, or damaged?"
             _warn(InputWarning(text))  # not as left out: where the rate varies, the header of an MKV only guesses
 
     def _missed(self, capture: Any, more: int) -> int | None:

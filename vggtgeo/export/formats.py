@@ -57,8 +57,8 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     stage = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=output))
     try:  # what is there already stays until all is written
         written = FORMATS[to](place, stage)
-        names = sorted(str(path.relative_to(stage)) for path in stage.rglob("*") if path.is_file())
-        _claim(output, names, ours=target is None)
+        names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
+        _claim(output, names, ours=output.resolve() == (place / "export" / to).resolve())
         for name in names:
             (output / name).parent.mkdir(parents=True, exist_ok=True)
             (stage / name).replace(output / name)

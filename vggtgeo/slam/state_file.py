@@ -88,8 +88,11 @@ def _with_enlargement(header: Header) -> Header:
 
 
 UPGRADES = {
-    **{1: _with_recorded_times, 2: _with_lens, 3: _with_first_pass},
-    **{4: _with_focal_wanted, 5: _with_enlargement},
+    1: _with_recorded_times,
+    2: _with_lens,
+    3: _with_first_pass,
+    4: _with_focal_wanted,
+    5: _with_enlargement,
 }
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)

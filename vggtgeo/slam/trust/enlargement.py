@@ -17,12 +17,11 @@ from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.finding import Finding
 
 MOST = 0.2
-"""Logarithm of the factor, beyond that of either neighbour. With one lens it is at most 0.063 in four clips, 0.094 at
+"""Logarithm of the factor, its own and beyond that of either neighbour; as many times that as a step takes longer than
+most do. With one lens it is at most 0.063 in four clips, 0.094 at
 1.7 frames a second, 0.131 at one, and 0.207 where blocks of frames are out of order (corridor-office: told as well);
 where a picture is enlarged at once by 1.25 it is 0.21 to 0.25, by 1.7 0.51 to 0.54. The lenses of phones differ by
 factors of 1.5 and more."""
-LEAST_FOLLOWED = 0.5
-"""Share of the corners that were followed, below which key points are matched."""
 LEAST_AGREEING = 20
 """Corners: fewer agree with some similarity where two pictures have nothing in common."""
 CLOSE = 2.0
@@ -57,12 +56,17 @@ def check_enlargements(estimate: Estimate, enlarged: np.ndarray) -> list[Finding
 
     enlarged: float64 [n], logarithm of each frame's factor over the one before it, NaN where nothing says.
     """
+    if len(enlarged) < 3:
+        return []
+    enlarged = np.append(np.nan, enlarged[1:])  # the first has none before it
     beside = np.stack([np.append(np.nan, enlarged[:-1]), np.append(enlarged[1:], np.nan)])
     # Where neither neighbour says anything, a large step of the camera looks the same.
-    apart = np.abs(enlarged - beside)
-    jump = np.where(np.isfinite(apart).any(0), np.nanmin(np.where(np.isfinite(apart), apart, np.inf), 0), 0.0)
+    apart = np.nan_to_num(np.abs(enlarged - beside), nan=np.inf).min(0)
+    # A camera goes farther where frames are missing.
+    taken = np.append(0.0, np.diff(estimate.times))
+    most = MOST * np.maximum(taken / max(float(np.median(taken[1:])), 1e-9), 1.0)
     found = []
-    for row in np.flatnonzero(jump > MOST):
+    for row in np.flatnonzero(np.isfinite(apart) & (apart > most) & (np.abs(enlarged) > most)):
         first, last = int(estimate.frames[row - 1]), int(estimate.frames[row])
         text = (
             f"frames {first} to {last}: the whole picture is {np.exp(enlarged[row]):.2f} times as large at once: was "
