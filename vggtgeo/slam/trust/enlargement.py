@@ -42,13 +42,14 @@ def followed_enlargement(before: np.ndarray, after: np.ndarray) -> float | None:
 
 def matched_enlargement(before: np.ndarray, after: np.ndarray, left_out: np.ndarray | None) -> float | None:
     """The same by descriptors, from grey images uint8 [h, w]; left_out: bool [h, w], what the camera carries."""
-    features = [_MATCHER.describe(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)) for image in (before, after)]
-    matches = _MATCHER.match(*features)
-    ends = [np.asarray(pixels, np.float32) for pixels in (matches.pixels_i, matches.pixels_j)]
+    first, second = (_MATCHER.describe(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)) for image in (before, after))
+    matches = _MATCHER.match(first, second)
+    start, end = matches.pixels_i.astype(np.float32), matches.pixels_j.astype(np.float32)
     if left_out is not None:
-        columns, rows = np.clip(np.rint(ends[1]), 0, np.array(left_out.shape[::-1]) - 1).astype(int).T
-        ends = [pixels[~left_out[rows, columns]] for pixels in ends]
-    return followed_enlargement(*ends)
+        columns, rows = np.clip(np.rint(end), 0, np.array(left_out.shape[::-1]) - 1).astype(int).T
+        kept = ~left_out[rows, columns]
+        start, end = start[kept], end[kept]
+    return followed_enlargement(start, end)
 
 
 def check_enlargements(estimate: Estimate, enlarged: np.ndarray) -> list[Finding]:
