@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -40,14 +40,19 @@ def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> t
     return result, truth[alignment]["rmse"] if truth else float("nan")
 
 
-def input_of(sequence: SequenceView) -> str:
-    """As tables say it."""
-    return "RGB-D" if sequence.has_depth else "RGB"
+def print_table(
+    text: str | None, names: tuple[str, ...], columns: tuple[str, ...], cells: Callable[[SequenceView], Iterable[str]]
+) -> None:
+    """A row for each clip of the command line, with depth and without, and each thing done to it.
 
-
-def options_of(text: str | None) -> argparse.Namespace:
-    """`clips` and `frames` of a benchmark of that docstring."""
+    text: docstring of the benchmark. columns: heads of what `cells` gives of a sequence.
+    """
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=40)
-    return parser.parse_args()
+    options = parser.parse_args()
+    print(f"| {' | '.join(('clip', 'input', 'change', *columns))} |\n" + "|---" * (3 + len(columns)) + "|")
+    for folder in options.clips:
+        for name, sequence in degraded_clips(folder, options.frames, names):
+            kind = "RGB-D" if sequence.has_depth else "RGB"
+            print(f"| {' | '.join((sequence.name, kind, name, *cells(sequence)))} |", flush=True)

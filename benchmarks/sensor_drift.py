@@ -5,29 +5,43 @@
 
 The first 40 frames of each clip, with depth and without: as they are; enlarged steadily, by 1.3 in the end, depth with
 them; enlarged at once, by 1.7 from the middle on; with depth that is longer and longer, by 1.4 in the end. ATE after
-SE(3) with depth, after Sim(3) without. Oracle: what was done.
+SE(3) with depth, after Sim(3) without. Oracle: what was done. Lens, unit: the
+logarithms of their changes that the verdict measures, with their standard deviations; at once: of the largest single
+enlargement. They are what the bars of `vggtgeo/slam/trust/sensor_drift.py` and `enlargement.py` rest on.
 """
 
 from __future__ import annotations
 
-from degraded_clips import degraded_clips, input_of, judged, options_of
+from collections.abc import Iterator
+
+import numpy as np
+from degraded_clips import judged, print_table
+
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.slam.trust.enlargement import beyond_neighbours
+from vggtgeo.slam.trust.evidence import EvidenceRecorder
+from vggtgeo.slam.trust.sensor_drift import Change, changes
 
 CHANGES = ("base", "zooming", "changed_lens", "growing_depth")
+COLUMNS = ("cm", "verdict", "lens", "unit", "at once", "reasons")
 
 
-def main() -> None:
-    """Print a row for each clip, with depth and without, and each change."""
-    options = options_of(__doc__)
-    print("| clip | input | change | cm | verdict | reasons |\n" + "|---" * 6 + "|")
-    for folder in options.clips:
-        for name, sequence in degraded_clips(folder, options.frames, CHANGES):
-            if name == "growing_depth" and not sequence.has_depth:
-                continue
-            result, error = judged(sequence)
-            reasons = "; ".join(result.verdict.reasons)
-            row = (sequence.name, input_of(sequence), name, f"{100 * error:.1f}", result.verdict.level, reasons)
-            print(f"| {' | '.join(row)} |", flush=True)
+def cells(sequence: SequenceView) -> Iterator[str]:
+    """What came of it, and what was measured of the sensors."""
+    result, error = judged(sequence)
+    yield from (f"{100 * error:.1f}", result.verdict.level)
+    measured: tuple[Change | None, ...] = ()
+    if sequence.has_depth and result.record is not None:
+        slam = result.record.slam
+        measured = changes(slam, range(len(slam.keyframes)))
+    told = ["" if one is None else f"{one.value:.3f} +- {one.sigma:.3f}" for one in measured]
+    yield from told or ("", "")
+    recorder = EvidenceRecorder(sequence.camera)
+    for frame in sequence.frames():
+        recorder.add(frame)
+    yield f"{beyond_neighbours(np.array([noted.enlarged for noted in recorder.frames], np.float64)).max():.3f}"
+    yield "; ".join(result.verdict.reasons)
 
 
 if __name__ == "__main__":
-    main()
+    print_table(__doc__, CHANGES, COLUMNS, cells)

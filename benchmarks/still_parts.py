@@ -9,22 +9,21 @@ ATE after SE(3) with depth, after Sim(3) without.
 
 from __future__ import annotations
 
-from degraded_clips import degraded_clips, input_of, judged, options_of
+from collections.abc import Iterator
+
+from degraded_clips import judged, print_table
 
 import vggtgeo as vg
 from vggtgeo.datasets.views import SequenceView
 
 PAINTED = ("base", "bars", "text", "board")
+COLUMNS = ("off: cm", "verdict", "on: cm", "verdict", "still")
 
 
-def main() -> None:
-    """Print a row for each clip, with depth and without, and each thing in its picture."""
-    options = options_of(__doc__)
-    print("| clip | input | in the picture | off: cm | verdict | on: cm | verdict | still |\n" + "|---" * 8 + "|")
-    for folder in options.clips:
-        for name, sequence in degraded_clips(folder, options.frames, PAINTED):
-            off, on = (_run(sequence, still_parts) for still_parts in (False, True))
-            print(f"| {sequence.name} | {input_of(sequence)} | {name} | {' | '.join((*off[:2], *on))} |", flush=True)
+def cells(sequence: SequenceView) -> Iterator[str]:
+    """Without the search, and with it."""
+    yield from _run(sequence, False)[:2]
+    yield from _run(sequence, True)
 
 
 def _run(sequence: SequenceView, still_parts: bool) -> list[str]:
@@ -35,4 +34,4 @@ def _run(sequence: SequenceView, still_parts: bool) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    print_table(__doc__, PAINTED, COLUMNS, cells)

@@ -88,15 +88,14 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
             content = file.read(_MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:  # a device that never ends, or something that is no settings file
-            raise InputError(f"`--settings` is `{path}`, which has more than {_MOST_BYTES} bytes; give a TOML file")
-        return tomllib.loads(content.decode("utf-8-sig"))
     except OSError as error:
         raise InputError(
             f"`--settings` is `{path}`, which cannot be read ({error.strerror}); give a TOML file"
         ) from None
-    except InputError:
-        raise
+    if len(content) > _MOST_BYTES:  # a device that never ends, or something that is no settings file
+        raise InputError(f"`--settings` is `{path}`, which has more than {_MOST_BYTES} bytes; give a TOML file")
+    try:
+        return tomllib.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
         raise InputError(f"`{path}` is no TOML file: {error}; a line is `key = value`, text in quotes") from None
 

@@ -18,10 +18,9 @@ from vggtgeo.slam.trust.finding import Finding
 
 MOST = 0.2
 """Logarithm of the factor, its own and beyond that of either neighbour; as many times that as a step takes longer than
-most do. With one lens it is at most 0.063 in four clips, 0.094 at
-1.7 frames a second, 0.131 at one, and 0.207 where blocks of frames are out of order (corridor-office: told as well);
-where a picture is enlarged at once by 1.25 it is 0.21 to 0.25, by 1.7 0.51 to 0.54. The lenses of phones differ by
-factors of 1.5 and more."""
+most do. Forty frames of a clip have at most 0.06 (`benchmarks/sensor_drift.py`); where blocks of corridor-office are
+out of order it is 0.21, which is told as well; a lens of 1.7 times the focal length gives 0.51 to 0.57. The lenses of
+phones differ by factors of 1.5 and more."""
 LEAST_AGREEING = 20
 """Corners: fewer agree with some similarity where two pictures have nothing in common."""
 CLOSE = 2.0
@@ -52,6 +51,18 @@ def matched_enlargement(before: np.ndarray, after: np.ndarray, left_out: np.ndar
     return followed_enlargement(start, end)
 
 
+def beyond_neighbours(enlarged: np.ndarray) -> np.ndarray:
+    """How much each step enlarges, and more than the one before and the one after it, float64 [n]: the least of the
+    three. Zero where the step says nothing, or neither neighbour does: a large step of the camera looks the same.
+
+    enlarged: float64 [n], as `check_enlargements` takes it.
+    """
+    enlarged = np.append(np.nan, enlarged[1:])  # the first has none before it
+    beside = np.stack([np.append(np.nan, enlarged[:-1]), np.append(enlarged[1:], np.nan)])
+    apart = np.nan_to_num(np.abs(enlarged - beside), nan=np.inf).min(0)
+    return np.where(np.isfinite(apart), np.minimum(apart, np.abs(enlarged)), 0.0)
+
+
 def check_enlargements(estimate: Estimate, enlarged: np.ndarray) -> list[Finding]:
     """Steps over which the whole picture grows or shrinks at once.
 
@@ -59,15 +70,12 @@ def check_enlargements(estimate: Estimate, enlarged: np.ndarray) -> list[Finding
     """
     if len(enlarged) < 3:
         return []
-    enlarged = np.append(np.nan, enlarged[1:])  # the first has none before it
-    beside = np.stack([np.append(np.nan, enlarged[:-1]), np.append(enlarged[1:], np.nan)])
-    # Where neither neighbour says anything, a large step of the camera looks the same.
-    apart = np.nan_to_num(np.abs(enlarged - beside), nan=np.inf).min(0)
+    apart = beyond_neighbours(enlarged)
     # A camera goes farther where frames are missing.
     taken = np.append(0.0, np.diff(estimate.times))
     most = MOST * np.maximum(taken / max(float(np.median(taken[1:])), 1e-9), 1.0)
     found = []
-    for row in np.flatnonzero(np.isfinite(apart) & (apart > most) & (np.abs(enlarged) > most)):
+    for row in np.flatnonzero(apart > most):
         first, last = int(estimate.frames[row - 1]), int(estimate.frames[row])
         text = (
             f"frames {first} to {last}: the whole picture is {np.exp(enlarged[row]):.2f} times as large at once: was "

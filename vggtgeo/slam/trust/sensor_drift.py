@@ -68,20 +68,12 @@ KNOTS = 3
 
 def check_sensors(slam: Slam) -> list[Finding]:
     """Do focal length and unit of depth change, between start, middle and end of some stretch of keyframes?"""
-    intrinsics = np.asarray(slam.intrinsics, np.float64)
     found = []
     for stretch in stretches(len(slam.keyframes)):
         ends = max(slam.keyframes[stretch[0]].frame, 0), slam.keyframes[stretch[-1]].frame
         if ends[1] < 0:  # of a known map alone, which was judged when it was made
             continue
-        pairs = list(depth_pairs(slam, stretch))
-        factors = [compare(pair, intrinsics) for pair in pairs]
-        noise = [factor.noise for factor in factors if np.isfinite(factor.noise)]
-        if not noise or np.median(noise) > MOST_NOISE:
-            continue
-        numbers = np.array([pair.numbers for pair in pairs], np.float64).reshape(-1, 2)
-        lens = change(numbers, [factor.focal for factor in factors])
-        unit = change(numbers, [factor.depth for factor in factors])
+        lens, unit = changes(slam, stretch)
         when = f"between frames {ends[0]} and {ends[1]}"
         if lens is not None and lens.is_sure and abs(lens.value) > MOST_ZOOM:
             text = f"the lens zooms: the focal length changes by about {_percent(lens)} % {when}"
@@ -90,6 +82,17 @@ def check_sensors(slam: Slam) -> list[Finding]:
             text = f"the unit of the sensor's depth changes by about {_percent(unit)} % {when}"
             found.append(Finding("depth scale", "degraded", text, *ends, scale=True))
     return found
+
+
+def changes(slam: Slam, stretch: range) -> tuple[Change | None, Change | None]:
+    """Of focal length and of the unit of depth in a stretch of keyframes; None of what nobody can say."""
+    pairs = list(depth_pairs(slam, stretch))
+    factors = [compare(pair, np.asarray(slam.intrinsics, np.float64)) for pair in pairs]
+    noise = [factor.noise for factor in factors if np.isfinite(factor.noise)]
+    if not noise or np.median(noise) > MOST_NOISE:
+        return None, None
+    numbers = np.array([pair.numbers for pair in pairs], np.float64)
+    return change(numbers, [factor.focal for factor in factors]), change(numbers, [factor.depth for factor in factors])
 
 
 def stretches(keyframes: int) -> list[range]:
