@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +13,18 @@ import vggtgeo as vg
 from vggtgeo.benchmark.inputs import DegradedWalk
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
+from vggtgeo.simulation.degradations import Degradation, Recording
 
 
-def degraded_clips(folder: Path, count: int, names: tuple[str, ...]) -> Iterator[tuple[str, SequenceView]]:
+def degraded_clips(folder: Path, count: int, changes: Mapping[str, Degradation]) -> Iterator[tuple[str, SequenceView]]:
     """The first frames of a clip with each of these things done to them, with depth where there is some and without."""
     clip = vg.read(folder)
     truth = clip.ground_truth()
     if truth is None:
         raise SystemExit(f"`{folder}` has no truth to compare with")
     frames = list(clip.frames(0, min(count, len(clip))))
-    for name in names:
-        changed = DEGRADATIONS[name](Recording(frames, clip.camera, truth), np.random.default_rng(0))
+    for name, change in changes.items():
+        changed = change(Recording(frames, clip.camera, truth), np.random.default_rng(0))
         walk = DegradedWalk(clip.name, changed)
         for has_depth in (True, False) if clip.has_depth else (False,):
             yield name, SequenceView(walk, clip.camera, has_depth)
@@ -41,7 +41,10 @@ def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> t
 
 
 def print_table(
-    text: str | None, names: tuple[str, ...], columns: tuple[str, ...], cells: Callable[[SequenceView], Iterable[str]]
+    text: str | None,
+    changes: Mapping[str, Degradation],
+    columns: tuple[str, ...],
+    cells: Callable[[SequenceView], Iterable[str]],
 ) -> None:
     """A row for each clip of the command line, with depth and without, and each thing done to it.
 
@@ -53,6 +56,6 @@ def print_table(
     options = parser.parse_args()
     print(f"| {' | '.join(('clip', 'input', 'change', *columns))} |\n" + "|---" * (3 + len(columns)) + "|")
     for folder in options.clips:
-        for name, sequence in degraded_clips(folder, options.frames, names):
+        for name, sequence in degraded_clips(folder, options.frames, changes):
             kind = "RGB-D" if sequence.has_depth else "RGB"
             print(f"| {' | '.join((sequence.name, kind, name, *cells(sequence)))} |", flush=True)

@@ -18,11 +18,12 @@ import numpy as np
 from degraded_clips import judged, print_table
 
 from vggtgeo.datasets.views import SequenceView
+from vggtgeo.simulation.degradations import DEGRADATIONS
 from vggtgeo.slam.trust.enlargement import beyond_neighbours
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.sensor_drift import Change, changes
 
-CHANGES = ("base", "zooming", "changed_lens", "growing_depth")
+CHANGES = {name: DEGRADATIONS[name] for name in ("base", "zooming", "changed_lens", "growing_depth")}
 COLUMNS = ("cm", "verdict", "lens", "unit", "at once", "reasons")
 
 

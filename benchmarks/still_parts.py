@@ -15,8 +15,9 @@ from degraded_clips import judged, print_table
 
 import vggtgeo as vg
 from vggtgeo.datasets.views import SequenceView
+from vggtgeo.simulation.degradations import DEGRADATIONS
 
-PAINTED = ("base", "bars", "text", "board")
+PAINTED = {name: DEGRADATIONS[name] for name in ("base", "bars", "text", "board")}
 COLUMNS = ("off: cm", "verdict", "on: cm", "verdict", "still")
 
 

@@ -30,7 +30,7 @@ from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRotation
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.state import PendingWindow, Slam, Waiting
+from vggtgeo.slam.state import PendingWindow, Readout, Slam, Waiting
 from vggtgeo.slam.state_file import STATE, load_state, save_state
 from vggtgeo.slam.window_prior import WindowPrior
 
@@ -73,6 +73,7 @@ def full(slam: Slam) -> Slam:
         pending=PendingWindow(7, slam, under_way),
         lens=Camera((140.0, 140.0, 80.0, 60.0), 160, 120, (-0.1, 0.0, 0.0, 0.0), known=False),
         focal_wanted=np.array([140.0, 141.0]),
+        readout=Readout(0.02, False, 3.0),
     )
 
 

@@ -7,6 +7,7 @@ import platform
 import resource
 import warnings
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,7 @@ def summarise(
         **stated_uncertainty(slam),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
         **({} if slam.lens is None else {"lens": lens_of(slam.lens)}),
+        **({} if slam.readout is None else {"rolling_shutter": asdict(slam.readout)}),
         "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
         "notes": list(slam.notes),
         **counts,

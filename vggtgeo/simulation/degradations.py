@@ -11,6 +11,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +168,15 @@ def changed_lens(recording: Recording, rng: np.random.Generator) -> Recording:
     return _through_lens(recording, lambda row: 1.7 if row >= middle else 1.0)
 
 
+def rolling_shutter(recording: Recording, rng: np.random.Generator, seconds: float = 0.02) -> Recording:
+    """The rows of each picture read one by one, over 20 ms, as by the camera of a phone; drawn by depth and truth."""
+    del rng
+    frames, camera = recording.frames, recording.camera
+    moving = camera_velocities(np.array([frame.timestamp for frame in frames]), recording.truth)
+    drawn = [rolled(frame, motion, camera.intrinsics, seconds) for frame, motion in zip(frames, moving, strict=True)]
+    return replace(recording, frames=drawn)
+
+
 def wrong_focal(recording: Recording, rng: np.random.Generator) -> Recording:
     """The calibration of a lens with 15 % more focal length."""
     del rng
@@ -193,7 +203,8 @@ DEGRADATIONS: dict[str, Degradation] = {
     "base": as_it_is,
     **{change.__name__: change for change in (dirty_lens, bars, text, board, person, dark, centimetres)},
     **{change.__name__: change for change in (growing_depth, other_depth, shuffled, barrel)},
-    **{change.__name__: change for change in (zooming, changed_lens, wrong_focal, covered, without_depth)},
+    **{change.__name__: change for change in (zooming, changed_lens, rolling_shutter, wrong_focal)},
+    **{change.__name__: change for change in (covered, without_depth)},
 }
 
 

@@ -26,7 +26,7 @@ def gain(
     before, after: a map adjusted with either camera, its points the same. chosen: bool [e, p], which matches count.
     fitted: parameters of the camera that were fitted to these very matches; each takes the freedom of a keyframe.
     """
-    fall = np.where(chosen, _energies(*before) - _energies(*after), 0.0)
+    fall = np.where(chosen, match_energies(*before) - match_energies(*after), 0.0)
     problem = before[0]
     source = np.asarray(problem.edges.source)
     sums, counts = np.zeros(problem.num_keyframes), np.zeros(problem.num_keyframes)
@@ -42,7 +42,8 @@ def gain(
     return float(mean), float(student_t.isf(CHANCE, free) * max(by_keyframe, by_match))
 
 
-def _energies(problem: Problem, state: State) -> np.ndarray:
+def match_energies(problem: Problem, state: State) -> np.ndarray:
+    """Robust energy of each match of key points, float64 [e, p]."""
     residual = _residuals_jit(problem, state)["points"]
     weight = problem.points.weight
     return np.asarray(problem.points.kernel.rho(weight * jnp.sum(residual**2, -1)) / 2, np.float64)

@@ -19,6 +19,7 @@ from vggtgeo.slam.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.global_shape import GlobalShape, global_solver, shape_of
 from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, undistorted
 from vggtgeo.slam.pose_uncertainty import keyframe_sigma
+from vggtgeo.slam.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
@@ -58,6 +59,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         adjustment = replace(adjustment, problem=problem)
         told = gauge_notes(gauge, adjustment.keyframes, "global adjustment") if number == 0 else ()
         slam = replace(slam, notes=(*slam.notes, *told))
+        adjustment = _without_readout(slam, adjustment)
         solver = global_solver(adjustment.problem, settings)
         solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
         if not np.isfinite(float(solution.energy)):
@@ -65,11 +67,13 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         slam, solved = _taken(slam, adjustment, solution.state), (adjustment.problem, solution.state)
         if number > 0:
             continue
+        slam, adjustment, state = _with_its_readout(slam, adjustment, solution.state, settings)
+        solved = adjustment.problem, state
         before = slam
         if slam.calibrated and not slam.metric:
-            slam = replace(slam, focal_wanted=free_focal(adjustment.problem, solution.state, _solves(settings)))
+            slam = replace(slam, focal_wanted=free_focal(adjustment.problem, state, _solves(settings)))
         if settings.camera.refine_intrinsics != "never":
-            slam = _with_its_camera(slam, adjustment, solution.state, edges, settings)
+            slam = _with_its_camera(slam, adjustment, state, edges, settings)
         if settings.refinement.global_rounds == 1:
             break
         if estimated or slam.intrinsics is not before.intrinsics:
@@ -85,6 +89,30 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
 def _solves(settings: SlamSettings) -> Solve:
     """Adjusts any problem of the shape of a global adjustment."""
     return lambda problem, state: solve_jit(problem, state, solver=global_solver(problem, settings)).state
+
+
+def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:
+    """The adjustment with its matches where they would be if images were read at once, where a readout is known."""
+    if slam.readout is None:
+        return adjustment
+    problem, initial = adjustment.problem, adjustment.initial
+    motions = camera_motions(slam, problem.num_keyframes)
+    return replace(adjustment, problem=without_readout(problem, initial, motions, slam.keyframes[0].size, slam.readout))
+
+
+def _with_its_readout(
+    slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
+) -> tuple[Slam, Adjustment, State]:
+    """The state after a search for a rolling shutter; with what was adjusted last, and its solution."""
+    if slam.readout is not None or not settings.refinement.rolling_shutter:
+        return slam, adjustment, state
+    motions = camera_motions(slam, adjustment.problem.num_keyframes)
+    size, longest = slam.keyframes[0].size, frame_interval(slam)
+    found = find_readout(adjustment.problem, state, motions, size, longest, _solves(settings))
+    if found is None or not found.pays:
+        return slam, adjustment, state
+    adjustment = replace(adjustment, problem=found.problem)
+    return replace(_taken(slam, adjustment, found.state), readout=found.readout), adjustment, found.state
 
 
 def _with_its_camera(

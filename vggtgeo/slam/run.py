@@ -21,6 +21,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.description import Description
+from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.loops import close_loops
@@ -150,28 +151,6 @@ def frame_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
     own: set[int] = set(pieces_by_size(slam)[piece]) if slam.keyframes else set()
     chosen = np.array([record.tracked and record.reference in own for record in slam.frames], bool)
     return Trajectory(times[chosen], rigid.invert(poses[chosen]))
-
-
-def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
-    """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known.
-
-    A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and the
-    next is shared out over the frames in between, in proportion to time, so that the path has no steps.
-    """
-    poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
-    times = np.array([record.timestamp for record in slam.frames])
-    last = 0
-    for row, record in enumerate(slam.frames):
-        if record.arrival is None:
-            continue
-        reference, tracked = record.arrival
-        change = poses[row] @ rigid.invert(tracked @ slam.keyframes[reference].pose)
-        between = [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
-        span = max(times[row] - times[last], 1e-9)
-        for k in between:
-            poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
-        last = row
-    return times, poses
 
 
 def keyframe_trajectory(slam: Slam, piece: int = 0) -> Trajectory:

@@ -239,5 +239,7 @@ class RefinementSettings(CheckedSettings):
     """Adjustments, each after relinearising the dense depth between keyframes."""
     global_neighbours: int = whole(16, at_least=1)
     """Most edges of one keyframe."""
+    rolling_shutter: bool = switch(True)
+    """Find how long the camera takes to read an image out, row by row, and take that out of the map."""
     loop_candidates: int = whole(3, at_least=0)
     """Pairs that each keyframe may propose in the search for places seen before."""

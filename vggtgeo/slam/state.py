@@ -66,6 +66,17 @@ class PendingWindow:
     result: Future[Slam]
 
 
+@dataclass(frozen=True)
+class Readout:
+    """How long the camera reads an image out, s: from the first row to the last, or column where columns; negative: the
+    last is read first. shift: by how much that moves matches in this run, pixels, exceeded by one in ten.
+    """
+
+    seconds: float
+    columns: bool
+    shift: float
+
+
 @dataclass(frozen=True, eq=False)
 class Slam:
     """Everything known after some frames.
@@ -90,7 +101,8 @@ class Slam:
     are what a first pass over the frames found (`first_pass.py`), or the run that made the map which this one goes on
     in: windows hold them, and the last adjustment estimates the camera once more. focal_wanted: the focal lengths that
     the last adjustment of a given camera without measured depth finds if they are free, float64 [2], pixels; None where
-    they explain matches no better than chance.
+    they explain matches no better than chance. readout: of the rolling shutter that the last adjustment found and took
+    out of the poses (`rolling_shutter.py`); pixels and images stay as they were read.
     """
 
     intrinsics: np.ndarray
@@ -119,6 +131,7 @@ class Slam:
     lens: Camera | None = None
     camera_found: bool = False
     focal_wanted: np.ndarray | None = None
+    readout: Readout | None = None
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)

@@ -9,8 +9,8 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.connected import pieces_by_size
-from vggtgeo.slam.run import frame_poses
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.state import Readout, Slam
 
 GUESSED = 0.1
 """A prior on the focal length that is wider than this share of it stands for a guess."""
@@ -25,7 +25,7 @@ class Estimate:
     metres. inliers: int [n], matches that agreed with the pose; is_keyframe: bool [n]. pieces: how many parts the map
     has. started: whether there ever was a map. by_surface: bool [n], frames that picture and surfaces place beyond
     doubt, without any match; None: no frame. focal_wanted: focal lengths that the last adjustment found if they are
-    free, float64 [2], pixels; None where that explained nothing.
+    free, float64 [2], pixels; None where that explained nothing. readout: of the rolling shutter that was found.
     """
 
     frames: np.ndarray
@@ -42,6 +42,7 @@ class Estimate:
     started: bool = True
     by_surface: np.ndarray | None = None
     focal_wanted: np.ndarray | None = None
+    readout: Readout | None = None
 
     @classmethod
     def of(cls, slam: Slam) -> Self:
@@ -63,6 +64,7 @@ class Estimate:
             known,
             np.array([record.evidence.placed_by_surface for record in slam.frames], bool),
             slam.focal_wanted,
+            slam.readout,
         )
 
     def __len__(self) -> int:

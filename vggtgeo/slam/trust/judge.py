@@ -20,6 +20,7 @@ from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
 from vggtgeo.slam.trust.sensor_drift import check_sensors
+from vggtgeo.slam.trust.shutter import check_shutter
 from vggtgeo.slam.trust.speed import check_speed
 from vggtgeo.slam.trust.steps import breaks, check_steps, steps
 from vggtgeo.slam.trust.still_points import check_parts, divide
@@ -68,4 +69,5 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
         sound[part.first : part.last + 2] = False
     yield from check_scale(estimate, hand_overs(estimate, evidence, sound))
     yield from check_camera(estimate, camera_opinion(estimate, evidence), size)
+    yield from check_shutter(estimate)
     yield from check_enlargements(estimate, np.array([noted.enlarged for noted in evidence], np.float64))

@@ -1,0 +1,186 @@
+"""A rolling shutter is found in the last adjustment, and taken out of the map. Truth: the moment that each row saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from recorded_run import recorded_run
+
+import vggtgeo as vg
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.residuals import residuals_at
+from vggtgeo.geometry import lie, rigid
+from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
+from vggtgeo.simulation.small_window import SIZE
+from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.rolling_shutter import camera_motions, find_readout, frame_interval, read_at_once, row_shifts
+from vggtgeo.slam.state import Readout
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.shutter import check_shutter
+
+WIDTH, HEIGHT = SIZE
+KEYFRAMES = 8
+WINDOW = vg.simulate_window(KEYFRAMES, points=60, lines=4, noise=0.3, depth_error=0.01, start_error=0.01)
+LONGEST = 1 / 30
+_solve = eqx.filter_jit(vg.solve)
+
+
+def adjusted(problem: Problem, state: State) -> State:
+    """The map adjusted to its matches."""
+    return _solve(problem, state).state
+
+
+def some_motions(seed: int = 0) -> np.ndarray:
+    """Of a hand-held camera at each keyframe: metres and radians a second."""
+    return np.random.default_rng(seed).normal(0.0, [0.4, 0.4, 0.4, 0.8, 0.8, 0.8], (KEYFRAMES, 6))
+
+
+def seen_later(pixels: np.ndarray, depth: np.ndarray, motion: np.ndarray, seconds: float, columns: bool) -> np.ndarray:
+    """Where pixels [m, 2] at depths [m] come out under motions [m, 6] if rows are read one by one: by the exact motion,
+    until the moment and the row belong to each other.
+    """
+    fx, fy, cx, cy = WINDOW.intrinsics
+    places = np.c_[(pixels - [cx, cy]) / [fx, fy], np.ones(len(pixels))] * depth[:, None]
+    seen = pixels
+    for _ in range(20):
+        moment = (seen[:, 0] + 0.5) / WIDTH - 0.5 if columns else (seen[:, 1] + 0.5) / HEIGHT - 0.5
+        moved = np.asarray(lie.exp(jnp.asarray(seconds * moment[:, None] * motion)) @ jnp.asarray(places))
+        seen = moved[:, :2] / moved[:, 2:] * [fx, fy] + [cx, cy]
+    return seen
+
+
+def with_readout(motions: np.ndarray, seconds: float, columns: bool = False) -> vg.SimulatedWindow:
+    """The window as such a camera sees it: its key points, its matches, and where its lines are matched."""
+    seen = WINDOW.observations
+    poses = rigid.to_matrix(WINDOW.poses)
+    fx, fy, cx, cy = WINDOW.intrinsics
+    depth = 1 / WINDOW.inverse_depth
+
+    def in_target(edges: np.ndarray, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixel and depth of landmarks in the target of edges, and its motion."""
+        host, target = seen.edges[edges].T
+        ray = np.c_[(seen.pixel[landmarks] - [cx, cy]) / [fx, fy], np.ones(len(landmarks))]
+        places = np.c_[ray * depth[landmarks, None], np.ones(len(landmarks))]
+        there = np.einsum("mij,mj->mi", poses[target] @ rigid.invert(poses[host]), places)
+        return there[:, :2] / there[:, 2:3] * [fx, fy] + [cx, cy], there[:, 2], motions[target]
+
+    straight, far, motion = in_target(seen.point_edge, seen.point_landmark)
+    moved = seen_later(straight, far, motion, seconds, columns) - straight
+    on_line, far, motion = in_target(seen.line_edge, seen.line_landmark)
+    beside = seen_later(on_line, far, motion, seconds, columns) - on_line
+    a, b, c = seen.line_coefficients.T
+    observations = replace(
+        seen,
+        pixel=seen_later(seen.pixel, depth, motions[seen.host], seconds, columns),
+        point_target=seen.point_target + moved,
+        line_coefficients=np.stack([a, b, c - a * beside[:, 0] - b * beside[:, 1]], 1),
+    )
+    return replace(WINDOW, observations=observations)
+
+
+@pytest.mark.parametrize(("seconds", "columns"), [(0.02, False), (-0.012, False), (0.02, True)])
+def test_a_rolling_shutter_is_found_and_taken_out(seconds: float, columns: bool) -> None:
+    """A window whose rows (or columns, as of a phone that is held upright) were seen one after the other, either end
+    first; oracles: the readout and the poses that it was made with.
+    """
+    motions = some_motions()
+    problem, start, _ = with_readout(motions, seconds, columns).pack()
+    state = adjusted(problem, start)
+    found = find_readout(problem, state, motions, (HEIGHT, WIDTH), LONGEST, adjusted)
+    assert found is not None
+    assert found.pays, (found.gain, found.needed)
+    assert found.readout.columns == columns
+    assert found.readout.seconds == pytest.approx(seconds, rel=0.05)
+    before, after = (np.sqrt(np.mean(WINDOW.errors(one) ** 2)) for one in (state, found.state))
+    assert after < 0.5 * before, (before, after)
+
+
+def test_what_is_taken_out_is_what_the_motion_put_in() -> None:
+    """Matches of the true map fit as they do without a rolling shutter, those of lines, too; oracle: that window."""
+    motions, seconds = some_motions(1), 0.02
+    at_once, _, _ = WINDOW.pack()
+    problem, _, _ = with_readout(motions, seconds).pack()
+    truth = WINDOW.truth()
+    shifts = row_shifts(problem, truth, motions, (HEIGHT, WIDTH), columns=False)
+    repaired = read_at_once(problem, shifts, seconds, WIDTH)
+    for name in ("points", "lines"):
+        expected, wrong, right = (np.asarray(residuals_at(p, truth)[name]) for p in (at_once, problem, repaired))
+        assert np.abs(wrong - expected).max() > 3.0
+        assert np.abs(right - expected).max() < 0.2  # of second order in the readout
+
+
+def test_images_that_are_read_at_once_have_none() -> None:
+    """Nothing is found in windows that no rolling shutter disturbed, nor where no camera moves; six of them."""
+    for seed in range(3):
+        window = vg.simulate_window(KEYFRAMES, 60, 4, noise=0.3, depth_error=0.01, start_error=0.01, seed=seed)
+        problem, start, _ = window.pack()
+        state = adjusted(problem, start)
+        for motions in (some_motions(seed), np.zeros((KEYFRAMES, 6))):
+            found = find_readout(problem, state, motions, (HEIGHT, WIDTH), LONGEST, adjusted)
+            assert found is None or not found.pays or found.readout.shift < 0.1
+
+
+def test_the_motion_of_a_keyframe_is_that_between_its_neighbours() -> None:
+    """For the time between the frames beside a keyframe it leads from one pose to the other; oracle: these poses."""
+    slam = recorded_run().slam
+    motions = camera_motions(slam, len(slam.keyframes) + 2)
+    times, poses = frame_poses(slam)
+    assert np.all(motions[len(slam.keyframes) :] == 0)
+    assert frame_interval(slam) == pytest.approx(0.1)
+    for keyframe, motion in zip(slam.keyframes, motions, strict=False):
+        before, after = max(keyframe.frame - 1, 0), min(keyframe.frame + 1, len(times) - 1)
+        there = lie.exp(jnp.asarray(motion * (times[after] - times[before]))).as_matrix() @ poses[before]
+        assert np.allclose(there, poses[after], atol=1e-6)
+        assert np.any(motion != 0)
+
+
+def test_frames_far_apart_say_nothing_of_the_motion() -> None:
+    """Beside a pause the neighbour on the other side is asked alone; a lost frame is no witness."""
+    slam = recorded_run().slam
+    second = slam.keyframes[1].frame
+    paused = tuple(replace(f, timestamp=f.timestamp + 5.0 * (f.frame > second)) for f in slam.frames)
+    whole, short = camera_motions(slam, len(slam.keyframes)), camera_motions(replace(slam, frames=paused), 3)
+    times, poses = frame_poses(slam)
+    step = jaxlie.SE3(jnp.asarray(rigid.to_quaternion((poses[second] @ rigid.invert(poses[second - 1]))[None])))
+    assert np.allclose(short[1], np.asarray(lie.log(step))[0] / (times[second] - times[second - 1]), atol=1e-6)
+    assert not np.allclose(short[1], whole[1], atol=1e-6)
+    lost = tuple(replace(f, tracked=f.frame in (0, second)) for f in slam.frames)
+    assert np.all(camera_motions(replace(slam, frames=lost), 3)[1] == 0)
+
+
+@pytest.mark.parametrize(("shift", "columns", "told"), [(12.0, False, True), (12.0, True, True), (2.0, False, False)])
+def test_a_readout_that_moves_much_is_told(shift: float, columns: bool, told: bool) -> None:
+    """The sentence names the time and the direction; what moves matches by a few pixels is no fault."""
+    estimate = replace(Estimate.of(recorded_run().slam), readout=Readout(-0.0301, columns, shift))
+    reasons = [finding.text for finding in check_shutter(estimate)]
+    assert len(reasons) == told
+    for reason in reasons:
+        assert "over about 30 ms" in reason
+        assert ("columns" if columns else "rows") in reason
+
+
+def test_rows_are_drawn_as_the_simulated_camera_draws_them() -> None:
+    """A picture of one moment, drawn again row by row by its depth and the true motion, is the one that the simulated
+    camera takes with that readout; oracle: that camera. Most of what the readout changes is there.
+    """
+    options = {"seed": 3, "size": (320, 240), "rate": 10.0, "speed": 2.0}
+    at_once, later = (
+        vg.simulate(
+            "office", 5, sensor=vg.simulation.Sensor(noise=0.0, depth_noise=0.0, readout_time=seconds), **options
+        )
+        for seconds in (0.0, 0.09)
+    )
+    frames = list(at_once.frames())
+    velocities = camera_velocities(np.array([frame.timestamp for frame in frames]), at_once.ground_truth())
+    middle = 2
+    drawn = rolled(frames[middle], velocities[middle], at_once.camera.intrinsics, 0.09)
+    true = list(later.frames())[middle].image.astype(float)
+    changed, left = (np.abs(image.astype(float) - true).mean() for image in (frames[middle].image, drawn.image))
+    assert left < 0.35 * changed, (changed, left)
+    with pytest.raises(vg.InputError, match="has no depth; a rolling shutter is drawn by it"):
+        rolled(replace(frames[0], depth=None), velocities[0], at_once.camera.intrinsics, 0.02)

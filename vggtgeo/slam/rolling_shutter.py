@@ -1,0 +1,280 @@
+"""The rolling shutter of a camera: found in the last adjustment, and taken out of it.
+
+Cameras of phones and the colour cameras of depth cameras read an image row by row, over 5 to 30 ms, in which the camera
+moves on: a match in row `v` of `H` is where its landmark was `(v / H - 1/2) T` after the middle of the image. The
+motion of each keyframe is known from the frames beside it, so that the map is adjusted once more with every match where
+it would have been at the middle, for the readout time `T` that explains matches best. Sought down the slope of the
+energy, whose derivative at an adjusted map needs no other adjustment (the envelope theorem), by the secant method.
+
+A phone that is held upright reads columns of what is shown; the direction whose slope is surer is taken.
+
+Without measured depth the map bends to explain such images, and fits them: building-walk's first 40 frames, each row
+drawn from where the camera was 30 ms x (v / H - 1/2) later, came out 13.6 cm off. What is found is told where it is
+large (`trust/shutter.py`): frames were matched and tracked as if each were of one moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from scipy.stats import t as student_t
+
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.geometry import lie, rigid
+from vggtgeo.geometry.cameras import SquarePinhole
+from vggtgeo.slam.camera_gain import LEAST_HOSTS, gain, match_energies
+from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.state import Readout, Slam
+
+MOST_APART = 3.0
+"""Frames beside a keyframe say how it moves where they are at most this many usual intervals away."""
+FIRST_SHIFT, SETTLED = 1.0, 0.05
+"""Pixels, median of the matches: the first step of the search, and the one at which it ends."""
+PROBE = 0.05
+"""Pixels, the same: for derivatives."""
+SOLVES = 6
+LONGEST = 2.0
+"""Of a step, in the one before."""
+WORTH_A_TRIAL = 0.05
+"""Chance of a slope as sure as this without a rolling shutter (Student's t over keyframes): a search takes seconds."""
+USUAL_LARGEST = 90
+"""Percentile of the matches whose shift is told."""
+
+Solve = Callable[[Problem, State], State]
+
+
+class Shifts(NamedTuple):
+    """Pixels a second of readout time by which pixels are off: of slots [n, s, 2], of points [e, p, 2] in the target,
+    and of lines [e, l, 2] where their sample is seen.
+    """
+
+    slots: np.ndarray
+    points: np.ndarray
+    lines: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FoundReadout:
+    """The outcome of a search: the readout, the problem without it, the map adjusted to that; and how much the mean
+    robust energy of a match falls by it, and has to fall to be no chance.
+    """
+
+    readout: Readout
+    problem: Problem
+    state: State
+    gain: float
+    needed: float
+
+    @property
+    def pays(self) -> bool:
+        """Whether it is there."""
+        return self.gain > self.needed
+
+
+def camera_motions(slam: Slam, room: int) -> np.ndarray:
+    """How the camera moves at each keyframe, float64 [room, 6]: the tangent of world -> camera, units of the map a
+    second, then rad a second; zero where no frame beside it says so, and beyond the keyframes.
+    """
+    motions = np.zeros((room, lie.TANGENT))
+    times, poses = frame_poses(slam)
+    row_of = {record.frame: row for row, record in enumerate(slam.frames)}
+    there = [(place, row_of[k.frame]) for place, k in enumerate(slam.keyframes) if k.frame in row_of]
+    if not there or len(times) < 2:
+        return motions
+    places, rows = np.array(there).T
+    tracked = np.array([record.tracked for record in slam.frames])
+    near = lambda other: tracked[other] & (np.abs(times[other] - times[rows]) <= MOST_APART * frame_interval(slam))
+    before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(times) - 1)
+    before, after = np.where(near(before), before, rows), np.where(near(after), after, rows)
+    steps = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(poses[after] @ rigid.invert(poses[before]))))
+    seconds = (times[after] - times[before])[:, None]
+    motions[places] = np.divide(
+        np.asarray(lie.log(steps)), seconds, out=np.zeros((len(rows), lie.TANGENT)), where=seconds > 0
+    )
+    return motions
+
+
+def frame_interval(slam: Slam) -> float:
+    """The usual time from frame to frame, s; 0 of fewer than two."""
+    times = np.array([record.timestamp for record in slam.frames])
+    return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+
+
+def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], columns: bool) -> Shifts:
+    """What a readout of one second would shift. size: height and width of the images; columns: they are read column by
+    column.
+    """
+    camera = _pinhole(problem, state)
+    poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
+    source, target = np.asarray(problem.edges.source), np.asarray(problem.edges.target)
+    pixels = np.asarray(problem.pixels, np.float64)
+    inverse = np.asarray(state.inverse_depth, np.float64)
+    flat = (pixels - camera[2:]) / camera[:2]
+    rays = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], -1)
+    relative = poses[target] @ rigid.invert(poses[source])
+    turned = np.einsum("eij,esj->esi", relative[:, :3, :3], rays[source])
+    seen = turned + relative[:, None, :3, 3] * inverse[source][..., None]
+    with np.errstate(all="ignore"):
+        projected = seen[..., :2] / seen[..., 2:] * camera[:2] + camera[2:]
+        there = inverse[source] / seen[..., 2]
+    points = problem.points.weight.shape[1]
+    shift = lambda at, depth, motion: _shift(at, depth, motion, camera, size, columns)
+    return Shifts(
+        shift(pixels, inverse, motions),
+        shift(np.asarray(problem.points.target, np.float64), there[:, :points], motions[target]),
+        shift(projected[:, points:], there[:, points:], motions[target]),
+    )
+
+
+def _pinhole(problem: Problem, state: State) -> np.ndarray:
+    """fx, fy, cx, cy of the camera."""
+    parameters = np.asarray(state.intrinsics, np.float64)
+    return np.array([parameters[0], *parameters]) if problem.camera is SquarePinhole else parameters[:4]
+
+
+def _shift(
+    pixels: np.ndarray,
+    inverse: np.ndarray,
+    motion: np.ndarray,
+    camera: np.ndarray,
+    size: tuple[int, int],
+    columns: bool,
+) -> np.ndarray:
+    """Velocity in the image [a, b, 2], of pixels [a, b, 2] at inverse depths [a, b] under motions [a, 6], by the time
+    of their row; zero where they are not in front of the camera.
+    """
+    flat = (pixels - camera[2:]) / camera[:2]
+    rays = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], -1)
+    with np.errstate(all="ignore"):
+        moved = motion[:, None, :3] * inverse[..., None] + np.cross(motion[:, None, 3:], rays)
+        velocity = (moved[..., :2] - flat * moved[..., 2:]) * camera[:2]
+        axis = 0 if columns else 1
+        moment = (pixels[..., axis] + 0.5) / size[1 - axis] - 0.5
+        shift = moment[..., None] * velocity
+    known = np.isfinite(shift).all(-1, keepdims=True) & (inverse > 0)[..., None]
+    return np.where(known, shift, 0.0)
+
+
+def read_at_once(problem: Problem, shifts: Shifts, seconds: float, most: float) -> Problem:
+    """The problem with every match where it would have been at the middle of its image's readout. most: pixels, of a
+    shift: beyond are landmarks that have run into the camera.
+    """
+    slots, points, lines = (np.clip(seconds * shift, -most, most) for shift in shifts)
+    coefficients = np.asarray(problem.lines.coefficients, np.float64)
+    offset = coefficients[..., 2] + np.sum(coefficients[..., :2] * lines, -1)
+    like = lambda values: jnp.asarray(values, problem.pixels.dtype)
+    changed = eqx.tree_at(
+        lambda p: (p.pixels, p.points.target, p.lines.coefficients),
+        problem,
+        (
+            like(np.asarray(problem.pixels) - slots),
+            like(np.asarray(problem.points.target) - points),
+            like(np.concatenate([coefficients[..., :2], offset[..., None]], -1)),
+        ),
+    )
+    return changed
+
+
+def without_readout(
+    problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], readout: Readout
+) -> Problem:
+    """The problem without a readout that is known; state: about where its map is."""
+    shifts = row_shifts(problem, state, motions, size, readout.columns)
+    return read_at_once(problem, shifts, readout.seconds, max(size) / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """A map, and what a readout does to it."""
+
+    problem: Problem
+    shifts: Shifts
+    most: float
+
+    @property
+    def usual(self) -> float:
+        """Median shift of the matches, pixels a second."""
+        return float(np.median(self.sizes)) if len(self.sizes) else 0.0
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Of every match, in host and target together, pixels a second."""
+        source = np.asarray(self.problem.edges.source)
+        points = self.shifts.points.shape[1]
+        both = np.stack([self.shifts.slots[source][:, :points], self.shifts.points], -2)
+        return np.asarray(np.linalg.norm(both, axis=-1).max(-1)[np.asarray(self.problem.points.present())])
+
+    def at(self, seconds: float) -> Problem:
+        """The problem without this readout."""
+        return read_at_once(self.problem, self.shifts, seconds, self.most)
+
+    def slopes(self, seconds: float, state: State) -> np.ndarray:
+        """Derivative of the energy of each keyframe's matches by the readout time, float64 [n], at an adjusted map."""
+        step = PROBE / self.usual
+        later, earlier = (match_energies(self.at(seconds + sign * step), state) for sign in (1, -1))
+        each = np.where(np.asarray(self.problem.points.present()), later - earlier, 0.0).sum(1) / (2 * step)
+        sums = np.zeros(self.problem.num_keyframes)
+        np.add.at(sums, np.asarray(self.problem.edges.source), each)
+        return sums
+
+
+def find_readout(
+    problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], longest: float, solve: Solve
+) -> FoundReadout | None:
+    """The readout that explains the matches of a map best; None where none is to be seen.
+
+    problem, state: an adjustment as if each image were of one moment. motions: see `camera_motions`. longest: seconds
+    that it can last, the time from frame to frame. solve: adjusts any problem of its shape.
+    """
+    chosen, surest = None, 0.0
+    for columns in (False, True):
+        shifts = row_shifts(problem, state, motions, size, columns)
+        search = _Search(problem, shifts, max(size) / 2)
+        if search.usual * longest < SETTLED:
+            continue
+        slopes = search.slopes(0.0, state)
+        slopes = slopes[slopes != 0]
+        if len(slopes) < LEAST_HOSTS:
+            continue
+        sure = abs(slopes.sum()) / np.sqrt(np.sum(slopes**2)) / student_t.isf(WORTH_A_TRIAL, len(slopes) - 1)
+        if sure > max(surest, 1.0):
+            chosen, surest = (columns, search, float(slopes.sum())), sure
+    if chosen is None:
+        return None
+    columns, search, slope = chosen
+    seconds, moved = _descend(search, state, slope, longest, solve)
+    without = search.at(seconds)
+    better, needed = gain((problem, state), (without, moved), np.asarray(problem.points.present()), fitted=2)
+    shift = float(np.percentile(search.sizes, USUAL_LARGEST)) * abs(seconds)
+    return FoundReadout(Readout(seconds, columns, shift), without, moved, better, needed)
+
+
+def _descend(search: _Search, state: State, slope: float, longest: float, solve: Solve) -> tuple[float, State]:
+    """The readout at which the energy has no slope, or the longest there can be, and the map adjusted to it."""
+    lower, upper = (0.0, slope), None
+    seconds = -np.sign(slope) * min(FIRST_SHIFT / search.usual, longest)
+    for _ in range(SOLVES):
+        state = solve(search.at(seconds), state)
+        here = seconds, float(search.slopes(seconds, state).sum())
+        if not np.isfinite(here[1]):
+            break
+        step = LONGEST * (here[0] - lower[0])
+        lower, upper = (lower, here) if here[1] * slope <= 0 else (here, upper)
+        following = np.clip(seconds + step, -longest, longest) if upper is None else _between(lower, upper)
+        if abs(following - seconds) * search.usual < SETTLED:
+            break
+        seconds = float(following)
+    else:
+        state = solve(search.at(seconds), state)
+    return float(seconds), state
+
+
+def _between(lower: tuple[float, float], upper: tuple[float, float]) -> float:
+    """Where a line through two slopes of opposite sign is zero."""
+    return (lower[0] * upper[1] - upper[0] * lower[1]) / (upper[1] - lower[1])
