@@ -18,10 +18,11 @@ from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
 from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.rolling_shutter import camera_motions, find_readout, frame_interval, read_at_once, row_shifts
+from vggtgeo.slam.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
 from vggtgeo.slam.state import Readout
 from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.shutter import check_shutter
+from vggtgeo.slam.trust.evidence import EvidenceRecorder, FrameEvidence, common
+from vggtgeo.slam.trust.shutter import check_shutter, read_at_once
 
 WIDTH, HEIGHT = SIZE
 KEYFRAMES = 8
@@ -106,8 +107,7 @@ def test_what_is_taken_out_is_what_the_motion_put_in() -> None:
     at_once, _, _ = WINDOW.pack()
     problem, _, _ = with_readout(motions, seconds).pack()
     truth = WINDOW.truth()
-    shifts = row_shifts(problem, truth, motions, (HEIGHT, WIDTH), columns=False)
-    repaired = read_at_once(problem, shifts, seconds, WIDTH)
+    repaired = without_readout(problem, truth, motions, (HEIGHT, WIDTH), Readout(seconds, False, 0.0))
     for name in ("points", "lines"):
         expected, wrong, right = (np.asarray(residuals_at(p, truth)[name]) for p in (at_once, problem, repaired))
         assert np.abs(wrong - expected).max() > 3.0
@@ -184,3 +184,37 @@ def test_rows_are_drawn_as_the_simulated_camera_draws_them() -> None:
     assert left < 0.35 * changed, (changed, left)
     with pytest.raises(vg.InputError, match="has no depth; a rolling shutter is drawn by it"):
         rolled(replace(frames[0], depth=None), velocities[0], at_once.camera.intrinsics, 0.02)
+
+
+def test_corners_that_judge_are_of_the_middle_of_the_image() -> None:
+    """Where rows are read one by one, depth and true motion carry corners beside where they were followed, and nearer
+    to that once the readout is taken out of them; oracle: the simulated camera.
+    """
+    readout = 0.08
+    sensor = vg.simulation.Sensor(readout_time=readout)
+    sequence = vg.simulate("room", 9, 0, (320, 240), rate=10.0, speed=1.5, sensor=sensor)
+    recorder = EvidenceRecorder(sequence.camera)
+    for frame in sequence.frames():
+        recorder.add(frame)
+    run = recorded_run().slam
+    poses = rigid.invert(sequence.ground_truth().poses)
+    frames = tuple(
+        replace(record, reference=0, relative=pose @ rigid.invert(poses[0]), arrival=None)
+        for record, pose in zip(run.frames, poses, strict=True)
+    )
+    first = replace(run.keyframes[0], pose=poses[0])
+    slam = replace(run, keyframes=(first, *run.keyframes[1:]), frames=frames, readout=Readout(readout, False, 9.0))
+
+    def off(evidence: list[FrameEvidence]) -> float:
+        """Median distance of corners from where depth and true motion carry them over two frames, pixels."""
+        found = []
+        for row in range(len(poses) - 2):
+            here, there = common(evidence[row], evidence[row + 2])
+            places = rigid.unproject(
+                evidence[row].pixels[here], 1 / evidence[row].depth[here], poses[row], slam.intrinsics
+            )
+            carried = rigid.project(places, poses[row + 2], slam.intrinsics)
+            found.append(np.linalg.norm(carried - evidence[row + 2].pixels[there], axis=1))
+        return float(np.nanmedian(np.concatenate(found)))
+
+    assert off(read_at_once(slam, recorder.frames)) < 0.6 * off(recorder.frames)

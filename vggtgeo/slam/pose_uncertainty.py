@@ -78,13 +78,13 @@ def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
         moved = np.hypot(moved, DEPTH_SCALE * np.linalg.norm(places - places[:1], axis=1))
     speed, rate = _speeds(times, poses, places)
     # What turns while it is read out is sheared and stretched, which looks like a motion at the scene's distance.
-    sheared = rate * _median_depths(slam)[[record.reference for record in records]]
+    sheared = rate * median_depths(slam)[[record.reference for record in records]]
     moved = np.sqrt(moved**2 + MOMENT**2 * (speed**2 + sheared**2))
     turned = np.sqrt(turned**2 + MOMENT**2 * rate**2 + CALIBRATION**2 * _angles(poses) ** 2)
     return PoseUncertainty(times, moved, turned)
 
 
-def _median_depths(slam: Slam) -> np.ndarray:
+def median_depths(slam: Slam) -> np.ndarray:
     """Of each keyframe's points, float64 [n]; that of all where it has none."""
     each = [keyframe.points.inverse_depth[np.isfinite(keyframe.points.inverse_depth)] for keyframe in slam.keyframes]
     every = float(np.median(np.concatenate(each))) if any(map(len, each)) else 1.0

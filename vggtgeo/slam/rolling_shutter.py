@@ -78,26 +78,32 @@ class FoundReadout:
 
 
 def camera_motions(slam: Slam, room: int) -> np.ndarray:
-    """How the camera moves at each keyframe, float64 [room, 6]: the tangent of world -> camera, units of the map a
-    second, then rad a second; zero where no frame beside it says so, and beyond the keyframes.
-    """
+    """How the camera moves at each keyframe, float64 [room, 6], see `frame_motions`; zero beyond the keyframes."""
     motions = np.zeros((room, lie.TANGENT))
-    times, poses = frame_poses(slam)
     row_of = {record.frame: row for row, record in enumerate(slam.frames)}
     there = [(place, row_of[k.frame]) for place, k in enumerate(slam.keyframes) if k.frame in row_of]
-    if not there or len(times) < 2:
-        return motions
-    places, rows = np.array(there).T
+    if there:
+        places, rows = np.array(there).T
+        motions[places] = frame_motions(slam)[rows]
+    return motions
+
+
+def frame_motions(slam: Slam) -> np.ndarray:
+    """How the camera moves at each frame, float64 [n, 6]: the tangent of world -> camera, units of the map a second,
+    then rad a second; from the frames before and after, zero where none of them says so.
+    """
+    times, poses = frame_poses(slam)
+    if len(times) < 2:
+        return np.zeros((len(times), lie.TANGENT))
+    rows = np.arange(len(times))
     tracked = np.array([record.tracked for record in slam.frames])
-    near = lambda other: tracked[other] & (np.abs(times[other] - times[rows]) <= MOST_APART * frame_interval(slam))
+    near = lambda other: tracked[other] & (np.abs(times[other] - times) <= MOST_APART * frame_interval(slam))
     before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(times) - 1)
     before, after = np.where(near(before), before, rows), np.where(near(after), after, rows)
     steps = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(poses[after] @ rigid.invert(poses[before]))))
     seconds = (times[after] - times[before])[:, None]
-    motions[places] = np.divide(
-        np.asarray(lie.log(steps)), seconds, out=np.zeros((len(rows), lie.TANGENT)), where=seconds > 0
-    )
-    return motions
+    still = np.zeros((len(times), lie.TANGENT))
+    return np.divide(np.asarray(lie.log(steps)), seconds, out=still, where=seconds > 0)
 
 
 def frame_interval(slam: Slam) -> float:
@@ -124,7 +130,7 @@ def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[
         projected = seen[..., :2] / seen[..., 2:] * camera[:2] + camera[2:]
         there = inverse[source] / seen[..., 2]
     points = problem.points.weight.shape[1]
-    shift = lambda at, depth, motion: _shift(at, depth, motion, camera, size, columns)
+    shift = lambda at, depth, motion: image_shift(at, depth, motion, camera, size, columns)
     return Shifts(
         shift(pixels, inverse, motions),
         shift(np.asarray(problem.points.target, np.float64), there[:, :points], motions[target]),
@@ -138,7 +144,7 @@ def _pinhole(problem: Problem, state: State) -> np.ndarray:
     return np.array([parameters[0], *parameters]) if problem.camera is SquarePinhole else parameters[:4]
 
 
-def _shift(
+def image_shift(
     pixels: np.ndarray,
     inverse: np.ndarray,
     motion: np.ndarray,

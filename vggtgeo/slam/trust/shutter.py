@@ -1,12 +1,45 @@
-"""The rolling shutter that the last adjustment found: did it bend what was matched and tracked before?"""
+"""The rolling shutter that the last adjustment found: did it bend what was matched and tracked before?
+
+The poses are of the middle of each image, and so are the corners that judge them: without depth, where the median of
+the map is.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vggtgeo.slam.pose_uncertainty import median_depths
+from vggtgeo.slam.rolling_shutter import frame_motions, image_shift
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.evidence import FrameEvidence
 from vggtgeo.slam.trust.finding import Finding
 
 MOST_SHIFT = 7.0
 """Pixels by which one match in ten is off, or more."""
+
+
+def read_at_once(slam: Slam, evidence: Sequence[FrameEvidence]) -> list[FrameEvidence]:
+    """The corners of frames where they would have been if each image were of one moment.
+
+    evidence: of the frames of the run, in their order.
+    """
+    readout = slam.readout
+    if readout is None:
+        return list(evidence)
+    intrinsics, size = np.asarray(slam.intrinsics, np.float64), slam.keyframes[0].size
+    depths = median_depths(slam)
+    found = []
+    for noted, motion, record in zip(evidence, frame_motions(slam), slam.frames, strict=True):
+        pixels, depth = noted.pixels.astype(np.float64), noted.depth.astype(np.float64)
+        known = np.isfinite(depth) & (depth > 0) & slam.metric
+        inverse = 1 / np.where(known, depth, depths[record.reference])
+        shift = image_shift(pixels[None], inverse[None], motion[None], intrinsics, size, readout.columns)[0]
+        found.append(replace(noted, pixels=(pixels - readout.seconds * shift).astype(np.float32)))
+    return found
 
 
 def check_shutter(estimate: Estimate) -> list[Finding]:
