@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import equinox as eqx
@@ -36,9 +37,13 @@ MOST_APART = 3.0
 """Frames beside a keyframe say how it moves where they are at most this many usual intervals away."""
 FIRST_SHIFT, SETTLED = 1.0, 0.05
 """Pixels, median of the matches: the first step of the search, and the one at which it ends."""
+FASTEST = 1e6
+"""Pixels a second: what seems faster is a landmark in the camera."""
 PROBE = 0.05
 """Pixels, the same: for derivatives."""
 SOLVES = 6
+AT_ONCE = 512
+"""Edges that are looked at together: a building's 15,000 would take gigabytes."""
 LONGEST = 2.0
 """Of a step, in the one before."""
 WORTH_A_TRIAL = 0.05
@@ -118,24 +123,35 @@ def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[
     """
     camera = _pinhole(problem, state)
     poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
-    source, target = np.asarray(problem.edges.source), np.asarray(problem.edges.target)
-    pixels = np.asarray(problem.pixels, np.float64)
-    inverse = np.asarray(state.inverse_depth, np.float64)
-    flat = (pixels - camera[2:]) / camera[:2]
-    rays = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], -1)
-    relative = poses[target] @ rigid.invert(poses[source])
-    turned = np.einsum("eij,esj->esi", relative[:, :3, :3], rays[source])
-    seen = turned + relative[:, None, :3, 3] * inverse[source][..., None]
-    with np.errstate(all="ignore"):
-        projected = seen[..., :2] / seen[..., 2:] * camera[:2] + camera[2:]
-        there = inverse[source] / seen[..., 2]
-    points = problem.points.weight.shape[1]
+    pixels, inverse = np.asarray(problem.pixels, np.float64), np.asarray(state.inverse_depth, np.float64)
     shift = lambda at, depth, motion: image_shift(at, depth, motion, camera, size, columns)
-    return Shifts(
-        shift(pixels, inverse, motions),
-        shift(np.asarray(problem.points.target, np.float64), there[:, :points], motions[target]),
-        shift(projected[:, points:], there[:, points:], motions[target]),
-    )
+    count = problem.points.weight.shape[1]
+    points = np.zeros(problem.points.target.shape, np.float32)
+    lines = np.zeros((*problem.lines.weight.shape, 2), np.float32)
+    edges = np.stack([np.asarray(problem.edges.source), np.asarray(problem.edges.target)], 1)
+    matched = np.asarray(problem.points.target, np.float64)
+    for first in range(0, len(edges), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        host, target = edges[part].T
+        seen, depth = _carried(pixels[host], inverse[host], poses[target] @ rigid.invert(poses[host]), camera)
+        points[part] = shift(matched[part], depth[:, :count], motions[target])
+        lines[part] = shift(seen[:, count:], depth[:, count:], motions[target])
+    return Shifts(shift(pixels, inverse, motions), points, lines)
+
+
+def _carried(
+    pixels: np.ndarray, inverse: np.ndarray, relative: np.ndarray, camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [a, b, 2] and inverse depths [a, b] of landmarks as other cameras see them; relative: [a, 4, 4]."""
+    rays = _rays(pixels, camera)
+    there = np.einsum("aij,abj->abi", relative[:, :3, :3], rays) + relative[:, None, :3, 3] * inverse[..., None]
+    with np.errstate(all="ignore"):
+        return there[..., :2] / there[..., 2:] * camera[:2] + camera[2:], inverse / there[..., 2]
+
+
+def _rays(pixels: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    """With a depth of one, [..., 3]."""
+    return np.concatenate([(pixels - camera[2:]) / camera[:2], np.ones((*pixels.shape[:-1], 1))], -1)
 
 
 def _pinhole(problem: Problem, state: State) -> np.ndarray:
@@ -155,16 +171,15 @@ def image_shift(
     """Velocity in the image [a, b, 2], of pixels [a, b, 2] at inverse depths [a, b] under motions [a, 6], by the time
     of their row; zero where they are not in front of the camera.
     """
-    flat = (pixels - camera[2:]) / camera[:2]
-    rays = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], -1)
+    rays = _rays(pixels, camera)
     with np.errstate(all="ignore"):
         moved = motion[:, None, :3] * inverse[..., None] + np.cross(motion[:, None, 3:], rays)
-        velocity = (moved[..., :2] - flat * moved[..., 2:]) * camera[:2]
+        velocity = (moved[..., :2] - rays[..., :2] * moved[..., 2:]) * camera[:2]
         axis = 0 if columns else 1
         moment = (pixels[..., axis] + 0.5) / size[1 - axis] - 0.5
         shift = moment[..., None] * velocity
     known = np.isfinite(shift).all(-1, keepdims=True) & (inverse > 0)[..., None]
-    return np.where(known, shift, 0.0)
+    return np.clip(np.where(known, shift, 0.0), -FASTEST, FASTEST)
 
 
 def read_at_once(problem: Problem, shifts: Shifts, seconds: float, most: float) -> Problem:
@@ -203,12 +218,12 @@ class _Search:
     shifts: Shifts
     most: float
 
-    @property
+    @cached_property
     def usual(self) -> float:
         """Median shift of the matches, pixels a second."""
         return float(np.median(self.sizes)) if len(self.sizes) else 0.0
 
-    @property
+    @cached_property
     def sizes(self) -> np.ndarray:
         """Of every match, in host and target together, pixels a second."""
         source = np.asarray(self.problem.edges.source)
