@@ -241,6 +241,7 @@ RUN = rows(
         ("a reader that is none", good, flags("--kind", "photos")),
         ("`--memory-limit-gb 1e400`", good, flags("--memory-limit-gb", "1e400")),
         ("`--fps 1e-320`", good, flags("--fps", "1e-320")),
+        ("`--fps 1e300`", good, flags("--fps", "1e300")),
         ("`--start 0x1`", good, flags("--start", "0x1")),
         ("`--stride 1e0`", good, flags("--stride", "1e0")),
         ("`--intrinsics` with 1e400", good, flags("--intrinsics", "1e400,55,31.5,23.5")),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -209,6 +210,8 @@ def _leave(error: BaseException) -> NoReturn:
         code = EXIT_INPUT
     elif _is_usage_error(error):
         message, code = f"error: {_usage_message(error)}", EXIT_INPUT
+    elif (wrong := _wrong_switch(error)) is not None:
+        message, code = f"error: {wrong}", EXIT_INPUT
     elif _lacks_platform():
         message = f"error: JAX finds no device for JAX_PLATFORMS={os.environ['JAX_PLATFORMS']}; unset it, or use cpu"
         code = EXIT_INPUT
@@ -223,6 +226,12 @@ def _is_short_of_memory(error: BaseException) -> bool:
     """Whether memory ran out, or what a thread needs: NumPy, Python and JAX each have a word of their own for it."""
     words = ("RESOURCE_EXHAUSTED", "can't start new thread")
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(words))
+
+
+def _wrong_switch(error: BaseException) -> str | None:
+    """What is wrong with a variable of JAX's that is neither true nor false: it says `invalid truth value ...`."""
+    found = re.fullmatch(r"invalid truth value '(.*)' for environment '(\w+)'", str(error))
+    return found and f"the environment variable `{found[2]}` is `{found[1]}`; JAX expects true or false"
 
 
 def _lacks_platform() -> bool:

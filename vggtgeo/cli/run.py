@@ -142,14 +142,18 @@ def _is_map(file: Path) -> bool:
     return True
 
 
+MOST_FPS = 1e5
+"""Above those of any camera: times would be too near each other to tell frames apart."""
+
+
 def check_flags(preset: str, features: str, memory_limit_gb: float | None, fps: float | None = None) -> None:
     """InputError for flags that do not go together, or cannot be."""
     if preset == "paper" and features != "sift":
         raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
     if memory_limit_gb is not None and not 0 < memory_limit_gb < float("inf"):
         raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be a positive number")
-    if fps is not None and not 0 < fps < float("inf"):
-        raise InputError(f"`--fps` is {fps:g}; it must be a positive number of frames a second")
+    if fps is not None and not 0 < fps <= MOST_FPS:
+        raise InputError(f"`--fps` is {fps:g}; it must be a positive number of frames a second, at most {MOST_FPS:g}")
 
 
 def check_provider(preset: str, provider: options.Provider) -> None:
