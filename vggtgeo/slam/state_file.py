@@ -46,21 +46,9 @@ from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(
-        Slam,
-        Readout,
-        Camera,
-        PendingWindow,
-        FramePose,
-        Waiting,
-        Evidence,
-        Keyframe,
-        Slots,
-        KeyframeImages,
-        CompressedImage,
-    ),
+    *(Slam, Camera, PendingWindow, FramePose, Waiting, Evidence, Keyframe, Slots, KeyframeImages, CompressedImage),
     *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
-    *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, WindowPrior, MarginalPrior),
+    *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, WindowPrior, MarginalPrior, Readout),
     *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
     *(PointTerm, LineTerm, DepthPrior, IntrinsicsPrior, RelativePose, SurfaceAlignment, RotationPrior, BaselinePrior),
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
