@@ -143,6 +143,17 @@ def test_a_guessed_camera_is_no_wrong_calibration(healthy: Walk) -> None:
     assert found_by_camera(estimate, healthy.evidence) == []
 
 
+def test_a_camera_that_cannot_be_is_told_though_nobody_gave_it(healthy: Walk) -> None:
+    """A principal point beside the middle by more than an eighth of the height, found by the run itself, is told; one
+    beside it by a twentieth is not.
+    """
+    for share, told in ((0.05, False), (0.13, True), (-0.13, True)):
+        found = K + np.array([0, 0, 0, share * SIZE[1]])
+        estimate = replace(healthy.estimate, intrinsics=found, given=found, sigma=np.full(4, 150.0))
+        texts = [finding.text for finding in check_camera(estimate, None, SIZE)]
+        assert ["what was found cannot be right" in text for text in texts] == [True] * told
+
+
 def test_a_focal_length_that_a_map_without_depth_wants_is_told(healthy: Walk) -> None:
     """20 % are told with the right one; 5 %, or what the run has moved to by itself, are not. Oracle: the intrinsics
     that the walk was made with.
