@@ -252,13 +252,18 @@ def test_a_device_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest
     assert result.stderr == "error: JAX finds no device for JAX_PLATFORMS=cuda; unset it, or use cpu\n"
 
 
-def test_a_switch_of_jax_that_is_none_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_switch_of_jax_that_is_none_is_named(tmp_path: Path) -> None:
     """`JAX_ENABLE_X64=maybe` was an internal error: JAX refuses it where it is imported; oracle: the line."""
-
-    def refusing(*_: object, **__: object) -> None:
-        raise ValueError("invalid truth value 'maybe' for environment 'JAX_ENABLE_X64'")
-
-    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", refusing)
-    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
-    assert result.exit_code == 2
+    command = [
+        sys.executable,
+        "-c",
+        "from vggtgeo.cli import main; main()",
+        "solve",
+        str(write(tmp_path)),
+        "-o",
+        "x.npz",
+    ]
+    environment = {**os.environ, "JAX_ENABLE_X64": "maybe"}
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
+    assert result.returncode == 2
     assert result.stderr == "error: the environment variable `JAX_ENABLE_X64` is `maybe`; JAX expects true or false\n"

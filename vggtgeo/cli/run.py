@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 REFINE = {None: "auto", True: "always", False: "never"}
 """The setting behind `--refine-intrinsics`, `--fix-intrinsics`, or neither."""
+MOST_FPS = 1e5
+"""Above those of any camera: times would be too near each other to tell frames apart."""
 
 
 def run(
@@ -140,10 +142,6 @@ def _is_map(file: Path) -> bool:
     except InputError:
         return False
     return True
-
-
-MOST_FPS = 1e5
-"""Above those of any camera: times would be too near each other to tell frames apart."""
 
 
 def check_flags(preset: str, features: str, memory_limit_gb: float | None, fps: float | None = None) -> None:

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
+
+from vggtgeo.geometry import rigid
 
 TANGENT = 6
 """Coordinates of a tangent."""
@@ -78,6 +81,12 @@ def log(pose: jaxlie.SE3) -> Float[Array, "*n 6"]:
 def boxminus(pose: jaxlie.SE3, base: jaxlie.SE3) -> Float[Array, "*n 6"]:
     """`log(T T_base^-1)`: the left tangent that moves `base` to `pose`."""
     return log(cast(pose @ base.inverse(), pose.wxyz_xyz.dtype))
+
+
+def steps(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The tangents that move poses [n, 4, 4] to others, float64 [n, 6]: `boxminus` of NumPy's matrices."""
+    motions = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(second @ rigid.invert(first))))
+    return np.asarray(log(motions), np.float64)
 
 
 def adjoint(pose: jaxlie.SE3) -> Float[Array, "*n 6 6"]:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import cv2
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
@@ -27,10 +26,9 @@ def camera_velocities(times: np.ndarray, truth: Trajectory) -> np.ndarray:
     after = np.clip(np.searchsorted(known, times, side="right"), 1, len(known) - 1)
     before = np.maximum(np.searchsorted(known, times, side="left") - 1, 0)
     poses = rigid.invert(truth.poses)
-    steps = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(poses[after] @ rigid.invert(poses[before]))))
     seconds = known[after] - known[before]
     near = (seconds > 0) & (seconds <= 6 * np.median(np.diff(known)))
-    return np.where(near[:, None], np.asarray(lie.log(steps)) / np.where(near, seconds, 1.0)[:, None], 0.0)
+    return np.where(near[:, None], lie.steps(poses[before], poses[after]) / np.where(near, seconds, 1.0)[:, None], 0.0)
 
 
 def rolled(frame: Frame, velocity: np.ndarray, intrinsics: tuple[float, ...], seconds: float) -> Frame:

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from scipy.stats import t as student_t
 
@@ -105,10 +104,9 @@ def frame_motions(slam: Slam) -> np.ndarray:
     near = lambda other: tracked[other] & (np.abs(times[other] - times) <= MOST_APART * frame_interval(slam))
     before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(times) - 1)
     before, after = np.where(near(before), before, rows), np.where(near(after), after, rows)
-    steps = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(poses[after] @ rigid.invert(poses[before]))))
     seconds = (times[after] - times[before])[:, None]
     still = np.zeros((len(times), lie.TANGENT))
-    return np.divide(np.asarray(lie.log(steps)), seconds, out=still, where=seconds > 0)
+    return np.divide(lie.steps(poses[before], poses[after]), seconds, out=still, where=seconds > 0)
 
 
 def frame_interval(slam: Slam) -> float:
@@ -190,7 +188,7 @@ def read_at_once(problem: Problem, shifts: Shifts, seconds: float, most: float) 
     coefficients = np.asarray(problem.lines.coefficients, np.float64)
     offset = coefficients[..., 2] + np.sum(coefficients[..., :2] * lines, -1)
     like = lambda values: jnp.asarray(values, problem.pixels.dtype)
-    changed = eqx.tree_at(
+    return eqx.tree_at(
         lambda p: (p.pixels, p.points.target, p.lines.coefficients),
         problem,
         (
@@ -199,7 +197,6 @@ def read_at_once(problem: Problem, shifts: Shifts, seconds: float, most: float) 
             like(np.concatenate([coefficients[..., :2], offset[..., None]], -1)),
         ),
     )
-    return changed
 
 
 def without_readout(

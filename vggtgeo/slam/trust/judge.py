@@ -20,7 +20,7 @@ from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
 from vggtgeo.slam.trust.sensor_drift import check_sensors
-from vggtgeo.slam.trust.shutter import check_shutter, read_at_once
+from vggtgeo.slam.trust.shutter import check_shutter, corners_at_once
 from vggtgeo.slam.trust.speed import check_speed
 from vggtgeo.slam.trust.steps import breaks, check_steps, steps
 from vggtgeo.slam.trust.still_points import check_parts, divide
@@ -39,7 +39,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     if slam.lens is not None:
         aligned = [noted.through(slam.lens) for noted in aligned]
     if len(aligned) == len(slam.frames):
-        aligned = read_at_once(slam, aligned)
+        aligned = corners_at_once(slam, aligned)
     known = frame_uncertainty(slam) if slam.keyframes else None
     found = [*input_findings, *check_record(estimate)]
     found += check_extent(estimate, None if known is None else known.translation)
