@@ -16,6 +16,9 @@ from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
+from vggtgeo.slam import calibration
+from vggtgeo.slam.calibration import keyframe_pairs
+from vggtgeo.slam.covisibility import Directed, directions
 from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
 from vggtgeo.slam.state import Readout
@@ -40,15 +43,24 @@ def some_motions(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(0.0, [0.4, 0.4, 0.4, 0.8, 0.8, 0.8], (KEYFRAMES, 6))
 
 
-def seen_later(pixels: np.ndarray, depth: np.ndarray, motion: np.ndarray, seconds: float, columns: bool) -> np.ndarray:
+def seen_later(
+    pixels: np.ndarray,
+    depth: np.ndarray,
+    motion: np.ndarray,
+    seconds: float,
+    columns: bool = False,
+    camera: np.ndarray = WINDOW.intrinsics,
+    size: tuple[int, int] = SIZE,
+) -> np.ndarray:
     """Where pixels [m, 2] at depths [m] come out under motions [m, 6] if rows are read one by one: by the exact motion,
     until the moment and the row belong to each other.
     """
-    fx, fy, cx, cy = WINDOW.intrinsics
+    fx, fy, cx, cy = camera
+    width, height = size
     places = np.c_[(pixels - [cx, cy]) / [fx, fy], np.ones(len(pixels))] * depth[:, None]
     seen = pixels
     for _ in range(20):
-        moment = (seen[:, 0] + 0.5) / WIDTH - 0.5 if columns else (seen[:, 1] + 0.5) / HEIGHT - 0.5
+        moment = (seen[:, 0] + 0.5) / width - 0.5 if columns else (seen[:, 1] + 0.5) / height - 0.5
         moved = np.asarray(lie.exp(jnp.asarray(seconds * moment[:, None] * motion)) @ jnp.asarray(places))
         seen = moved[:, :2] / moved[:, 2:] * [fx, fy] + [cx, cy]
     return seen
@@ -111,6 +123,51 @@ def test_what_is_taken_out_is_what_the_motion_put_in() -> None:
         expected, wrong, right = (np.asarray(residuals_at(p, truth)[name]) for p in (at_once, problem, repaired))
         assert np.abs(wrong - expected).max() > 3.0
         assert np.abs(right - expected).max() < 0.2  # of second order in the readout
+
+
+def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
+    """Matches that a readout has moved come back to where they are without it; oracle: the run that they are of, each
+    match moved by the exact motion of its image.
+    """
+    slam, seconds = recorded_run().slam, 0.03
+    by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
+    height, width = slam.keyframes[0].size
+    motions = dict(zip(by_number, some_motions(2), strict=False))
+    at = {"seconds": seconds, "camera": slam.intrinsics, "size": (width, height)}
+    edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
+    expected = keyframe_pairs(slam, edges)
+    usual = float(np.median(np.concatenate([pair.depth for pair in expected])))
+
+    def rolled_pixels(pixels: np.ndarray, inverse: np.ndarray, number: int) -> np.ndarray:
+        """As the image of that keyframe shows them; what has no depth is never asked."""
+        depth = 1 / np.where(np.isfinite(inverse) & (inverse > 0), inverse, 1 / usual)
+        return seen_later(pixels, depth, np.tile(motions[number], (len(pixels), 1)), **at)
+
+    def moved(edge: Directed) -> Directed:
+        host, target = by_number[edge.host], by_number[edge.target]
+        ray = np.c_[
+            (host.points.pixels[edge.slots] - slam.intrinsics[2:]) / slam.intrinsics[:2], np.ones(len(edge.slots))
+        ]
+        turned = target.pose @ rigid.invert(host.pose)
+        inverse = host.points.prior[edge.slots]
+        there = inverse / (ray @ turned[2, :3] + turned[2, 3] * inverse)
+        return replace(edge, pixels=rolled_pixels(edge.pixels, there, edge.target))
+
+    keyframes = tuple(
+        replace(k, points=replace(k.points, pixels=rolled_pixels(k.points.pixels, k.points.prior, k.number)))
+        for k in slam.keyframes
+    )
+    seen = replace(slam, keyframes=keyframes)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibration, "camera_motions", lambda _, room: np.stack([motions[n] for n in by_number])[:room])
+        wrong = keyframe_pairs(seen, [moved(edge) for edge in edges])
+        right = keyframe_pairs(replace(seen, readout=Readout(seconds, False, 0.0)), [moved(edge) for edge in edges])
+    for name in ("before", "after"):
+        true, disturbed, repaired = (
+            np.concatenate([getattr(pair, name) for pair in pairs]) for pairs in (expected, wrong, right)
+        )
+        assert np.abs(disturbed - true).max() > 3.0
+        assert np.abs(repaired - true).max() < 0.1 * np.abs(disturbed - true).max()  # of second order in the readout
 
 
 def test_images_that_are_read_at_once_have_none() -> None:

@@ -24,7 +24,7 @@ tracked and closed with the given ones, see `first_pass.py`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,6 +36,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera_gain import CHANCE, gain
 from vggtgeo.slam.camera_of_pairs import CameraOpinion, CameraPair, camera_of_pairs
 from vggtgeo.slam.covisibility import Directed
+from vggtgeo.slam.rolling_shutter import at_once, camera_motions, carried
 from vggtgeo.slam.state import Slam
 
 PRIOR = 0.01
@@ -139,8 +140,13 @@ def camera_held_at(problem: Problem, intrinsics: np.ndarray) -> Problem:
 
 
 def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
-    """Matches of keyframes with a depth that is no result of the camera: the measured one, else the estimate."""
+    """Matches of keyframes with a depth that is no result of the camera: the measured one, else the estimate.
+
+    Where they would be if each image were read at once: as they are, two clips of one camera (10 ms a readout) want 484
+    and 488 px, and without the readout 489 and 487.
+    """
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
+    motions = dict(zip(by_number, camera_motions(slam, len(slam.keyframes)), strict=True))
     found = []
     chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MOST_PAIRS).astype(int))
     for edge in (edges[row] for row in chosen if row < len(edges)):
@@ -152,8 +158,21 @@ def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
             continue
         relative = target.pose @ rigid.invert(host.pose)
         block = min(edge.host, edge.target) // BLOCK
-        found.append(CameraPair(before, after, 1.0 / inverse[known], relative, block))
+        pair = CameraPair(before, after, 1.0 / inverse[known], relative, block)
+        found.append(_pair_at_once(pair, slam, motions[edge.host], motions[edge.target]))
     return found
+
+
+def _pair_at_once(pair: CameraPair, slam: Slam, host: np.ndarray, target: np.ndarray) -> CameraPair:
+    """The pair without the readout that the run has found; host, target: how the camera moves in either image, [6]."""
+    camera, size = np.asarray(slam.intrinsics, np.float64), slam.keyframes[0].size
+    inverse = 1.0 / pair.depth
+    _, there = carried(pair.before[None], inverse[None], pair.relative[None], camera)
+    return replace(
+        pair,
+        before=at_once(pair.before, inverse, host, camera, size, slam.readout),
+        after=at_once(pair.after, there[0], target, camera, size, slam.readout),
+    )
 
 
 def _averaged(opinion: CameraOpinion, given: np.ndarray) -> tuple[np.ndarray, bool]:

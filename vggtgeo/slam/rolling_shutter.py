@@ -131,13 +131,13 @@ def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[
     for first in range(0, len(edges), AT_ONCE):
         part = slice(first, first + AT_ONCE)
         host, target = edges[part].T
-        seen, depth = _carried(pixels[host], inverse[host], poses[target] @ rigid.invert(poses[host]), camera)
+        seen, depth = carried(pixels[host], inverse[host], poses[target] @ rigid.invert(poses[host]), camera)
         points[part] = shift(matched[part], depth[:, :count], motions[target])
         lines[part] = shift(seen[:, count:], depth[:, count:], motions[target])
     return Shifts(shift(pixels, inverse, motions), points, lines)
 
 
-def _carried(
+def carried(
     pixels: np.ndarray, inverse: np.ndarray, relative: np.ndarray, camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [a, b, 2] and inverse depths [a, b] of landmarks as other cameras see them; relative: [a, 4, 4]."""
@@ -178,6 +178,22 @@ def image_shift(
         shift = moment[..., None] * velocity
     known = np.isfinite(shift).all(-1, keepdims=True) & (inverse > 0)[..., None]
     return np.clip(np.where(known, shift, 0.0), -FASTEST, FASTEST)
+
+
+def at_once(
+    pixels: np.ndarray,
+    inverse: np.ndarray,
+    motion: np.ndarray,
+    camera: np.ndarray,
+    size: tuple[int, int],
+    readout: Readout | None,
+) -> np.ndarray:
+    """Pixels [m, 2] of one image, where they would be at the middle of its readout; see `image_shift`."""
+    there = np.asarray(pixels, np.float64)
+    if readout is None:
+        return there
+    shift = image_shift(there[None], inverse[None], motion[None], camera, size, readout.columns)[0]
+    return np.asarray(there - readout.seconds * shift)
 
 
 def read_at_once(problem: Problem, shifts: Shifts, seconds: float, most: float) -> Problem:

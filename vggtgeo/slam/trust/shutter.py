@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from vggtgeo.slam.pose_uncertainty import median_depths
-from vggtgeo.slam.rolling_shutter import frame_motions, image_shift
+from vggtgeo.slam.rolling_shutter import at_once, frame_motions
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import FrameEvidence
@@ -36,11 +36,11 @@ def corners_at_once(slam: Slam, evidence: Sequence[FrameEvidence]) -> list[Frame
     depths = median_depths(slam)
     found = []
     for noted, motion, record in zip(evidence, frame_motions(slam), slam.frames, strict=True):
-        pixels, depth = noted.pixels.astype(np.float64), noted.depth.astype(np.float64)
+        depth = noted.depth.astype(np.float64)
         known = np.isfinite(depth) & (depth > 0) & slam.metric
         inverse = 1 / np.where(known, depth, depths[record.reference])
-        shift = image_shift(pixels[None], inverse[None], motion[None], intrinsics, size, readout.columns)[0]
-        found.append(replace(noted, pixels=(pixels - readout.seconds * shift).astype(np.float32)))
+        pixels = at_once(noted.pixels, inverse, motion, intrinsics, size, readout)
+        found.append(replace(noted, pixels=pixels.astype(np.float32)))
     return found
 
 
