@@ -127,6 +127,7 @@ IMAGES = rows(
         ("a file behind the PNG's end", image(bad.encoded(".png") + b"x" * 9999)),
         ("two JPEGs in one file: the first", image(bad.encoded(".jpg") * 2, ".jpg")),
         ("a PPM of 16 bits", image(b"P6 64 48 65535\n" + (PICTURE.astype(">u2") * 257).tobytes(), ".ppm")),
+        ("a PPM whose white is 100", image(b"P6 64 48 100\n" + (PICTURE // 3).tobytes(), ".ppm")),
         ("one pixel", image(bad.encoded(".png", PICTURE[:1, :1]))),
         ("a JPEG that is called .png", image(bad.encoded(".jpg"))),
         ("colour, grey and 16 bits mixed", beside(other_kinds)),

@@ -343,3 +343,13 @@ def test_images_are_used_as_they_are_stored(tmp_path: Path) -> None:
     assert twelve.bits == 12
     np.testing.assert_array_equal(twelve.image, picture)
     assert read_image_file(tmp_path / "twelve.png", 16).image.max() == 15  # beside images that use all 16 bits
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_ppm_says_what_white_is(tmp_path: Path, text: bool) -> None:
+    """Values up to 100, in a binary and in a text file, come out up to 255; oracle: the values."""
+    values = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3) % 101
+    header = f"P{3 if text else 6} # made by hand\n8 6\n100\n".encode()
+    content = " ".join(map(str, values.ravel())).encode() + b"\n" if text else values.tobytes()
+    (tmp_path / "white.ppm").write_bytes(header + content)
+    np.testing.assert_allclose(read_image_file(tmp_path / "white.ppm").image, values * 2.55, atol=1.0)

@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 
 from vggtgeo.datasets.image_defects import decoding_defect, defect
 from vggtgeo.datasets.image_orientation import as_stored, orientation
+from vggtgeo.datasets.image_sizes import declared_white
 from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
@@ -36,6 +37,7 @@ FIVE_THOUSANDTHS = DepthFormat(5000.0)
 """TUM RGB-D: 5000 is one metre."""
 
 
+WHITE = 255
 BITS = (8, 10, 12, 14, 16)
 """Bits that the values of a 16-bit file may have: cameras of 10 and 12 bits write such files, and never fill them."""
 
@@ -69,6 +71,8 @@ def read_image_file(path: Path, least_bits: int = 8) -> ImageFile:
         needed = max(int(image.max()).bit_length(), least_bits)
         bits = next(known for known in BITS if known >= needed)
         image = (image >> (bits - 8)).astype(np.uint8)
+    elif 0 < (white := declared_white(content)) < WHITE:  # OpenCV scales those of text files alone
+        image = cv2.convertScaleAbs(image, alpha=WHITE / white)
     return ImageFile(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), bits, orientation(content))
 
 

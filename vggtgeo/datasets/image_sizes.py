@@ -7,7 +7,9 @@ import struct
 
 from vggtgeo.datasets.tiff_tags import STARTS, tiff_tags
 
-_PNM = re.compile(rb"P[1-6]\s+(?:#[^\n]*\n\s*)*(\d{1,12})\s+(?:#[^\n]*\n\s*)*(\d{1,12})\s")
+_GAP = rb"\s+(?:#[^\n]*\n\s*)*"
+_PNM = re.compile(rb"P[1-6]" + _GAP + rb"(\d{1,12})" + _GAP + rb"(\d{1,12})\s")
+_PNM_WHITE = re.compile(rb"P[56]" + _GAP + rb"\d{1,12}" + _GAP + rb"\d{1,12}" + _GAP + rb"(\d{1,5})\s")
 _WIDTH, _HEIGHT = 256, 257
 
 
@@ -48,3 +50,9 @@ def declared_size(content: bytes) -> tuple[int, int]:
         return 0, 0
     plain = _PNM.match(content)
     return (int(plain[1]), int(plain[2])) if plain else (0, 0)
+
+
+def declared_white(content: bytes) -> int:
+    """The value that means white in a binary PGM or PPM, 1 to 65535; 0 in any other file."""
+    white = _PNM_WHITE.match(content)
+    return int(white[1]) if white else 0
