@@ -39,6 +39,7 @@ def test_a_cluster_that_is_not_there_is_told(tmp_path: Path) -> None:
         all_rows(tiny.jobs(), Store(tmp_path, "t", "s"), LIMITS, cluster=Cluster("127.0.0.1:9"), command=command)
 
 
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # Ray forks; its own processes import no JAX before
 @pytest.mark.slow  # starts three processes of Ray, half a minute
 def test_a_worker_that_is_killed_costs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that with a head and two worker nodes, one killed in the middle, every run is there once and every number

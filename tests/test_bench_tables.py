@@ -136,6 +136,12 @@ def test_other_systems_are_rows_of_their_own(tmp_path: Path) -> None:
     assert found["ate_sim3_m"] == pytest.approx(0.0, abs=1e-9)
     assert found["scale"] == pytest.approx(0.8)
     assert found["ate_se3_m"] > 0.1
+    assert found["rte_1s_m"] > 0.1
+    assert len(found["input_hash"]) == 16
+    (free,) = external_rows(
+        tiny.suite(tiny.TEXT + EXTERNAL + "metric = false\n"), tiny.jobs(), tmp_path / "out/runs", tmp_path
+    )
+    assert free["rte_1s_m"] == pytest.approx(0.0, abs=1e-9)
     (tmp_path / "other/walk.txt").write_text("nothing")
     (broken,) = external_rows(suite, tiny.jobs(), tmp_path / "out/runs", tmp_path)
     assert broken["status"] == "error"
@@ -248,10 +254,23 @@ def test_a_suite_without_any_result_has_a_page(tmp_path: Path) -> None:
     assert ablation_figure(tiny.suite(), rows) is not None
 
 
+def test_the_tables_say_what_makes_a_row_doubtful() -> None:
+    """A scale that cannot be stands in the tables, not only in `runs.csv`; rows that are no runs are not called so."""
+    good = row("walk", "full", 0, 0.01, warnings="the scale is 7")
+    gone = row("hall", "full", 0, None, status="absent")
+    other = row("walk", "other", 0, 0.02, external="a.txt")
+    text = markdown.page(tiny.suite(), [good, gone, other])
+    assert "## Warnings" in text
+    assert "| walk | full | 0 | the scale is 7 |" in text
+    assert "1 run, 1 more whose recording is not there, 1 of other systems." in text
+    assert "## Warnings" not in markdown.page(tiny.suite(), ROWS)
+
+
 def test_the_report_of_a_batch(tmp_path: Path) -> None:
     # Proves what `vggtgeo.bench` hands back, and its files.
     report = BenchReport(tiny.suite(), tuple(ROWS), tmp_path)
-    assert set(report.write(tmp_path)) >= {"report.html", "tables.md", "runs.csv"}
+    report.write(tmp_path)
+    assert {file.name for file in tmp_path.iterdir()} >= {"report.html", "tables.md", "runs.csv"}
     assert (tmp_path / "tables.md").read_text() == report.markdown()
     assert report.to_dict()["rows"][0]["sequence"] == "walk"
     assert "12 of 12 runs" in repr(report)
@@ -288,6 +307,18 @@ def test_the_command_runs_a_suite_and_prints_its_tables(tmp_path: Path, monkeypa
     assert "| full system | **1.40** | **1.40** | **1.40** |" in outcome.stdout
     listed = CliRunner().invoke(make_app(), ["bench", "list"])
     assert "The paper's tables, simulated" in listed.stdout
+
+
+def test_a_batch_in_which_nothing_has_a_result_ends_with_1(tmp_path: Path) -> None:
+    """As where no recording is there: a script must not take it for a success."""
+    (tmp_path / "none.toml").write_text(
+        'title = "t"\n[[sequence]]\nname = "a"\npath = "nowhere"\n[[setting]]\nname = "full"\n'
+    )
+    (tmp_path / "data").mkdir()
+    arguments = ["bench", str(tmp_path / "none.toml"), "-o", str(tmp_path / "out"), "--data", str(tmp_path / "data")]
+    outcome = CliRunner().invoke(make_app(), arguments)
+    assert outcome.exit_code == 1, outcome.output
+    assert "Not there: a" in outcome.stdout
 
 
 def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:

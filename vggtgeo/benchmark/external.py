@@ -7,8 +7,9 @@ from pathlib import Path
 
 from vggtgeo.benchmark.jobs import Job
 from vggtgeo.benchmark.measure import trajectory_errors
+from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.store import Row
-from vggtgeo.benchmark.suite import Suite
+from vggtgeo.benchmark.suite import ExternalTable, Suite
 from vggtgeo.datasets import open_sequence
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -26,18 +27,19 @@ def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> 
             file = base / table.files.format(sequence=job.sequence, seed=job.seed)
             if file.is_file():
                 places.setdefault(file, job)
-        found += [_row(suite, table.name, job, file, runs) for file, job in places.items()]
+        found += [_row(suite, table, job, file, runs) for file, job in places.items()]
     return found
 
 
-def _row(suite: Suite, name: str, job: Job, file: Path, runs: Path) -> Row:
-    row = {"suite": suite.name, "sequence": job.sequence, "setting": name, "seed": job.seed, "external": str(file)}
+def _row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -> Row:
+    row = {"suite": suite.name, "sequence": job.sequence, "setting": table.name, "seed": job.seed}
+    row |= {"external": str(file), "input_hash": input_hash(file), "metric": table.metric}
     row |= {"protocol": job.spec["protocol"], "status": "ok", "simulated": bool(job.spec["simulate"])}
     try:
         truth = _truth(job, runs)
         if truth is None:
             return {**row, "status": "error", "message": "there is no truth to compare with"}
-        errors, _ = trajectory_errors(Trajectory.load_tum(file), truth)
+        errors, _ = trajectory_errors(Trajectory.load_tum(file), truth, table.metric)
     except InputError as error:
         return {**row, "status": "error", "message": str(error)}
     return {**row, **errors}

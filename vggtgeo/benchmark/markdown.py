@@ -22,6 +22,8 @@ def page(suite: Suite, rows: Sequence[Row]) -> str:
         if cells.differences(suite, good):
             parts += [f"## Against {suite.title_of(suite.base)}", _DIFFERENCES, differences(suite, good)]
         parts += ["## Each sequence and setting", details(suite, good)]
+    if any(row.get("warnings") for row in good):
+        parts += ["## Warnings", doubts(good)]
     if len(good) < len(rows):
         parts += ["## Without a result", failures(rows)]
     for name in suite.published:
@@ -45,9 +47,19 @@ def notice(suite: Suite, rows: Sequence[Row]) -> str:
     }.get(frozenset(kinds), "")
     roles = "Perception is simulated, too: stubs of the five roles with stated error models. "
     stubs = roles if any(row.get("perception") == "simulated" for row in rows) else ""
-    count = f"{len(rows)} runs" if len(rows) != 1 else "1 run"
     seeds = f"Seeds from {suite.first_seed}; mean ± standard deviation over seeds."
-    return f"{kind}{stubs}Suite `{suite.name}`, {count}. {seeds} Protocol {cells.protocol_text(rows)}."
+    return f"{kind}{stubs}Suite `{suite.name}`, {_count(rows)}. {seeds} Protocol {cells.protocol_text(rows)}."
+
+
+def _count(rows: Sequence[Row]) -> str:
+    """How many runs there are, and what else the rows are."""
+    others = sum("external" in row for row in rows)
+    absent = sum(row["status"] == "absent" for row in rows)
+    runs = len(rows) - others - absent
+    parts = [f"{runs} runs" if runs != 1 else "1 run"]
+    parts += [f"{absent} more whose recording is not there"] * bool(absent)
+    parts += [f"{others} of other systems"] * bool(others)
+    return ", ".join(parts)
 
 
 def accuracy(suite: Suite, rows: Sequence[Row], column: cells.Column) -> str:
@@ -84,6 +96,12 @@ def details(suite: Suite, rows: Sequence[Row]) -> str:
         for sequence, setting, own in groups
     ]
     return table(["sequence", "setting", "runs", "tracked", *(column.head for column in shown), "verdict"], lines)
+
+
+def doubts(rows: Sequence[Row]) -> str:
+    """What makes the errors of a run doubtful: few poses that match, a scale that cannot be."""
+    names = ("sequence", "setting", "seed", "warnings")
+    return table(names, [[str(row[name]) for name in names] for row in rows if row.get("warnings")])
 
 
 def failures(rows: Sequence[Row]) -> str:

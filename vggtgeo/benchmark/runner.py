@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
 
+OUTPUTS = ("report.html", "tables.md", "runs.csv", "runs.parquet")
+"""What a suite leaves in its folder; the last where PyArrow is there."""
 Progress = Callable[[int, int, Row], None]
 """Called after each run with the number of those that are done, the number of all, and the row."""
 
@@ -57,17 +60,13 @@ class BenchReport:
         """The name of the suite and every row, as plain values."""
         return {"suite": self.suite.name, "rows": [dict(row) for row in self.rows]}
 
-    def write(self, folder: Path) -> list[str]:
-        """`report.html`, `tables.md`, `runs.csv`, and `runs.parquet` where PyArrow is there; the names of the files."""
+    def write(self, folder: Path) -> None:
+        """The files of `OUTPUTS`."""
         write_text(folder / "tables.md", self.markdown())
         write_text(folder / "runs.csv", self.csv())
         write_page(folder / "report.html", self.suite, self.rows, self.folder)
-        names = ["report.html", "tables.md", "runs.csv"]
-        try:
+        with suppress(InputError):
             write_parquet(folder / "runs.parquet", self.rows)
-        except InputError:
-            return names
-        return [*names, "runs.parquet"]
 
     def __repr__(self) -> str:
         good = sum(row["status"] == "ok" for row in self.rows)

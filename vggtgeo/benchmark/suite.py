@@ -45,6 +45,9 @@ class CheckedTable:
         for key in values:
             if key not in known:
                 raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
+        lacks = [f"`{name}`" for name, entry in known.items() if name not in values and _is_required(entry)]
+        if lacks:
+            raise InputError(f"{where} lacks {', '.join(lacks)}")
         for key, value in values.items():
             expected = _PLAIN.get(str(known[key].type))
             if expected is not None and type(value) not in expected[0]:
@@ -54,8 +57,10 @@ class CheckedTable:
             return cls(**plain)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
-        except TypeError as error:
-            raise InputError(f"{where}: {str(error).partition('() ')[2] or error}") from None
+
+
+def _is_required(entry: dataclasses.Field[Any]) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,9 +161,12 @@ class SettingTable(RowTable):
 
 @dataclass(frozen=True, kw_only=True)
 class ExternalTable(RowTable):
-    """`[[external]]`: trajectories of another system. files: TUM format; `{sequence}` and `{seed}` stand for both."""
+    """`[[external]]`: trajectories of another system. files: TUM format; `{sequence}` and `{seed}` stand for both.
+    metric: whether their lengths are metres; else relative errors are taken after Sim(3), as of runs without depth.
+    """
 
     files: str
+    metric: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

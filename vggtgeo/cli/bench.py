@@ -44,8 +44,12 @@ def bench(
     quiet: Annotated[bool, typer.Option("--quiet/--no-quiet", help="Print the tables only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a suite of sequences, settings and seeds, and write its tables and its page."""
+    """Run a suite of sequences, settings and seeds, and write its tables and its page.
+
+    Exit code 1: no run has a result.
+    """
     from vggtgeo.benchmark.cluster import Cluster
+    from vggtgeo.benchmark.runner import OUTPUTS
     from vggtgeo.benchmark.runner import bench as run_suite  # brings JAX, which --help does without
     from vggtgeo.benchmark.suite import load_suite, shipped
 
@@ -74,7 +78,9 @@ def bench(
         )
     typer.echo(json.dumps(report.to_dict()) if as_json else report.markdown())
     if not (quiet or as_json):
-        typer.echo(f"in {folder}: report.html tables.md runs.csv", err=True)
+        typer.echo(f"in {folder}: {' '.join(name for name in OUTPUTS if (folder / name).is_file())}", err=True)
+    if not any(row["status"] == "ok" for row in report.rows):
+        raise typer.Exit(1)
 
 
 class _Bar:
@@ -108,7 +114,8 @@ def _line(row: Row) -> str:
     error = row.get("ate_se3_m") if row.get("metric") else row.get("ate_sim3_m")
     text = "" if error is None else f" ATE {100 * error:.2f} cm after {'SE(3)' if row.get('metric') else 'Sim(3)'},"
     simulated = " (simulated)" if row.get("simulated") else ""
-    return f"{name}:{text} {row['tracked']}/{row['frames']} frames, {row['verdict']}{simulated}"
+    doubts = f"; {row['warnings']}" if row.get("warnings") else ""
+    return f"{name}:{text} {row['tracked']}/{row['frames']} frames, {row['verdict']}{simulated}{doubts}"
 
 
 def _list(text: str | None) -> list[str] | None:
