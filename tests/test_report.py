@@ -54,7 +54,8 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     """The text of the page of this run, or of a changed state of it."""
     slam = slam or run.slam
     truth = run.sequence.ground_truth()
-    report = evaluate_trajectory(frame_trajectory(slam), truth)
+    path = frame_trajectory(slam)
+    report = evaluate_trajectory(path, truth) if len(path) else None
     facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
     verdict = options.setdefault("verdict", Verdict("good"))
     settings, seconds = {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}
@@ -72,6 +73,16 @@ def _deep(slam: Slam) -> bool:
 @pytest.fixture(scope="module")
 def run() -> RecordedRun:
     return recorded_run()
+
+
+def test_a_run_that_was_found_nowhere_in_a_known_map_has_a_page(run: RecordedRun, tmp_path: Path) -> None:
+    """Localised only, and in another place: keyframes and a map, and no frame with a pose. All is written but the
+    path; it ended in an error after all the work.
+    """
+    nowhere = replace(run.slam, frames=tuple(replace(record, tracked=False) for record in run.slam.frames))
+    page = _page(run, tmp_path, nowhere, truth=None)
+    assert "No frame has a pose." in page
+    assert "The map seen from" not in page
 
 
 def test_every_adjustment_is_recorded_once(run: RecordedRun) -> None:

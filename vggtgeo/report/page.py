@@ -104,7 +104,7 @@ def write_page(
         verdict_line=VERDICT_LINES[verdict.level],
         timeline=_timeline(verdict),
         warnings=[*warnings, *slam.notes],
-        trajectory=figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric),
+        trajectory=_path_drawn(slam, trajectory, truth),
         has_truth=truth is not None,
         residuals=figures.residuals_svg(records) if records else None,
         map_above=_map_picture(map_view.from_above, cloud, trajectory),
@@ -122,6 +122,13 @@ def write_page(
         scale_basis=summary.get("scale_basis"),
     )
     write_text(path, text)
+
+
+def _path_drawn(slam: Slam, trajectory: Trajectory, truth: Trajectory | None) -> str:
+    """Empty where no frame has a pose: one that is sought in a map that is known may be in another place."""
+    if not len(trajectory):
+        return ""
+    return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric)
 
 
 def template(package: str, name: str) -> jinja2.Template:
@@ -219,7 +226,7 @@ def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: fl
 
 
 def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | None:
-    return figures.picture(view(cloud, trajectory), 900) if len(cloud) > 100 else None
+    return figures.picture(view(cloud, trajectory), 900) if len(cloud) > 100 and len(trajectory) else None
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
