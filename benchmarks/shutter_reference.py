@@ -24,10 +24,11 @@ import numpy as np
 import pycolmap
 
 from vggtgeo.evaluation.alignment import umeyama
-from vggtgeo.geometry import lie, rigid
+from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.mapping.tracks import Tracks
 from vggtgeo.results.scene import Scene
+from vggtgeo.simulation.rolling_rows import camera_velocities
 from vggtgeo.slam.rolling_shutter import image_shift
 
 SOFT = 2.0
@@ -60,7 +61,7 @@ def main() -> None:
         reference = _scaled_like(reference, Trajectory.load_tum(options.scale_from))
     rows = np.abs(reference.timestamps[None] - scene.timestamps[:, None]).argmin(1)
     poses = rigid.invert(reference.poses)
-    motions = _motions(reference.timestamps, poses)[rows]
+    motions = camera_velocities(reference.timestamps[rows], reference)
     own = Model(scene.poses, scene.tracks, scene.intrinsics)
     begun = Model(poses[rows], _brought(own, poses[rows]), scene.intrinsics)
     count = f"{len(rows)} keyframes, {len(scene.tracks)} points, {len(scene.tracks.point)} observations"
@@ -129,13 +130,6 @@ def _brought(model: Model, poses: np.ndarray) -> Tracks:
     """The tracks of a model where other poses of its keyframes are, by Sim(3)."""
     moved = umeyama(model.centres, rigid.invert(poses)[:, :3, 3], with_scale=True)
     return replace(model.tracks, points=moved.points(model.tracks.points))
-
-
-def _motions(times: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Tangents of world -> camera, a second, by the frames beside each, float64 [n, 6]."""
-    rows = np.arange(len(times))
-    before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(rows) - 1)
-    return np.asarray(lie.steps(poses[before], poses[after]) / (times[after] - times[before])[:, None])
 
 
 def _scaled_like(trajectory: Trajectory, metric: Trajectory) -> Trajectory:

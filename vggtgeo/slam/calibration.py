@@ -37,7 +37,7 @@ from vggtgeo.slam.camera_gain import CHANCE, gain
 from vggtgeo.slam.camera_of_pairs import CameraOpinion, CameraPair, camera_of_pairs
 from vggtgeo.slam.covisibility import Directed
 from vggtgeo.slam.rolling_shutter import at_once, camera_motions, carried
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state import Readout, Slam
 
 PRIOR = 0.01
 """Standard deviation of a given calibration, relative to the focal length: what makers and calibration tools reach."""
@@ -146,7 +146,8 @@ def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
     and 488 px, and without the readout 489 and 487.
     """
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
-    motions = dict(zip(by_number, camera_motions(slam, len(slam.keyframes)), strict=True))
+    readout = slam.readout
+    motions = {} if readout is None else dict(zip(by_number, camera_motions(slam, len(by_number)), strict=True))
     found = []
     chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MOST_PAIRS).astype(int))
     for edge in (edges[row] for row in chosen if row < len(edges)):
@@ -159,19 +160,27 @@ def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
         relative = target.pose @ rigid.invert(host.pose)
         block = min(edge.host, edge.target) // BLOCK
         pair = CameraPair(before, after, 1.0 / inverse[known], relative, block)
-        found.append(_pair_at_once(pair, slam, motions[edge.host], motions[edge.target]))
+        if readout is not None:
+            pair = _at_once(pair, motions[edge.host], motions[edge.target], slam.intrinsics, host.size, readout)
+        found.append(pair)
     return found
 
 
-def _pair_at_once(pair: CameraPair, slam: Slam, host: np.ndarray, target: np.ndarray) -> CameraPair:
-    """The pair without the readout that the run has found; host, target: how the camera moves in either image, [6]."""
-    camera, size = np.asarray(slam.intrinsics, np.float64), slam.keyframes[0].size
+def _at_once(
+    pair: CameraPair,
+    host: np.ndarray,
+    target: np.ndarray,
+    camera: np.ndarray,
+    size: tuple[int, int],
+    readout: Readout,
+) -> CameraPair:
+    """The pair without a readout; host, target: how the camera moves in either image, [6]."""
     inverse = 1.0 / pair.depth
     _, there = carried(pair.before[None], inverse[None], pair.relative[None], camera)
     return replace(
         pair,
-        before=at_once(pair.before, inverse, host, camera, size, slam.readout),
-        after=at_once(pair.after, there[0], target, camera, size, slam.readout),
+        before=at_once(pair.before, inverse, host, camera, size, readout),
+        after=at_once(pair.after, there[0], target, camera, size, readout),
     )
 
 

@@ -186,12 +186,10 @@ def at_once(
     motion: np.ndarray,
     camera: np.ndarray,
     size: tuple[int, int],
-    readout: Readout | None,
+    readout: Readout,
 ) -> np.ndarray:
     """Pixels [m, 2] of one image, where they would be at the middle of its readout; see `image_shift`."""
     there = np.asarray(pixels, np.float64)
-    if readout is None:
-        return there
     shift = image_shift(there[None], inverse[None], motion[None], camera, size, readout.columns)[0]
     return np.asarray(there - readout.seconds * shift)
 
