@@ -6,6 +6,7 @@ import numpy as np
 from witness import SIZE
 
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
+from vggtgeo.slam.trust.change_of_sides import check_sides
 from vggtgeo.slam.trust.depth_agreement import check_depth, depth_ratios
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import FrameEvidence
@@ -24,6 +25,11 @@ def found_by_steps(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Fi
 def found_by_parts(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:
     """Parts of the picture that stand still, or move on their own."""
     return check_parts(estimate, [divide(step) for step in steps(estimate, evidence)])
+
+
+def found_by_sides(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:
+    """Poses that leave what they had explained for what they had not."""
+    return list(check_sides(estimate, steps(estimate, evidence)))
 
 
 def found_by_depth(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:

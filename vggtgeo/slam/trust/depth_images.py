@@ -28,12 +28,14 @@ PLAUSIBLE = (0.5, 6.5)
 """Metres, of the median over all frames of their median depth."""
 
 
-def check_frozen(evidence: Evidence, harmless: bool) -> list[Finding]:
-    """Depth images that are repeated while the picture moves.
+def check_frozen(estimate: Estimate, evidence: Evidence, harmless: bool) -> list[Finding]:
+    """Depth images that are repeated while the picture moves, where they were used.
 
     harmless: whether depth and motion agree all the same, as they do where the camera hardly moves: then it marks the
     segment only.
     """
+    if not estimate.metric:  # all beyond its range, say, which is the same all the time
+        return []
     moved = np.array([0.0, *(_flow(a, b) for a, b in pairwise(evidence))])
     with np.errstate(invalid="ignore"):
         frozen = (np.array([frame.depth_changed for frame in evidence]) < LEAST_CHANGED) & (moved > MOVED)

@@ -10,6 +10,7 @@ from vggtgeo.slam.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.blind import check_blind, cuts
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
+from vggtgeo.slam.trust.change_of_sides import check_sides
 from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.enlargement import check_enlargements
@@ -60,11 +61,12 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
     wrong = breaks(estimate, evidence, taken)
     yield from check_speed(estimate, cuts(estimate, evidence, taken))
     yield from check_steps(estimate, taken, wrong)
+    yield from check_sides(estimate, taken)
     yield from check_blind(estimate, evidence, taken)
     yield from check_parts(estimate, [divide(step) for step in taken])
     ratios = depth_ratios(estimate, evidence)
     yield from check_depth(estimate, ratios)
-    yield from check_frozen(evidence, harmless=agree(ratios))
+    yield from check_frozen(estimate, evidence, harmless=agree(ratios))
     yield from check_range(estimate, evidence)
     sound = np.ones(len(estimate), bool)
     for part in wrong:

@@ -47,11 +47,14 @@ MOST_WRONG = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step's corners: pixels before and after float64 [m, 2], whether each agrees with the poses bool [m]."""
+    """One step's corners: pixels before and after float64 [m, 2], whether each agrees with the poses bool [m], number
+    of its track int32 [m].
+    """
 
     before: np.ndarray
     after: np.ndarray
     agrees: np.ndarray
+    ids: np.ndarray
 
     @property
     def flow(self) -> np.ndarray:
@@ -86,7 +89,7 @@ def compare(
         off = np.where(known, np.linalg.norm(near - after, axis=1), _from_half_line(after, far, near))
         parallax = np.where(known, np.linalg.norm(near - far, axis=1), 0.0)
         agrees = off < 3 * np.hypot(NOISE, DEPTH_NOISE * parallax)
-    return Step(before, after, agrees)
+    return Step(before, after, agrees, first.ids[rows])
 
 
 def between(estimate: Estimate, evidence: Evidence, row: int, other: int) -> Step:
