@@ -25,6 +25,7 @@ from vggtgeo.results.summary import pieces
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import compile_global, expected_keyframes
+from vggtgeo.slam.connected import piece_of
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.global_shape import padded_count, shape_for
 from vggtgeo.slam.loops import close_loops
@@ -372,6 +373,23 @@ def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
     np.testing.assert_allclose(times[1], np.arange(8) / 10)
     assert [piece["poses"] for piece in told] == [len(own) for own in times]
     assert told[1]["frames"] == [0, 7]
+
+
+def test_back_from_a_jump_the_window_is_of_one_piece(room) -> None:
+    """Back where the map began after a jump that began a piece of its own: keyframes of that piece, whose place is a
+    guess, are not matched with those of the first, which lines alone would tie to it.
+    """
+    frames, camera, _ = room
+    other = simulate("room", 2000, 0, SIZE, rate=10.0)
+    elsewhere = [other.frame(60 + i) for i in range(14)]
+    seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:8], *elsewhere, *frames[7:16]))]
+    slam = _run(seen, camera)
+    assert len(slam.origins) == 2, slam.notes
+    assert any("found again" in note for note in slam.notes), slam.notes
+    assert slam.keyframes[-1].frame > 22, "a keyframe was made after the return"
+    assert len(set(piece_of(slam)[list(slam.window)])) == 1
+    jumped = {keyframe.number for keyframe in slam.keyframes if 8 <= keyframe.frame < 22}
+    assert not [pair.key for pair in slam.pairs if len(jumped & set(pair.key)) == 1]
 
 
 def test_a_frame_of_another_size_is_named(room) -> None:

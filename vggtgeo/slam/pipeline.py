@@ -11,6 +11,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.connected import piece_of
 from vggtgeo.slam.covisibility import without_matches
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence
@@ -248,9 +249,13 @@ def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
 
 
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
-    """A window of the keyframes around an old one, held where it is: the camera has come back to it."""
-    low = max(max((origin for origin in slam.origins if origin <= number), default=0), number - NEIGHBOURS)
-    window = tuple(range(low, min(number + NEIGHBOURS + 1, len(slam.keyframes))))[-(settings.window.size - 1) :]
+    """A window of the keyframes around an old one, held where it is: the camera has come back to it.
+
+    Those of its own piece: the place of another is a guess, by which matches would be found that mean nothing.
+    """
+    label = piece_of(slam)
+    around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
+    window = tuple(other for other in around if label[other] == label[number])[-(settings.window.size - 1) :]
     # Without metric depth one held pose leaves the unit free: two hold it.
     held = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
     return replace(slam, window=window, prior=None, solved=None, held=held)
