@@ -9,6 +9,7 @@ from typing import Any
 
 import bad_files as bad
 import numpy as np
+import tiny_layouts as layouts
 import tiny_sequences as tiny
 from bad_row import Row, read_frames, rows, solve_with
 
@@ -140,6 +141,8 @@ IMAGES = rows(
         ("a folder of other files", lambda folder: bad.file("a/notes.txt", "")(folder).parent),
         ("a single image", bad.file("a.png", bad.encoded(".png"))),
         ("an animated GIF", bad.file("a.gif", b"GIF89a" + NUL)),
+        ("a recording of Record3D", lambda folder: layouts.record3d_file(folder / "room.r3d")),
+        ("one camera of a raw drive of KITTI", lambda folder: layouts.kitti_raw(folder) / "image_02"),
     ],
     call=read_frames,
 )

@@ -1,8 +1,11 @@
 """Runs on a real Ray cluster of this machine: a head and two workers, one of them killed in the middle."""
 
+import json
 import os
+import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -10,8 +13,8 @@ import pytest
 import tiny_suites as tiny
 from conftest import ROOT
 
-from vggtgeo.benchmark.cluster import Cluster
-from vggtgeo.benchmark.processes import Limits
+from vggtgeo.benchmark.cluster import Cluster, run_remotely
+from vggtgeo.benchmark.processes import Limits, claimed
 from vggtgeo.benchmark.runner import all_rows
 from vggtgeo.benchmark.store import Store
 from vggtgeo.io.errors import InputError
@@ -37,6 +40,55 @@ def test_a_cluster_that_is_not_there_is_told(tmp_path: Path) -> None:
     # Proves one line for a wrong address, or for a package that is not installed.
     with pytest.raises(InputError, match=r"no Ray cluster at|needs Ray"):
         all_rows(tiny.jobs(), Store(tmp_path, "t", "s"), LIMITS, cluster=Cluster("127.0.0.1:9"), command=command)
+
+
+def test_runs_of_a_node_have_processors_of_their_own(tmp_path: Path) -> None:
+    # Proves that runs at once on a node are held to as many processors as they were promised, each its own, as runs in
+    # processes are, and to none where all are taken. Oracle: what the run itself may use.
+    there = sorted(os.sched_getaffinity(0))
+    code = "import os, pathlib, sys; pathlib.Path(sys.argv[1], 'cores.txt').write_text(str(os.sched_getaffinity(0)))"
+    prints = lambda folder, scratch: [sys.executable, "-S", "-E", "-c", code, str(folder)]
+    job = json.dumps(Store(tmp_path, "t", "s").described(tiny.jobs()[0]))
+    with claimed(1) as first:
+        assert len(first) == 1
+        _, files = run_remotely(job, LIMITS, prints, 1.0)
+        used = set(map(int, files["cores.txt"].decode().strip("{}").split(",")))
+        assert used == ({there[1]} if len(there) > 1 else set(there))
+        with claimed(len(there)) as too_many:
+            assert too_many == ()
+    with claimed(len(there)) as again:
+        assert again == tuple(there)
+
+
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")
+@pytest.mark.slow  # starts two clusters of Ray, one after the other
+def test_a_driver_that_dies_goes_on_where_it_was(tmp_path: Path) -> None:
+    # Proves that after SIGKILL of a driver on a cluster a second call does the rest only, and that no finished run is
+    # lost or done twice. Oracle: the times at which the finished rows were written; a batch in processes.
+    pytest.importorskip("ray", reason="Ray is not installed")
+    code = (
+        f"import sys; sys.path[:0] = [{str(ROOT / 'tests')!r}, {str(ROOT)!r}]\n"
+        "import tiny_suites as tiny\nfrom pathlib import Path\nfrom test_bench_cluster import LIMITS, command\n"
+        "from vggtgeo.benchmark.cluster import Cluster\nfrom vggtgeo.benchmark.runner import all_rows\n"
+        "from vggtgeo.benchmark.store import Store\n"
+        f"store = Store(Path({str(tmp_path / 'wild')!r}), 't', 's')\n"
+        "all_rows(tiny.jobs(), store, LIMITS, cluster=Cluster('local'), command=command)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT), *sys.path])}
+    driver = subprocess.Popen([sys.executable, "-c", code], env=environment)
+    while len(list(tmp_path.glob("wild/runs/*/row.json"))) < 4:
+        assert driver.poll() is None
+        time.sleep(0.02)
+    driver.kill()
+    driver.wait()
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.glob("wild/runs/*/row.json")}
+    assert 4 <= len(written) < 12
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=120)
+    assert {path: path.stat().st_mtime_ns for path in written} == written
+    rows = all_rows(tiny.jobs(), Store(tmp_path / "wild", "t", "s"), LIMITS, command=command)
+    calm = all_rows(tiny.jobs(), Store(tmp_path / "calm", "t", "s"), LIMITS, workers=2, command=command)
+    numbers = lambda rows: [(row["status"], row["fingerprint"], row["ate_se3_m"]) for row in rows]
+    assert numbers(rows) == numbers(calm)
 
 
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # Ray forks; its own processes import no JAX before

@@ -16,6 +16,7 @@ import tiny_suites as tiny
 from conftest import ROOT
 
 from vggtgeo.benchmark.processes import Limits, run_limited, shares
+from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.runner import all_rows
 from vggtgeo.benchmark.store import Store
 from vggtgeo.io.errors import InputError
@@ -83,8 +84,9 @@ def test_processors_are_shared_out() -> None:
 
 
 def test_every_run_leaves_a_row_whatever_becomes_of_it(tmp_path: Path) -> None:
-    # Proves that a crash, a hang and an exception are rows with their reasons, that the other runs are not touched, and
-    # that a second call runs nothing. Oracle: a worker made to fail on some jobs; the list of starts.
+    # Proves that a crash, a hang and an exception are rows with their reasons and where they come from (versions,
+    # commit, machine, settings), that the other runs are not touched, and that a second call
+    # runs nothing. Oracle: a worker made to fail on some jobs; the list of starts; the provenance of this process.
     before = """
 if job["setting"] == "bare" and job["seed"] == 0 and job["sequence"] == "walk": raise ValueError("no such lines")
 if job["setting"] == "bare" and job["seed"] == 1 and job["sequence"] == "walk": os.kill(os.getpid(), 6)
@@ -97,6 +99,10 @@ if job["setting"] == "bare" and job["seed"] == 2 and job["sequence"] == "walk": 
     assert "ValueError: no such lines" in found["walk", "bare", 0]["message"]
     assert "SIGABRT" in found["walk", "bare", 1]["message"]
     assert found["walk", "bare", 2]["status"] == "timeout"
+    for row in rows:
+        assert row.items() >= provenance().items(), row["status"]
+        assert row["status"] == "ok" or "use_lines" in row["settings"]
+        assert row["simulated"] is True
     starts = (tmp_path / "starts.txt").read_text()
     assert _without_time(all_rows(tiny.jobs(), store, limits, command=tiny.worker())) == _without_time(rows)
     assert (tmp_path / "starts.txt").read_text() == starts

@@ -7,13 +7,14 @@ import pytest
 import tiny_sequences
 import tiny_suites as tiny
 
-from vggtgeo.benchmark.inputs import find_sequence
+from vggtgeo.benchmark.inputs import find_sequences
 from vggtgeo.benchmark.jobs import jobs_of
 from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.provenance import input_hash, source_digest
 from vggtgeo.benchmark.published import published
+from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.suite import limited, load_suite, read_suite, shipped
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 WANTED = {"paper", "tum", "7scenes", "euroc", "replica", "tanks", "simulated", "stress", "quick", "clips"}
 
@@ -27,7 +28,7 @@ def test_every_suite_that_comes_along_can_be_read() -> None:
         assert suite.title
         assert len({job.name for job in jobs_of(suite, ())}) == len(jobs_of(suite, ()))
         for table in suite.published:
-            assert published(table).rows
+            assert all(published(table).lines())
 
 
 def test_the_paper_is_what_it_was() -> None:
@@ -112,15 +113,35 @@ def test_a_part_of_a_suite_keeps_what_belongs_together() -> None:
 
 
 def test_a_recording_is_found_below_any_data_folder(tmp_path: Path) -> None:
-    # Proves that a benchmark's own folder may lie in between, and that what is absent is None, no error.
+    # Proves that a benchmark's own folder may lie in between, that this is told, with what else has
+    # that name; what is absent is no error.
     tiny_sequences.tum(tmp_path / "b" / "tum" / "fr1" / "desk")
     folders = (tmp_path / "a", tmp_path / "b")
-    assert find_sequence("fr1/desk", folders) == (tmp_path / "b" / "tum" / "fr1" / "desk").resolve()
-    assert find_sequence("desk", folders) == (tmp_path / "b" / "tum" / "fr1" / "desk").resolve()
-    assert find_sequence("xyz", folders) is None
+    assert find_sequences("fr1/desk", folders) == [(tmp_path / "b" / "tum" / "fr1" / "desk").resolve()]
+    assert find_sequences("desk", folders) == [(tmp_path / "b" / "tum" / "fr1" / "desk").resolve()]
+    assert find_sequences("xyz", folders) == []
     text = tiny.TEXT.replace('simulate = { scene = "hall", frames = 4 }', 'path = "desk"')
-    assert [job.present for job in jobs_of(read_suite(text, "t", "t"), folders)][-1]
-    assert not tiny.jobs(text)[-1].present
+    with pytest.warns(
+        InputWarning, match=rf"found below the folders of recordings: hall in `{tmp_path}/b/tum/fr1/desk`$"
+    ):
+        jobs = jobs_of(read_suite(text, "t", "t"), folders)
+    assert jobs[-1].present
+    assert jobs_of(read_suite(text, "t", "t"), [tmp_path / "b" / "tum" / "fr1"])[-1].present  # just there: no word
+    tiny_sequences.tum(tmp_path / "b" / "older" / "desk")
+    several = r"hall in `.*/b/older/desk` \(the first of 2, with `.*/b/tum/fr1/desk`\)"
+    with pytest.warns(InputWarning, match=several):
+        assert jobs_of(read_suite(text, "t", "t"), folders)[-1].spec["path"].endswith("older/desk")
+
+
+def test_a_recording_that_is_not_there_is_told_where_it_was_looked_for(tmp_path: Path) -> None:
+    # Proves that the row says which folder was expected where, and what to do where no folder was given.
+    text = tiny.TEXT.replace('simulate = { scene = "hall", frames = 4 }', 'path = "desk"')
+    job = jobs_of(read_suite(text, "t", "t"), [tmp_path])[-1]
+    assert not job.present
+    expected = f"no `desk` in `{tmp_path}`, nor one or two folders below"
+    assert Store(tmp_path / "out", "t", "s").absent(job)["message"] == expected
+    alone = Store(tmp_path / "out", "t", "s").absent(tiny.jobs(text)[-1])
+    assert alone["message"] == "no `desk`, as no folder of recordings is known: give `--data FOLDER`"
 
 
 def test_protocols_say_whose_they_are() -> None:

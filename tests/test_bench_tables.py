@@ -175,12 +175,20 @@ def test_published_figures_have_source_and_protocol_and_stand_apart() -> None:
     table = published("tum-freiburg1")
     assert table.source
     assert table.protocol
-    assert table.rows["ORB-SLAM3"][0] is None
+    assert table.rows["ORB-SLAM3"][0] == "lost"
     text = markdown.page(tiny.suite(tiny.TEXT.replace("seeds = 3", 'seeds = 3\npublished = ["tum-freiburg1"]')), ROWS)
     before, _, after = text.partition("## Published by others")
     assert "DROID-SLAM" not in before
     assert "| DROID-SLAM (uncalibrated)* | 0.202 |" in after
     assert "Not measured here" in after
+    lost = (
+        "| ORB-SLAM3 | lost | 0.017 | 0.21 | lost | 0.034 | lost | lost | lost | 0.009 | C. Campos et al., ORB-SLAM3: "
+    )
+    assert lost in after
+    assert "`-`" not in after
+    other = markdown.published_table(published("averages"))
+    assert "| SLAM3R* | - | 0.066 | Y. Liu et al., SLAM3R" in other
+    assert "`-`: not published." in other
     with pytest.raises(InputError, match="there is no published table `x`"):
         published("x")
 
@@ -240,6 +248,8 @@ def test_the_page_holds_everything_and_loads_nothing(tmp_path: Path) -> None:
         "+4.00 ± 2.48",
         "Time and memory",
         "Published by others",
+        "0.022",
+        "Z. Teed, J. Deng, DROID-SLAM",
         "crash",
     ):
         assert wanted in page.text, wanted

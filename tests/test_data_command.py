@@ -1,6 +1,7 @@
 """`vggtgeo data`: the list of recordings, and sentences about what is wrong with one."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -120,6 +121,23 @@ def test_what_is_wrong_is_a_sentence(tmp_path: Path, spoil, message: str) -> Non
     outcome = CliRunner().invoke(make_app(), ["data", "check", str(folder), "--json"])
     assert outcome.exit_code == 2
     assert json.loads(outcome.stdout)["problems"] == list(found.problems)
+
+
+@pytest.mark.parametrize(("kind", "what"), [("rgb", "images"), ("depth", "depth images")])
+def test_missing_files_are_counted_over_all(tmp_path: Path, kind: str, what: str) -> None:
+    # Proves that files that are listed and not there are counted over the whole recording and named as missing, in one
+    # sentence, and that what is there is still looked at. Oracle: a recording of which 98 of 101 are taken away.
+    folder = _good(tmp_path / "desk", 101)
+    for number, file in enumerate(sorted((folder / kind).iterdir())):
+        if number % 50:
+            file.unlink()
+    found = inspect(folder)
+    (problem,) = found.problems
+    assert problem.startswith(f"98 of 101 {what} that are listed are not there: `{folder}/{kind}/10.1")
+    assert "101 frames of 40 x 30" in found.facts
+    shutil.rmtree(folder / "depth")
+    gone = next(text for text in inspect(folder).problems if "depth" in text)
+    assert "none of the 101 depth images is there: " in gone
 
 
 def test_what_cannot_be_opened_is_told_too(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import MAX_TIME_DIFFERENCE, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 app = typer.Typer()
 app.command()(evaluate)
@@ -83,6 +83,55 @@ def test_what_the_user_gave_wrong_is_an_input_error(tmp_path: Path) -> None:
         result = CliRunner().invoke(app, [str(estimate), str(truth)])
         assert isinstance(result.exception, InputError)
         assert message in str(result.exception)
+
+
+def _walk(seed: int, turning: bool, begin: float = 0.0) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[:, :3, 3] = rng.normal(scale=0.05, size=(200, 3)).cumsum(axis=0)
+    if turning:
+        poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(scale=0.03, size=(200, 3)).cumsum(axis=0)).as_matrix()
+    return Trajectory(begin + np.arange(200) / 30, poses)
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        (_walk(2, turning=True), "explains the true rotations no better than a camera that stands still"),
+        (_walk(2, turning=False), "explains the true path hardly better than a camera that stands still"),
+        (_walk(1, turning=True, begin=6.5), "only 5 of 200 poses match"),
+        (_walk(1, turning=True, begin=9.0), None),
+    ],
+    ids=["another, turning", "another, not turning", "five match", "none match"],
+)
+def test_the_truth_of_another_sequence_is_no_success(tmp_path: Path, truth: Trajectory, said: str | None) -> None:
+    # Proves that nothing that can be compared never ends with 0: a sentence, and 3, or an error where not three poses
+    # match. Oracle: two random walks; a script that looks at the exit code.
+    _walk(1, turning=True).save_tum(tmp_path / "trajectory.txt")
+    truth.save_tum(tmp_path / "truth.txt")
+    arguments = [str(tmp_path / "trajectory.txt"), str(tmp_path / "truth.txt"), "--json"]
+    if said is None:
+        assert isinstance(CliRunner().invoke(app, arguments).exception, InputError)
+        return
+    with pytest.warns(InputWarning) as warned:
+        outcome = CliRunner().invoke(app, arguments)
+    assert outcome.exit_code == 3
+    assert any(said in str(one.message) for one in warned), [str(one.message) for one in warned]
+    assert "NOT COMPARABLE" in outcome.stderr
+    assert "ate_se3_m" in json.loads(outcome.stdout)
+
+
+def test_an_estimate_without_scale_or_of_a_part_is_a_success(tmp_path: Path) -> None:
+    # Proves that what can be compared ends with 0: in another unit, and over a tenth of the sequence.
+    truth = _walk(1, turning=True)
+    truth.save_tum(tmp_path / "truth.txt")
+    scaled = truth.poses.copy()
+    scaled[:, :3, 3] *= 20
+    for estimate in (Trajectory(truth.timestamps, scaled), truth.select(slice(0, 20))):
+        estimate.save_tum(tmp_path / "trajectory.txt")
+        outcome = CliRunner().invoke(app, [str(tmp_path / "trajectory.txt"), str(tmp_path / "truth.txt")])
+        assert outcome.exit_code == 0, outcome.output
+        assert "warning: " in outcome.output
 
 
 def test_a_run_of_free_scale_has_no_errors_in_metres(tmp_path: Path) -> None:

@@ -22,7 +22,8 @@ STAIR = (
     ("figures",),
     ("report",),
     ("results",),
-    ("benchmark", "export", "learning", "viewing"),
+    ("export", "learning", "viewing"),
+    ("benchmark",),
     ("cli",),
 )
 """Packages of `vggtgeo`, the lowest first: each imports of those below it; those of one step nothing of each other."""

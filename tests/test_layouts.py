@@ -174,12 +174,64 @@ def test_tanks_and_temples(tmp_path: Path) -> None:
     assert inside_crop(folder / "Ignatius.json", points).tolist() == [True, False, False, True, False]
 
 
+@pytest.mark.parametrize("lists", ["rgb.txt depth.txt associated.txt", "rgb.txt depth.txt", "associated.txt"])
+def test_eth3d_slam(tmp_path: Path, lists: str) -> None:
+    # Proves that ETH3D's SLAM benchmark is read as it is downloaded: the folder's camera, 5000 per metre, times, truth
+    # at times of its own; with `associated.txt` alone, too. Oracle: what was written.
+    folder = tiny.eth3d(tmp_path / "cables_1")
+    for name in {"rgb.txt", "depth.txt", "associated.txt"} - set(lists.split()):
+        (folder / name).unlink()
+    sequence = open_sequence(folder)
+    frames = _check(sequence, "TumRgbd")
+    assert [frame.timestamp for frame in frames] == pytest.approx([3894.207, 3894.2439, 3894.2808])
+    assert [frame.depth[3, 7] for frame in frames] == pytest.approx([1007 / 5000, 1017 / 5000, 1027 / 5000])
+    assert sequence.camera.known
+    assert sequence.camera.distortion == ()
+    truth = sequence.ground_truth()
+    np.testing.assert_allclose(truth.timestamps[[0, -1]], [3894.22, 3894.26])
+    assert truth.positions[:, 0].tolist() == [0, 1, 2, 3, 4]
+
+
 def test_kitti(tmp_path: Path) -> None:
     # Proves the rectified camera, times, and that the grey camera's poses are moved to the colour camera. Oracle: 6 cm.
     sequence = _open(tiny.kitti(tmp_path / "dataset"))
     frames = _check(sequence, "Kitti")
     assert frames[2].timestamp == pytest.approx(0.2074)
     np.testing.assert_allclose(sequence.ground_truth().positions[:, 0], [-0.06, 0.94, 1.94])
+
+
+def test_kitti_raw(tmp_path: Path) -> None:
+    # Proves that a raw drive is read with its day's calibration and times, the colour camera first, and says that GPS
+    # and IMU are left alone; of an unrectified one, the camera as it was calibrated. Oracle: what was written.
+    place = tiny.kitti_raw(tmp_path)
+    with pytest.warns(InputWarning, match="the GPS and IMU in `oxts` are not used: there is no truth"):
+        sequence = open_sequence(place)
+    frames = _check(sequence, "Kitti")
+    assert [frame.timestamp for frame in frames] == pytest.approx([0, 0.0125, 0.025], abs=1e-6)
+    assert sequence.camera.known
+    assert sequence.ground_truth() is None
+    for file in place.rglob("data/*.png"):
+        tiny_sequences.write_image(file, tiny_sequences.image(0, 48, 34))
+    raw = _open(place).camera
+    assert raw.intrinsics == pytest.approx((40.0, 41.0, 19.5, 14.5))
+    assert raw.distortion == pytest.approx((-0.369, 0.197, 0.001, 0.0006, -0.07))
+
+
+def test_a_part_of_a_raw_drive_is_named(tmp_path: Path) -> None:
+    # Proves that one camera's folder of a raw drive, or its points alone, is told from any folder.
+    place = tiny.kitti_raw(tmp_path)
+    for part in (place / "oxts", place / "image_02", place.parent):
+        with pytest.raises(InputError, match=r"of KITTI's raw recordings; give the folder of a drive"):
+            open_sequence(part)
+
+
+@pytest.mark.parametrize("write", [tiny.record3d, tiny.record3d_file])
+def test_record3d_is_named(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    # Proves that a recording of Record3D, packed or not, is told by its name, with what to do.
+    with pytest.raises(
+        InputError, match=r"is a recording of Record3D, whose depth .LZFSE. is not read; .*`depth/0.png`"
+    ):
+        open_sequence(write(tmp_path / "room.r3d"))
 
 
 def test_arkit_scenes(tmp_path: Path) -> None:

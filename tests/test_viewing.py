@@ -20,11 +20,14 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tiny_suites
 from conftest import ROOT
 from recorded_run import RecordedRun, recorded_run
 from typer.testing import CliRunner
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
+from vggtgeo.benchmark.page import write_page
+from vggtgeo.benchmark.worker import recorded
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
@@ -74,6 +77,27 @@ def recording(run: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Pat
     callback.on_finish(run.slam, run.cloud)
     stream.disconnect()
     return path
+
+
+def test_a_run_of_a_batch_leaves_its_recording_where_one_is_asked_for(run: RecordedRun, tmp_path: Path) -> None:
+    """Beside what the result writes, which takes older recordings away, and only where asked for; the page of the
+    batch links to it. Oracle: rerun's own reader.
+    """
+    place = tmp_path / "runs/walk.full.0"
+    place.mkdir(parents=True)
+    with recorded(place, False) as callbacks:
+        assert callbacks == ()
+    text = tiny_suites.TEXT.replace("seeds = 3", "recordings = true")
+    assert [job.spec["recordings"] for job in (tiny_suites.jobs(text)[0], tiny_suites.jobs()[0])] == [True, False]
+    with recorded(place, True) as callbacks:
+        for slam in run.states:
+            callbacks[0].on_frame(slam, run.frames[slam.frames[-1].frame])
+        callbacks[0].on_finish(run.slam, run.cloud)
+        assert not list(place.iterdir())
+    assert "/world/trajectory" in entities_of(place / "run.rrd")
+    row = {"suite": "tiny", "sequence": "walk", "setting": "full", "seed": 0, "status": "ok", "protocol": "every-frame"}
+    write_page(tmp_path / "report.html", tiny_suites.suite(text), [row], tmp_path)
+    assert '<a href="runs/walk.full.0/run.rrd">recording</a>' in (tmp_path / "report.html").read_text()
 
 
 def test_the_recording_holds_every_entity(recording: Path) -> None:

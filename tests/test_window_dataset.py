@@ -103,6 +103,20 @@ def test_loaders_take_it_as_it_is(folder: Path) -> None:
     assert batches[0].problem.points.weight.shape[0] == 2
 
 
+def test_grain_takes_it_as_it_is(folder: Path) -> None:
+    # Proves that grain's loader shuffles and batches the data set: every window once an epoch, stacked as `batches`
+    # stacks it. Oracle: the labels, and the windows themselves.
+    grain = pytest.importorskip("grain.python", reason="grain is not installed")
+    data = WindowDataset.open(folder)
+    loaded = grain.MapDataset.source(data).shuffle(seed=3).batch(1, batch_fn=stacked)
+    seeds = [int(batch.labels["seed"][0]) for batch in loaded]
+    assert sorted(seeds) == list(range(COUNT))
+    assert seeds != list(range(COUNT))
+    expected = stacked([data[seeds[0]]])
+    for a, b in zip(jax.tree.leaves(loaded[0].problem), jax.tree.leaves(expected.problem), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_windows_of_another_shape_are_refused(tmp_path: Path) -> None:
     # Proves that what could not be stacked is refused when it is written, and that a folder without its index is no
     # data set.

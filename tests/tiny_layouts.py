@@ -1,6 +1,8 @@
 """Tiny recordings in the layouts of the benchmarks, as they are downloaded; see `tiny_sequences` for their contents."""
 
 import json
+import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -8,6 +10,7 @@ import numpy as np
 from tiny_sequences import HEIGHT, INTRINSICS, WIDTH, depth_codes, image, pose, tum_line, write_image
 
 COUNT = 3
+POSES = tuple(pose(number) for number in range(COUNT))
 YAW = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -15,12 +18,12 @@ def _matrix(values: np.ndarray) -> str:
     return "\n".join(" ".join(f"{value:.9f}" for value in row) for row in values) + "\n"
 
 
-def replica(folder: Path) -> Path:
+def replica(folder: Path, poses: Sequence[np.ndarray] = POSES) -> Path:
     """A room of NICE-SLAM's Replica, its camera beside it; depth in 1 / 6553.5 m."""
-    for number in range(COUNT):
+    for number in range(len(poses)):
         write_image(folder / f"results/frame{number:06d}.jpg", image(number))
         write_image(folder / f"results/depth{number:06d}.png", depth_codes(number))
-    (folder / "traj.txt").write_text("".join(" ".join(map(str, pose(n).ravel())) + "\n" for n in range(COUNT)))
+    (folder / "traj.txt").write_text("".join(" ".join(map(str, one.ravel())) + "\n" for one in poses))
     fx, fy, cx, cy = INTRINSICS
     camera = {"w": WIDTH, "h": HEIGHT, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "scale": 6553.5}
     (folder.parent / "cam_params.json").write_text(json.dumps({"camera": camera}))
@@ -98,12 +101,12 @@ def icl(folder: Path) -> Path:
     return folder
 
 
-def tanks(folder: Path) -> Path:
+def tanks(folder: Path, poses: Sequence[np.ndarray] = POSES) -> Path:
     """A scene with its log, its alignment to the scanner (twice as large, moved along z) and its crop."""
     log = []
-    for number in range(COUNT):
+    for number, one in enumerate(poses):
         write_image(folder / f"{number + 1:06d}.jpg", image(number))
-        log.append(f"{number} {number} 0\n" + _matrix(pose(number)))
+        log.append(f"{number} {number} 0\n" + _matrix(one))
     (folder / f"{folder.name}_COLMAP_SfM.log").write_text("".join(log))
     alignment = np.diag([2.0, 2.0, 2.0, 1.0])
     alignment[2, 3] = 5.0
@@ -111,6 +114,26 @@ def tanks(folder: Path) -> Path:
     corners = [[0, 0, 0], [2, 0, 0], [2, 0, 2], [1, 0, 1], [0, 0, 2]]
     crop = {"orthogonal_axis": "Y", "axis_min": -1.0, "axis_max": 1.0, "bounding_polygon": corners}
     (folder / f"{folder.name}.json").write_text(json.dumps(crop))
+    return folder
+
+
+def eth3d(folder: Path) -> Path:
+    """A training sequence of ETH3D SLAM, its mono and its RGB-D archive unpacked over each other: colour and depth of
+    one time, 5000 per metre; truth of 100 poses a second that begins later than the images.
+    """
+    rgb, depth, both = [], [], []
+    for number in range(COUNT):
+        time = f"{3894.207 + 0.0369 * number:.6f}"
+        write_image(folder / f"rgb/{time}.png", image(number))
+        write_image(folder / f"depth/{time}.png", depth_codes(number))
+        rgb.append(f"{time} rgb/{time}.png\n")
+        depth.append(f"{time} depth/{time}.png\n")
+        both.append(f"{time} rgb/{time}.png {time} depth/{time}.png\n")
+    for name, lines in (("rgb", rgb), ("depth", depth), ("associated", both)):
+        (folder / f"{name}.txt").write_text("".join(lines))
+    (folder / "calibration.txt").write_text(" ".join(map(str, INTRINSICS)))
+    truth = [tum_line(3894.22 + 0.01 * number, number) for number in range(5)]
+    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(truth))
     return folder
 
 
@@ -127,6 +150,48 @@ def kitti(folder: Path) -> Path:
     (folder / "poses").mkdir()
     (folder / "poses/07.txt").write_text("".join(" ".join(map(str, pose(n)[:3].ravel())) + "\n" for n in range(COUNT)))
     return place
+
+
+def kitti_raw(folder: Path) -> Path:
+    """A synced and rectified drive of KITTI's raw recordings, its calibration in the folder of the day, and GPS/IMU."""
+    place = folder / "2011_09_26" / "2011_09_26_drive_0001_sync"
+    times = [f"2011-09-26 13:02:25.{964389445 + number * 100_000_000 // 8:09d}\n" for number in range(COUNT)]
+    for number in range(COUNT):
+        for camera in ("image_00", "image_02"):
+            write_image(place / f"{camera}/data/{number:010d}.png", image(number))
+            (place / camera / "timestamps.txt").write_text("".join(times))
+    (place / "oxts/data").mkdir(parents=True)
+    (place / "oxts/data/0000000000.txt").write_text("49.0 8.4 112.8\n")
+    (place / "oxts/timestamps.txt").write_text("".join(times))
+    fx, fy, cx, cy = INTRINSICS
+    (place.parent / "calib_cam_to_cam.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\n"
+        f"S_02: {WIDTH + 8:e} {HEIGHT + 4:e}\n"
+        f"K_02: {fx + 5:e} 0 {cx:e} 0 {fy + 5:e} {cy:e} 0 0 1\n"
+        "D_02: -0.369 0.197 0.001 0.0006 -0.07\n"
+        f"S_rect_02: {WIDTH:e} {HEIGHT:e}\n"
+        f"P_rect_02: {fx:e} 0 {cx:e} {0.06 * fx:e} 0 {fy:e} {cy:e} 0 0 0 1 0\n"
+    )
+    return place
+
+
+def record3d(folder: Path) -> Path:
+    """A recording of the app Record3D, unpacked; its depth is compressed with LZFSE, which is not read."""
+    for number in range(COUNT):
+        write_image(folder / f"rgbd/{number}.jpg", image(number))
+        (folder / f"rgbd/{number}.depth").write_bytes(b"bvx2" + bytes(40))
+    matrix = [INTRINSICS[0], 0, 0, 0, INTRINSICS[1], 0, *INTRINSICS[2:], 1]
+    (folder / "metadata").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fps": 60, "K": matrix, "poses": []}))
+    return folder
+
+
+def record3d_file(path: Path) -> Path:
+    """The same as the app shares it: a zip archive."""
+    place = record3d(path.with_suffix(".made"))
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in place.rglob("*"):
+            archive.write(file, file.relative_to(place))
+    return path
 
 
 def arkit(folder: Path) -> Path:

@@ -37,6 +37,12 @@ DETAILS = (
     Column("depth RMSE cm", "depth_rmse_m", 100.0),
     Column("AbsRel %", "depth_abs_rel", 100.0),
     Column("F-score %", "f_score", 100.0, 1, 1),
+    Column("precision %", "precision", 100.0, 1, 1),
+    Column("recall %", "recall", 100.0, 1, 1),
+    Column("mesh F-score %", "mesh_f_score", 100.0, 1, 1),
+    Column("depth < 1.25 %", "depth_below_1_25", 100.0, 1, 1),
+    Column("NEES place", "nees_place", 1.0, 2, 0),
+    Column("NEES rotation", "nees_rotation", 1.0, 2, 0),
     Column("frames/s", "frames_per_second", 1.0, 1, 0),
     Column("memory GB", "peak_memory_gb", 1.0, 2, 0),
 )

@@ -8,6 +8,7 @@ whose worker or node is gone. Recordings must lie under the same path on every n
 from __future__ import annotations
 
 import json
+import math
 import socket
 import tempfile
 import time
@@ -17,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.jobs import Job
-from vggtgeo.benchmark.processes import Limits, run_limited
+from vggtgeo.benchmark.processes import Limits, claimed, run_limited
+from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.scheduling import Command, Finished, described, worker_command
 from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import JOB, LOG, ROW
@@ -81,7 +83,8 @@ def run_remotely(job: str, limits: Limits, command: Command, cpus: float) -> tup
         scratch.mkdir()
         (place / JOB).write_text(job, encoding="utf-8")
         began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        ending = run_limited(command(place, scratch), place / LOG, limits)
+        with claimed(math.ceil(cpus)) as cores:  # Ray counts processors, and gives none
+            ending = run_limited(command(place, scratch), place / LOG, limits, cores)
         files = [path for path in sorted(place.iterdir()) if path.is_file() and path.stat().st_size <= LARGEST_FILE]
         contents = {path.name: path.read_bytes() for path in files if not path.name.startswith(".")}
     return {**described(ending, contents.get(LOG, b"")), "started": began, "cpus": cpus}, contents
@@ -93,9 +96,10 @@ def _taken(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[str, Any
     try:
         ending, contents = ray.get(reference)
     except ray.exceptions.RayError as error:
-        message = str(error).strip().splitlines()
+        lines = str(error).strip().splitlines()
+        message = f"the cluster gave it up: {lines[0] if lines else error!r}"
         return store.complete(
-            job, status="crash", message=f"the cluster gave it up: {message[0] if message else error!r}"
+            job, status="crash", message=message, **{**provenance(), "machine": "a node that is gone"}
         )
     for name, content in contents.items():
         if name not in (JOB, ROW):

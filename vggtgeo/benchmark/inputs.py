@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.benchmark.exact_frames import ExactFrames, RecordedFrames
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence, without_depth
 from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -45,29 +47,31 @@ def data_folders(given: Iterable[str | os.PathLike[str]] | None) -> tuple[Path, 
     return tuple(Path(name).expanduser() for name in named if name and Path(name).expanduser().is_dir())
 
 
-def find_sequence(path: str, folders: Iterable[Path]) -> Path | None:
-    """The first of `folder / path` that is there, also with one or two folders in between; None where none is."""
+def find_sequences(path: str, folders: Iterable[Path]) -> list[Path]:
+    """All of `folder / path` that are there, also with one or two folders in between, the one to take first."""
     wanted = Path(path).expanduser()
     if wanted.is_absolute():
-        return wanted if wanted.exists() else None
-    for folder in folders:
-        for level in _LEVELS:
-            parents = [folder] if not level else sorted(folder.glob(level))
-            for parent in parents:
-                if (parent / wanted).exists():
-                    return (parent / wanted).resolve()
-    return None
+        return [wanted.resolve()] if wanted.exists() else []
+    parents = (
+        parent
+        for folder in folders
+        for level in _LEVELS
+        for parent in ([folder] if not level else sorted(folder.glob(level)))
+    )
+    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if (parent / wanted).exists()))
 
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """sequence: what the run reads. perception: who looks at it. oracle: the exact truth of a rendered walk, where
-    what is read is what was rendered. simulated: nothing was recorded.
+    """sequence: what the run reads. perception: who looks at it. exact: the depth and poses that its surfaces are known
+    by, of a walk that is read as it was rendered, or of a recording whose depth is exact. scan: of a scene that was
+    scanned, too. simulated: nothing was recorded.
     """
 
     sequence: Sequence
     perception: Perception
-    oracle: SimulatedOracle | None = None
+    exact: ExactFrames | None = None
+    scan: TanksAndTemples | None = None
     simulated: bool = False
 
     @property
@@ -82,18 +86,23 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
     scratch: a folder of this user alone, where a walk that is rendered is kept for the next run on it.
     """
     if not spec["simulate"]:
-        sequence = _without(open_sequence(spec["path"], spec["kind"]), spec)
-        return Input(sequence, _perceived(spec, sequence.has_depth))
+        recorded = open_sequence(spec["path"], spec["kind"])
+        sequence = _without(recorded, spec)
+        exact = RecordedFrames.of(recorded) if spec["exact_depth"] else None
+        scan = recorded if isinstance(recorded, TanksAndTemples) else None
+        return Input(sequence, _perceived(spec, sequence.has_depth), exact, scan)
     rendered = _rendered(spec["simulate"], seed, scratch)
     if spec["perception"] == "simulated":
         if spec["degrade"] != "base":
             raise InputError(
                 "simulated roles know the images that were rendered; leave `degrade` out, or use real ones"
             )
-        return Input(rendered, Perception(simulated_roles(rendered.oracle, spec, seed), {}), rendered.oracle)
+        return Input(
+            rendered, Perception(simulated_roles(rendered.oracle, spec, seed), {}), rendered.oracle, simulated=True
+        )
     if spec["degrade"] == "base":
         sequence = _without(rendered, spec)
-        return Input(sequence, _perceived(spec, sequence.has_depth), rendered.oracle)
+        return Input(sequence, _perceived(spec, sequence.has_depth), rendered.oracle, simulated=True)
     sequence = _without(degraded(rendered, spec["degrade"], seed), spec)
     return Input(sequence, _perceived(spec, sequence.has_depth), simulated=True)
 
@@ -223,18 +232,3 @@ def _perceived(spec: Mapping[str, Any], has_depth: bool) -> Perception:
     if spec["perception"] == "simulated":
         raise InputError("`perception` is 'simulated', which needs a rendered walk: a sequence with `simulate`")
     return perception(spec["perception"], classical_roles(has_depth, start, spec["features"]))
-
-
-def exact_cloud(oracle: SimulatedOracle, most: int = 30, step: int = 4) -> np.ndarray:
-    """World points of the surfaces that the walk saw, float64 [n, 3]: every `step`-th pixel of `most` frames."""
-    fx, fy, cx, cy = oracle.camera.intrinsics
-    count = len(oracle.sequence)
-    clouds = []
-    for index in np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)):
-        depth = oracle.depth(int(index))[::step, ::step]
-        v, u = np.nonzero(np.isfinite(depth))
-        z = depth[v, u]
-        local = np.column_stack([(step * u - cx) / fx * z, (step * v - cy) / fy * z, z])
-        pose = np.linalg.inv(oracle.pose(int(index)))
-        clouds.append(local @ pose[:3, :3].T + pose[:3, 3])
-    return np.concatenate(clouds)

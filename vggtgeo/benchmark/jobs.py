@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.benchmark.inputs import find_sequence
+from vggtgeo.benchmark.inputs import find_sequences
 from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.suite import SequenceTable, SettingTable, Suite
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import Tables, changed, updated
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run. spec: what it depends on, plain values; `path` in it is None where the recording is not there."""
+    """One run. spec: what it depends on, plain values; `path` in it is None where the recording is not there. absent:
+    says so, and where it was looked for.
+    """
 
     sequence: str
     setting: str
     seed: int
     spec: Mapping[str, Any]
     input_hash: str = ""
+    absent: str = ""
 
     @property
     def name(self) -> str:
@@ -46,11 +51,16 @@ class Job:
 
 
 def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
-    """All runs of a suite, sequence by sequence; recordings are looked for in the folders `data`."""
+    """All runs of a suite, sequence by sequence; recordings are looked for in the folders `data`, and an InputWarning
+    says which of them were found in folders below those.
+    """
     roots = tuple(data)
+    places = {one.name: find_sequences(one.path, roots) if one.path else [] for one in suite.sequence}
+    _tell_deeper(suite, places, roots)
     found = []
     for sequence in suite.sequence:
-        place = find_sequence(sequence.path, roots) if sequence.path else None
+        place = next(iter(places[sequence.name]), None)
+        absent = _absent(sequence.path, roots) if place is None else ""
         digest = "" if place is None else input_hash(place)
         settings = [table for table in suite.setting if not table.sequences or sequence.name in table.sequences]
         specs = {setting.name: _spec(suite, sequence, setting, place) for setting in settings}
@@ -58,8 +68,30 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
         for seed in range(suite.first_seed, suite.first_seed + count):
             for setting in settings:
                 if seed - suite.first_seed < (setting.seeds or suite.seeds):
-                    found.append(Job(sequence.name, setting.name, seed, specs[setting.name], digest))
+                    found.append(Job(sequence.name, setting.name, seed, specs[setting.name], digest, absent))
     return found
+
+
+def _tell_deeper(suite: Suite, places: Mapping[str, Sequence[Path]], roots: Iterable[Path]) -> None:
+    """A folder of the same name, deep in others, may be another recording than the one that was meant."""
+    told = []
+    for one in suite.sequence:
+        there = places[one.name]
+        wanted = Path(one.path).expanduser()
+        if not there or wanted.is_absolute() or there[0] in [(root / wanted).resolve() for root in roots]:
+            continue
+        rest = ", ".join(f"`{other}`" for other in there[1:])
+        told.append(f"{one.name} in `{there[0]}`" + (f" (the first of {len(there)}, with {rest})" if rest else ""))
+    if told:
+        warnings.warn(f"found below the folders of recordings: {'; '.join(told)}", InputWarning, stacklevel=3)
+
+
+def _absent(path: str, roots: Sequence[Path]) -> str:
+    if Path(path).expanduser().is_absolute():
+        return f"`{path}` is not there"
+    if not roots:
+        return f"no `{path}`, as no folder of recordings is known: give `--data FOLDER`"
+    return f"no `{path}` in {', '.join(f'`{root}`' for root in roots)}, nor one or two folders below"
 
 
 def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: Path | None) -> dict[str, Any]:
@@ -83,8 +115,10 @@ def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: P
         "key_points": sequence.key_points,
         "references": dict(sequence.references),
         "threshold": sequence.threshold,
+        "exact_depth": sequence.exact_depth,
         "set": _plain(changed(settings)),
         "pages": suite.pages,
+        "recordings": suite.recordings,
     }
 
 

@@ -122,16 +122,11 @@ def failures(rows: Sequence[Row]) -> str:
 
 def published_table(given: PublishedTable) -> str:
     """Figures of others, apart from the suite's own."""
-    heads = ["system", *given.columns]
-    mark = lambda name: f"{name}*" if name in given.uncalibrated else name
-    lines = [
-        [mark(name), *("" if number is None else f"{number:g}" for number in numbers)]
-        for name, numbers in given.rows.items()
-    ]
     note = " `*`: not given the intrinsics." if given.uncalibrated else ""
+    note += " `-`: not published." if any(None in numbers for numbers in given.rows.values()) else ""
     return (
         f"## Published by others: {given.title}\n\nNot measured here; {given.unit}. Source: {given.source}. Protocol: "
-        f"{given.protocol}.{note}\n\n{table(heads, lines)}"
+        f"{given.protocol}.{note}\n\n{table(['system', *given.columns, 'paper'], given.lines())}"
     )
 
 

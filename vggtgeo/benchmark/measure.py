@@ -9,16 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.benchmark.inputs import Input, exact_cloud
-from vggtgeo.evaluation import (
-    DepthError,
-    Similarity,
-    TrajectoryReport,
-    cloud_error,
-    depth_error,
-    evaluate_trajectory,
-    focal_error,
-)
+from vggtgeo.benchmark.inputs import Input
+from vggtgeo.benchmark.map_errors import depth_errors, map_errors
+from vggtgeo.evaluation import Similarity, TrajectoryReport, evaluate_trajectory, focal_error, pose_consistency
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.results import Result
@@ -27,7 +20,6 @@ DELTAS: tuple[tuple[str, float, str], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0
 """Of RTE and RRE: the name in the columns, how far, and its unit."""
 _AROUND = 0.02
 """Seconds before the first and after the last frame in which the truth still belongs to the run."""
-_DEPTH_MAPS = 40  # keyframes whose dense depth is compared, evenly spaced: more changes the mean by little
 
 
 def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str, Any]:
@@ -57,10 +49,28 @@ def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str,
         reference = Trajectory.load_tum(Path(spec["path"]) / file)
         found, _ = trajectory_errors(estimate, reference, metric=False)
         row[f"ate_sim3_{name}_m"] = found.get("ate_sim3_m")
-    row |= depth_errors(result, given, alignment)
-    if given.oracle is not None and alignment is not None and len(result.cloud):
-        row |= cloud_errors(alignment.points(result.cloud.points.astype(np.float64)), given, spec["threshold"])
+    if truth is not None and alignment is not None:
+        row |= honesty(result, truth, row["scale"])
+        row |= depth_errors(result, given, alignment) | map_errors(result, given, alignment, spec)
     return {name: _plain(value) for name, value in row.items()}
+
+
+def honesty(result: Result, truth: Trajectory, scale: float, max_dt: float = 0.01) -> dict[str, Any]:
+    """The mean NEES of places and of rotations, over their three numbers each: 1 where the deviations that the run
+    states are those of its errors, more where they are too small. scale: of the Sim(3) alignment, which lengths of a
+    run without metres are taken by.
+    """
+    stated = result.uncertainty
+    if stated is None:
+        return {}
+    factor = 1.0 if result.metric else scale
+    try:
+        found = pose_consistency(
+            result.trajectory, truth, factor * stated.translation, stated.rotation, factor, max_dt=max_dt
+        )
+    except InputError:
+        return {}
+    return {name: one.mean / one.degrees for name, one in zip(("nees_place", "nees_rotation"), found, strict=True)}
 
 
 def truth_of_run(result: Result, truth: Trajectory | None) -> Trajectory | None:
@@ -109,55 +119,6 @@ def _relative(report: TrajectoryReport, name: str, metric: bool) -> dict[str, An
     return {
         f"rte_{name}_m": pairs.translation_statistics.mean,
         f"rre_{name}_deg": float(np.degrees(pairs.rotation_statistics.mean)),
-    }
-
-
-def depth_errors(result: Result, given: Input, alignment: Similarity | None) -> dict[str, Any]:
-    """Pooled errors of the keyframes' dense depth, against the exact depth of a rendered walk.
-
-    `depth_prior_rmse_m` is that of the depth before the adjustment. Depth without scale is scaled as the path is.
-    """
-    if given.oracle is None or result.record is None or alignment is None:
-        return {}
-    keyframes = result.record.slam.keyframes
-    scale = np.float32(alignment.scale)
-    chosen = np.unique(np.linspace(0, len(keyframes) - 1, _DEPTH_MAPS).round().astype(int))
-    found: list[DepthError] = []
-    prior: list[DepthError] = []
-    for number in chosen:
-        keyframe, fused = keyframes[number], result.record.dense.depth_maps[number]
-        truth = given.oracle.depth(keyframe.frame)
-        for depth, kept in ((fused.depth if fused else None, found), (keyframe.depth, prior)):
-            if depth is not None and np.isfinite(depth).any():
-                kept.append(depth_error((scale * depth).astype(np.float64), truth))
-    weights = np.array([one.count for one in found], np.float64)
-    if not weights.sum():
-        return {}
-    pooled = lambda values: float(np.average(np.array(values), weights=weights))
-    before = np.array([(one.rmse**2, one.count) for one in prior if one.count]).reshape(-1, 2)
-    return {
-        "depth_rmse_m": math.sqrt(pooled([one.rmse**2 for one in found])),
-        "depth_abs_rel": pooled([one.relative for one in found]),
-        "depth_below_1_25": pooled([one.inliers for one in found]),
-        "depth_prior_rmse_m": math.sqrt(np.average(before[:, 0], weights=before[:, 1])) if len(before) else None,
-    }
-
-
-def cloud_errors(points: np.ndarray, given: Input, threshold: float) -> dict[str, Any]:
-    """Precision, recall, F-score and mean distances of the map against the surfaces that the walk saw."""
-    assert given.oracle is not None
-    truth = exact_cloud(given.oracle)
-    most = 200_000  # points of each: distances to a tenth of the map differ in the third digit
-    step = max(len(points) // most, 1)
-    found = cloud_error(points[::step], truth[:: max(len(truth) // most, 1)], threshold)
-    return {
-        "f_score": found.f_score,
-        "precision": found.precision,
-        "recall": found.recall,
-        "accuracy_m": found.accuracy,
-        "completeness_m": found.completeness,
-        "mean_distance_m": found.mean_distance,
-        "threshold_m": threshold,
     }
 
 

@@ -11,6 +11,7 @@ from vggtgeo.benchmark.published import published
 from vggtgeo.benchmark.statistics import select
 from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.suite import Suite
+from vggtgeo.benchmark.worker import LOG, RECORDING
 from vggtgeo.io.files import write_text
 from vggtgeo.report.figures import svg
 from vggtgeo.report.page import style, template
@@ -88,7 +89,7 @@ def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> dict[str, Any]
 
 def _run(suite: Suite, row: Row, folder: Path) -> dict[str, Any]:
     place = Path("runs") / f"{row['sequence']}.{row['setting']}.{row['seed']}"
-    files = {"page": "report.html", "poses": "estimate.txt", "recording": "run.rrd", "log": "log.txt"}
+    files = {"page": "report.html", "poses": "estimate.txt", "recording": RECORDING, "log": LOG}
     there = {name: (place / file).as_posix() for name, file in files.items() if (folder / place / file).is_file()}
     return {
         **{name: row.get(name) for name in ("sequence", "seed", "status", "verdict", "message", "warnings", "reasons")},

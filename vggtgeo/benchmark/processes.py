@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ from pathlib import Path
 import psutil
 
 from vggtgeo.io.jax_environment import jax_environment
+from vggtgeo.io.locks import LockedError, locked
 
 _POLL = 0.02
 _MEMORY_POLL = 0.25
@@ -133,6 +135,24 @@ def _resident_gb(pid: int) -> float:
         return sum(one.memory_info().rss for one in (process, *process.children(recursive=True))) / 2**30
     except psutil.Error:
         return 0.0
+
+
+@contextmanager
+def claimed(count: int) -> Iterator[tuple[int, ...]]:
+    """`count` processors of this machine that no other process of this user has claimed so; () where fewer are free."""
+    folder = Path(tempfile.gettempdir()) / f"vggtgeo-cores-{getattr(os, 'getuid', int)()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    with contextlib.ExitStack() as held:
+        found: list[int] = []
+        for core in sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []:
+            if len(found) < count:
+                with contextlib.suppress(LockedError):
+                    held.enter_context(locked(folder / str(core)))
+                    found.append(core)
+        if len(found) < count:
+            held.close()
+            found = []
+        yield tuple(found)
 
 
 def shares(workers: int) -> list[tuple[int, ...]]:

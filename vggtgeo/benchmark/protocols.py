@@ -11,23 +11,20 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Protocol:
-    """stride: take every n-th frame. poses: judge "all" frames or "keyframes". headline: the error that its tables
-    print. about: whose it is.
-    """
+    """stride: take every n-th frame. poses: judge "all" frames or "keyframes". about: whose it is."""
 
     stride: int
     poses: str
-    headline: str
     about: str
 
 
 PROTOCOLS: dict[str, Protocol] = {
-    "every-frame": Protocol(1, "all", "ate_se3_m", "a pose for every frame, metric"),
-    "every-frame-sim3": Protocol(1, "all", "ate_sim3_m", "a pose for every frame, scale free"),
+    "every-frame": Protocol(1, "all", "a pose for every frame, metric"),
+    "every-frame-sim3": Protocol(1, "all", "a pose for every frame, scale free"),
     "mast3r-slam": Protocol(
-        2, "keyframes", "ate_sim3_m", "MASt3R-SLAM: every second frame, keyframes only, `evo_ape tum GT EST -as`"
+        2, "keyframes", "MASt3R-SLAM: every second frame, keyframes only, `evo_ape tum GT EST -as`"
     ),
-    "droid-slam": Protocol(2, "all", "ate_sim3_m", "DROID-SLAM: every second frame, a pose for each of them"),
-    "dpvo": Protocol(1, "all", "ate_sim3_m", "DPVO: every frame; its tables print the median of the trials"),
-    "vggt-slam": Protocol(1, "keyframes", "ate_sim3_m", "VGGT-SLAM: keyframes by the flow of the image"),
+    "droid-slam": Protocol(2, "all", "DROID-SLAM: every second frame, a pose for each of them"),
+    "dpvo": Protocol(1, "all", "DPVO: every frame; its own tables print the median of the trials, these the mean"),
+    "vggt-slam": Protocol(1, "keyframes", "VGGT-SLAM: keyframes by the flow of the image"),
 }

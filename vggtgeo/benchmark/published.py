@@ -10,11 +10,15 @@ from typing import Any
 
 from vggtgeo.io.errors import InputError
 
+LOST = "lost"
+Figure = float | str | None
+
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """title, source, protocol: in words. columns: heads. rows: numbers by system, None where it has none or was lost.
-    unit: of the numbers. uncalibrated: systems that were not given the intrinsics.
+    """title, source, protocol: in words. columns: heads. rows: numbers by system, `LOST` where it lost track, None
+    where none is published. unit: of the numbers. papers: of the systems. uncalibrated: systems that were not given the
+    intrinsics.
     """
 
     name: str
@@ -23,8 +27,21 @@ class PublishedTable:
     protocol: str
     unit: str
     columns: tuple[str, ...]
-    rows: Mapping[str, tuple[float | None, ...]]
+    rows: Mapping[str, tuple[Figure, ...]]
+    papers: Mapping[str, str]
     uncalibrated: tuple[str, ...] = ()
+
+    def lines(self) -> list[list[str]]:
+        """A row of texts a system: its name, with a star where it was not given the intrinsics, numbers, and paper."""
+        return [
+            [f"{name}{'*' * (name in self.uncalibrated)}", *map(figure_text, numbers), self.papers[name]]
+            for name, numbers in self.rows.items()
+        ]
+
+
+def figure_text(figure: Figure) -> str:
+    """As it stands in a table."""
+    return "-" if figure is None else figure if isinstance(figure, str) else f"{figure:g}"
 
 
 def published(name: str) -> PublishedTable:
@@ -36,12 +53,18 @@ def published(name: str) -> PublishedTable:
     values = tomllib.loads((folder / f"{name}.toml").read_text("utf-8"))
     columns = tuple(values.pop("columns"))
     rows = {
-        system: tuple(None if number == "lost" or number == "" else float(number) for number in numbers)
+        system: tuple(None if number == "" else LOST if number == LOST else float(number) for number in numbers)
         for system, numbers in values.pop("rows").items()
     }
     if any(len(numbers) != len(columns) for numbers in rows.values()):
         raise InputError(f"published table `{name}`: each row must have {len(columns)} numbers")
-    return PublishedTable(name, columns=columns, rows=rows, **{key: _value(value) for key, value in values.items()})
+    papers = tomllib.loads((files("vggtgeo.benchmark") / "systems.toml").read_text("utf-8"))
+    if unknown := rows.keys() - papers.keys():
+        raise InputError(f"published table `{name}`: `systems.toml` has no paper of {', '.join(sorted(unknown))}")
+    own = {system: papers[system] for system in rows}
+    return PublishedTable(
+        name, columns=columns, rows=rows, papers=own, **{key: _value(value) for key, value in values.items()}
+    )
 
 
 def _value(value: object) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,7 @@ def bench(
     timeout_minutes: float | None = None,
     memory_gb: float | None = None,
     retry: bool = False,
+    recordings: bool | None = None,
     progress: Progress | None = None,
     cluster: Cluster | None = None,
 ) -> BenchReport:
@@ -114,6 +115,7 @@ def bench(
         timeout_minutes: limit of one run, in place of the suite's.
         memory_gb: limit of one run, in place of the suite's.
         retry: run again what ended without a result.
+        recordings: whether each run leaves `run.rrd` for the Rerun viewer, in place of the suite's.
         progress: see `Progress`.
         cluster: a Ray cluster to run on, in place of processes here.
 
@@ -130,6 +132,7 @@ def bench(
     """
     chosen = suite if isinstance(suite, Suite) else load_suite(Path(suite))
     chosen = limited(chosen, _names(sequences), _names(settings), seeds, first_seed, frames)
+    chosen = replace(chosen, recordings=chosen.recordings if recordings is None else recordings)
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"`output` is `{folder}`, which is a file; give a folder")

@@ -14,6 +14,7 @@ from typing import Any
 from vggtgeo.benchmark.inputs import walk_name
 from vggtgeo.benchmark.jobs import Job
 from vggtgeo.benchmark.processes import Ending, Limits, run_limited, shares
+from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.store import Row, Store
 from vggtgeo.benchmark.worker import LOG
 
@@ -88,7 +89,7 @@ def run_one(
 
 
 def described(ending: Ending, log: bytes) -> dict[str, Any]:
-    """The columns of a row that tell how its process ended; the status is that of a run that left no row itself."""
+    """The columns of a row that tell how its process ended, and where; the status is that of a run that left no row."""
     message = ending.message
     if ending.status == "ended" and ending.code > 0:
         lines = log[-_LAST:].decode(errors="replace").splitlines()
@@ -99,6 +100,7 @@ def described(ending: Ending, log: bytes) -> dict[str, Any]:
         "seconds_wall": ending.seconds,
         "peak_memory_gb": ending.peak_gb,
         "tries": ending.tries,
+        **provenance(),
     }
 
 

@@ -65,7 +65,7 @@ class Store:
 
     def absent(self, job: Job) -> Row:
         """The row of a run whose recording is not there; not stored, as it may be there tomorrow."""
-        return {**identity(self.described(job)), "status": "absent", "message": "the recording is not there"}
+        return {**identity(self.described(job)), "status": "absent", "message": job.absent}
 
     def described(self, job: Job) -> dict[str, Any]:
         """What a run is to do, as `job.json` holds it."""

@@ -90,6 +90,7 @@ class SequenceTable(CheckedTable):
         key_points: of the simulated matcher, a frame.
         references: other truths by name, files of the TUM format in the sequence's folder; compared after Sim(3).
         threshold: of precision and recall, metres.
+        exact_depth: the recording's depth is exact (it was rendered): depth, map and mesh are compared with it.
         set: settings of the pipeline on this sequence.
     """
 
@@ -105,6 +106,7 @@ class SequenceTable(CheckedTable):
     key_points: int = 800
     references: Mapping[str, str] = field(default_factory=dict)
     threshold: float = 0.05
+    exact_depth: bool = False
     set: Tables = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -114,6 +116,8 @@ class SequenceTable(CheckedTable):
         _one_of("degrade", self.degrade, tuple(DEGRADATIONS))
         if self.path and self.degrade != "base":
             raise InputError(f"`degrade` is {self.degrade!r}; it is for rendered walks")
+        if self.simulate and self.exact_depth:
+            raise InputError("`exact_depth` is for recordings; that of a rendered walk is known to be so")
         _check_protocol(self.protocol)
         if not (math.isfinite(self.threshold) and self.threshold > 0):
             raise InputError(f"`threshold` is {self.threshold}; it must be positive metres")
@@ -180,6 +184,7 @@ class Suite(CheckedTable):
         protocol: see `vggtgeo/benchmark/protocols.py`.
         timeout_minutes, memory_gb: limits of one run.
         pages: whether each run leaves its page and its map.
+        recordings: whether each run leaves `run.rrd` for the Rerun viewer, which takes time of its own.
         published: names of the tables of other systems' figures that belong beside this suite.
         set: settings of the pipeline, of all runs; a sequence's come on top, then a setting's.
         sequence, setting, external: lists of tables.
@@ -195,6 +200,7 @@ class Suite(CheckedTable):
     timeout_minutes: float = 60.0
     memory_gb: float = 16.0
     pages: bool = True
+    recordings: bool = False
     published: tuple[str, ...] = ()
     set: Tables = field(default_factory=dict)
     sequence: tuple[SequenceTable, ...] = ()

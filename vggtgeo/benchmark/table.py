@@ -18,7 +18,8 @@ FIRST = (
     *("frames", "tracked", "coverage", "keyframes", "matched", "metric", "path_m"),
     *("ate_se3_m", "ate_sim3_m", "scale", "ate_yaw_m", "ate_unaligned_m", "rte_1s_m", "rre_1s_deg"),
     *("rte_1m_m", "rre_1m_deg", "depth_rmse_m", "depth_abs_rel", "depth_below_1_25"),
-    *("f_score", "precision", "recall", "mean_distance_m", "completeness_m", "focal_error"),
+    *("f_score", "precision", "recall", "mean_distance_m", "accuracy_m", "completeness_m", "threshold_m"),
+    *("mesh_f_score", "mesh_accuracy_m", "mesh_completeness_m", "nees_place", "nees_rotation", "focal_error"),
     *("frames_per_second", "seconds_wall", "peak_memory_gb"),
 )
 """Columns that people look for; the others follow by name."""

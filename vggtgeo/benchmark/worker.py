@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import signal
+import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +24,13 @@ from vggtgeo.io.files import write_json
 from vggtgeo.io.warned import collected_warnings
 from vggtgeo.results import Result
 from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import updated
+from vggtgeo.viewing.callback import RerunCallback
+from vggtgeo.viewing.target import open_target
 
-JOB, ROW, LOG = "job.json", "row.json", "log.txt"
+JOB, ROW, LOG, RECORDING = "job.json", "row.json", "log.txt", "run.rrd"
 """Files in the folder of a run."""
 
 
@@ -55,6 +61,7 @@ def identity(job: Mapping[str, Any]) -> dict[str, Any]:
         "fingerprint": job["fingerprint"],
         "protocol": spec["protocol"],
         "perception": spec["perception"],
+        "simulated": bool(spec["simulate"]),
         "depth_input": not spec["rgb_only"],
         "settings": json.dumps({key: spec[key] for key in _SETTINGS}, sort_keys=True),
         "input_hash": job["input_hash"],
@@ -71,24 +78,41 @@ def _peak_gb() -> float:
 def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None) -> dict[str, Any]:
     with collected_warnings() as warned:
         given = open_input(spec, seed, scratch)
-    simulated = given.simulated or given.oracle is not None
-    result = reconstruct(
-        given.sequence,
-        given.perception,
-        updated(SlamSettings(), spec["set"]),
-        start=spec["start"],
-        end=spec["end"],
-        stride=spec["stride"],
-        seed=seed,
-        title=f"{folder.name}{' (simulated)' if simulated else ''}",
-        facts={"simulated": True} if simulated else None,
-        warned=warned,
-    )
-    if result.summary["interrupted"]:  # by a signal of somebody else: a part of the frames is no result
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGTERM)
-    _save(folder, result, truth_of_run(result, given.truth), spec)
-    return {**measured(result, given, spec), "simulated": simulated}
+    with recorded(folder, spec["recordings"]) as callbacks:
+        result = reconstruct(
+            given.sequence,
+            given.perception,
+            updated(SlamSettings(), spec["set"]),
+            start=spec["start"],
+            end=spec["end"],
+            stride=spec["stride"],
+            seed=seed,
+            title=f"{folder.name}{' (simulated)' if given.simulated else ''}",
+            callbacks=callbacks,
+            facts={"simulated": True} if given.simulated else None,
+            warned=warned,
+        )
+        if result.summary["interrupted"]:  # by a signal of somebody else: a part of the frames is no result
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            os.kill(os.getpid(), signal.SIGTERM)
+        _save(folder, result, truth_of_run(result, given.truth), spec)
+    return measured(result, given, spec)
+
+
+@contextmanager
+def recorded(folder: Path, wanted: bool) -> Iterator[tuple[Callback, ...]]:
+    """What logs the run to `folder`/run.rrd for the Rerun viewer, where that is wanted. The file comes at the end: what
+    a result writes takes away what an earlier run left, recordings among it.
+    """
+    if not wanted:
+        yield ()
+        return
+    with tempfile.TemporaryDirectory(prefix="vggtgeo-bench-") as made:
+        path = Path(made) / RECORDING
+        stream = open_target(str(path), folder.name, path).stream
+        yield (RerunCallback(stream),)
+        stream.disconnect()
+        shutil.move(path, folder / RECORDING)
 
 
 def _save(folder: Path, result: Result, truth: Trajectory | None, spec: Mapping[str, Any]) -> None:

@@ -35,6 +35,12 @@ def bench(
     timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
     memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
     retry: Annotated[bool, typer.Option("--retry/--no-retry", help="Run again what ended without a result.")] = False,
+    recordings: Annotated[
+        bool | None,
+        typer.Option(
+            "--recordings/--no-recordings", help="A file run.rrd of each run, for Rerun.", show_default="the suite's"
+        ),
+    ] = None,
     engine: Annotated[
         Literal["processes", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
     ] = "processes",
@@ -73,6 +79,7 @@ def bench(
             timeout_minutes=timeout_minutes,
             memory_gb=memory_gb,
             retry=retry,
+            recordings=recordings,
             progress=bar.advance,
             cluster=Cluster(address, cpus, gpus) if engine == "ray" else None,
         )

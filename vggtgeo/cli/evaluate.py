@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.options import JsonOption
+from vggtgeo.cli.options import EXIT_FAILED, JsonOption
 from vggtgeo.io.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
@@ -35,17 +35,23 @@ def evaluate(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT."""
+    """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT.
+
+    Exit code 3: the numbers mean nothing, as the two are of different sequences, or the estimate failed.
+    """
     from vggtgeo.evaluation import evaluate_trajectory
     from vggtgeo.evaluation.resemblance import warn_of_strangers
 
     found, true, scale = load_estimate(estimate), load_truth(truth), load_scale(estimate)
     report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit)
-    warn_of_strangers(found, true, max_dt)
+    meaningless = warn_of_strangers(found, true, max_dt)
     if as_json:
         typer.echo(json.dumps({**report.as_dict(), **({} if scale is None else {"estimate_scale": scale})}, indent=2))
     else:
         print_report(report, scale)
+    if meaningless:
+        typer.echo("NOT COMPARABLE: these errors say nothing, see the warnings", err=True)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def load_estimate(path: Path) -> Trajectory:

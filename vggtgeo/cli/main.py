@@ -131,7 +131,7 @@ START = (
 )
 EXIT_CODES = (
     f"0 done; {EXIT_INPUT} something given is wrong (one line says what, and what to do); {EXIT_FAILED} the verdict "
-    f"of a run is failed (its outputs are kept); {EXIT_INTERRUPTED} "
+    f"of a run is failed (its outputs are kept), or what evaluate prints means nothing; {EXIT_INTERRUPTED} "
     f"interrupted (a run writes what it has first); {EXIT_INTERNAL} a fault of the program (`vggtgeo --debug ...` "
     "shows where)."
 )

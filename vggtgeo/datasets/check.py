@@ -4,10 +4,12 @@ import itertools
 import os
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.opening import open_sequence
 from vggtgeo.geometry.trajectory import Trajectory
@@ -40,15 +42,43 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
         warnings.simplefilter("always", InputWarning)
         try:
             sequence = open_sequence(path, kind)
-            frames = _sample(sequence)
+            missing, there = _without_missing(sequence)
+            frames = _sample(there)
             truth = sequence.ground_truth()
         except InputError as error:
             return Inspection((), (*_texts(caught), str(error)))
-    problems = [*_texts(caught), *_of_images(frames), *_of_times(frames, len(sequence)), *_of_depth(sequence, frames)]
+    problems = [
+        *_texts(caught),
+        *missing,
+        *_of_images(frames),
+        *_of_times(frames, len(sequence)),
+        *_of_depth(sequence, frames),
+    ]
     problems += _of_truth(truth, frames)
     if not sequence.camera.known and not any("intrinsics" in text for text in problems):
         problems.append("the intrinsics are a guess; give --intrinsics, or put them into calibration.txt")
     return Inspection(_facts(sequence, frames, truth), tuple(dict.fromkeys(problems)))
+
+
+def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
+    """How many of the files that are listed are not there, and the sequence of those that are."""
+    if not isinstance(sequence, FolderSequence):
+        return [], sequence
+    images = [file.image for file in sequence.files if not file.image.exists()]
+    depths = [file.depth for file in sequence.files if file.depth is not None and not file.depth.exists()]
+    gone = {*images, *depths}
+    files = tuple(
+        replace(file, depth=None if file.depth in gone else file.depth)
+        for file in sequence.files
+        if file.image not in gone
+    )
+    told = [*_told(images, len(sequence), "images"), *_told(depths, len(sequence), "depth images")]
+    return told, replace(sequence, files=files)
+
+
+def _told(gone: list[Path], count: int, what: str) -> list[str]:
+    names = f"`{gone[0]}`{', ...' if len(gone) > 1 else ''}" if gone else ""
+    return [f"{len(gone)} of {count} {what} that are listed are not there: {names}"] if gone else []
 
 
 def _sample(sequence: Sequence) -> list[Frame]:

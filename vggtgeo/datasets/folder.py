@@ -181,9 +181,9 @@ def depth_is_usable(name: str, files: Sequence[FrameFile], coding: DepthFormat, 
         if np.isfinite(depth).any():
             return True
     if with_depth:
-        _warn(
-            f"`{name}`: none of the {len(with_depth)} depth images has a valid pixel{reason}; reading the images only"
-        )
+        gone = not any(file.depth is not None and file.depth.exists() for file in with_depth)
+        what = f"is there: `{with_depth[0].depth}`, ..." if gone else f"has a valid pixel{reason}"
+        _warn(f"`{name}`: none of the {len(with_depth)} depth images {what}; reading the images only")
     return False
 
 

@@ -16,9 +16,9 @@ from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of
+from vggtgeo.datasets.tum import read_pairs
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
 
 _CAMERA = (481.20, 480.00, 319.50, 239.50)
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -39,7 +39,7 @@ class IclNuim(FolderSequence):
         """Reads the list of pairs."""
         files = tuple(
             FrameFile(index, number / FRAMES_PER_SECOND, folder / image, folder / depth)
-            for index, (number, depth, image) in enumerate(sorted(_pairs(folder / _LIST)))
+            for index, (number, image, depth) in enumerate(sorted(read_pairs(folder / _LIST, "N")))
         )
         width, height = common_size(str(folder), files)
         camera = Camera(_CAMERA, width, height)
@@ -57,19 +57,3 @@ class IclNuim(FolderSequence):
         rows = read_matrices(file, 8)
         poses = poses_of(rows[:, 1:4], rows[:, 4:])
         return trajectory_of(rows[:, 0] / FRAMES_PER_SECOND, _MIRROR @ poses @ _MIRROR, file)
-
-
-def _pairs(file: Path) -> list[tuple[float, str, str]]:
-    pairs = []
-    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
-        words = line.split("#", 1)[0].split()
-        if not words:
-            continue
-        try:
-            time, depth, _, image = float(words[0]), words[1], float(words[2]), words[3]
-        except (IndexError, ValueError):
-            raise InputError(f"`{file}`, line {number}: found {line!r}; expected `N depth/N.png N rgb/N.png`") from None
-        pairs.append((time, depth, image) if "depth" in depth else (time, image, depth))
-    if not pairs:
-        raise InputError(f"`{file}` lists nothing; expected lines `N depth/N.png N rgb/N.png`")
-    return pairs

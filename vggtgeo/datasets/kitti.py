@@ -3,6 +3,8 @@
 Source: A. Geiger et al., "Are we ready for autonomous driving?", CVPR 2012.
 """
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +19,7 @@ from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, 
 from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 RATE = 10.0
 _FOLDERS = ("image_2", "image_0", "image_02/data", "image_00/data")
@@ -49,6 +51,10 @@ class Kitti(FolderSequence):
         times = _times(folder, place, len(images))
         files = tuple(FrameFile(index, times[index], image) for index, image in enumerate(images))
         width, height = common_size(str(folder), files)
+        if (folder / "oxts").is_dir():
+            warnings.warn(
+                f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", InputWarning, stacklevel=3
+            )
         camera, baseline = _camera(folder, place.relative_to(folder).parts[0], width, height)
         return cls(folder, folder.resolve().name, camera, files, baseline=baseline)
 
@@ -91,20 +97,49 @@ def _moments(file: Path) -> list[float]:
 
 
 def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, float]:
-    """The rectified camera, and its distance from the left grey one: the fourth number of `P` is `-fx b`."""
+    """The camera, and its distance from the left grey one: the fourth number of `P` is `-fx b`."""
     for file in (
         folder / "calib.txt",
         folder / "calib_cam_to_cam.txt",
         folder.resolve().parent / "calib_cam_to_cam.txt",
     ):
-        lines = file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
-        for line in lines:
-            key, _, rest = line.partition(":")
-            if key.strip() in _LINES[name]:
-                values = numbers_of(rest.split(), f"`{file}`: `{key}`")
-                if len(values) != 12:
-                    raise InputError(f"`{file}`: `{key}` has {len(values)} numbers; expected 12")
-                intrinsics = intrinsics_of(file, (values[0], values[5], values[2], values[6]))
-                return Camera(intrinsics, width, height), -values[3] / values[0]
+        values = _calibration(file)
+        if _is_unrectified(file, values, name, width, height):
+            return _as_calibrated(file, values, name, width, height), 0.0
+        for key in _LINES[name]:
+            if key in values:
+                row = _numbers(file, key, values[key], 12)
+                intrinsics = intrinsics_of(file, (row[0], row[5], row[2], row[6]))
+                return Camera(intrinsics, width, height), -row[3] / row[0]
     own = camera_from_folder(folder, width, height)
     return own or guess_with_warning(str(folder), width, height), 0.0
+
+
+def _calibration(file: Path) -> dict[str, str]:
+    """Its lines `KEY: VALUES`."""
+    lines = file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
+    parts = [line.partition(":") for line in lines]
+    return {key.strip(): rest for key, _, rest in parts}
+
+
+def _is_unrectified(file: Path, values: Mapping[str, str], name: str, width: int, height: int) -> bool:
+    """Whether images have the size before the rectification, as in the drives `_extract`."""
+    original, rectified = (
+        tuple(numbers_of(values.get(key, "").split(), f"`{file}`: `{key}`"))
+        for key in (f"S_{name[-2:]}", f"S_rect_{name[-2:]}")
+    )
+    return original == (width, height) != rectified
+
+
+def _as_calibrated(file: Path, values: Mapping[str, str], name: str, width: int, height: int) -> Camera:
+    matrix = _numbers(file, f"K_{name[-2:]}", values.get(f"K_{name[-2:]}", ""), 9)
+    lens = _numbers(file, f"D_{name[-2:]}", values.get(f"D_{name[-2:]}", ""), 5)
+    intrinsics = intrinsics_of(file, (matrix[0], matrix[4], matrix[2], matrix[5]))
+    return Camera(intrinsics, width, height, distortion=tuple(lens))
+
+
+def _numbers(file: Path, key: str, text: str, count: int) -> list[float]:
+    values = numbers_of(text.split(), f"`{file}`: `{key}`")
+    if len(values) != count:
+        raise InputError(f"`{file}`: `{key}` has {len(values)} numbers; expected {count}")
+    return values

@@ -13,6 +13,7 @@ from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
+from vggtgeo.datasets.not_read import reason_not_read
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
 from vggtgeo.datasets.replica import Replica
 from vggtgeo.datasets.rgbd_folders import RgbdFolders
@@ -108,7 +109,8 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
         if reader.matches(place):
             return reader.open(place)
     raise InputError(
-        f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
+        reason_not_read(place)
+        or f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
         "a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of `vggtgeo data list`, or a folder "
         "of images"
     )
@@ -123,6 +125,8 @@ def _open_video(file: Path) -> Sequence:
         raise InputError(f"`{file}` is a GIF, whose colours and times are not those of a camera; give the video itself")
     if file.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
+    if reason := reason_not_read(file):
+        raise InputError(reason)
     return VideoFile.open(file)
 
 

@@ -15,6 +15,7 @@ from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.pose_files import read_json, read_matrix, read_text, trajectory_of
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -55,6 +56,26 @@ class TanksAndTemples(FolderSequence):
         if alignment.is_file():
             poses = moved(poses, read_matrix(alignment, (4, 4)))
         return trajectory_of(np.array(numbers) / FRAMES_PER_SECOND, poses, file)
+
+    def scanned_points(self) -> Float[np.ndarray, "n 3"] | None:
+        """The laser scan within its volume (`SCENE.ply`, `SCENE.json`), metres, in the world of `ground_truth`; None
+        where a file is missing, or `SCENE_trans.txt`, without which the poses are not in the scanner's frame.
+        """
+        scene = self._scene()
+        if scene is None or not all((self.folder / f"{scene}{end}").is_file() for end in ("_trans.txt", ".ply")):
+            return None
+        points = PointCloud.load_ply(self.folder / f"{scene}.ply").points.astype(np.float64)
+        return points[self.judged(points)]
+
+    def judged(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Which points lie in the volume that the scan is compared in; all where no `SCENE.json` tells."""
+        file = self.folder / f"{self._scene()}.json"
+        return inside_crop(file, points) if file.is_file() else np.ones(len(points), bool)
+
+    def _scene(self) -> str | None:
+        """The name that the files begin with."""
+        file = next(iter(sorted(self.folder.glob(f"*{_LOG}"))), None)
+        return None if file is None else file.name.removesuffix(_LOG)
 
 
 def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 4 4"]:

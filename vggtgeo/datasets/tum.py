@@ -4,7 +4,7 @@
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. ETH3D SLAM (whose
 `calibration.txt` is the one read here) and Bonn RGB-D Dynamic have the same layout. Colour and depth
 are taken at different times: an image gets the depth nearest in time, at most 0.02 s away, each depth used
-once.
+once. `associated.txt`, the pairs that ETH3D SLAM comes with, is read where `rgb.txt` is not there.
 """
 
 import math
@@ -27,6 +27,7 @@ MAX_DEPTH_DELAY = 0.02
 LATEST = 1e11
 """Seconds of a time stamp, 3,000 years: nanoseconds since 1970 are 1e18."""
 _TRUTH = "groundtruth.txt"
+_PAIRS = "associated.txt"
 _Entry = tuple[float, Path]
 
 
@@ -36,21 +37,14 @@ class TumRgbd(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has an `rgb.txt`."""
-        return (folder / "rgb.txt").is_file()
+        """Whether `folder` has an `rgb.txt`, or an `associated.txt`."""
+        return (folder / "rgb.txt").is_file() or (folder / _PAIRS).is_file()
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
-        images = _read_list(folder / "rgb.txt", frames=True)
-        depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
-        partners = partners_in_time(images, depths)
-        files = tuple(
-            FrameFile(index, time, image, None if partner is None else depths[partner][1])
-            for index, ((time, image), partner) in enumerate(zip(images, partners, strict=True))
-        )
-        if depths and (alone := partners.count(None)):
-            _warn(f"`{folder}`: {alone} of {len(images)} images have no depth within {MAX_DEPTH_DELAY} s")
+        listed = (folder / "rgb.txt").is_file() or not (folder / _PAIRS).is_file()
+        files = _of_lists(folder) if listed else _of_pairs(folder)
         width, height = common_size(str(folder), files)
         camera = (
             camera_from_folder(folder, width, height)
@@ -64,6 +58,48 @@ class TumRgbd(FolderSequence):
         """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
         file = self.folder / _TRUTH
         return Trajectory.load_tum(file) if file.exists() else None
+
+
+def _of_lists(folder: Path) -> tuple[FrameFile, ...]:
+    images = _read_list(folder / "rgb.txt", frames=True)
+    depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
+    partners = partners_in_time(images, depths)
+    if depths and (alone := partners.count(None)):
+        _warn(f"`{folder}`: {alone} of {len(images)} images have no depth within {MAX_DEPTH_DELAY} s")
+    return tuple(
+        FrameFile(index, time, image, None if partner is None else depths[partner][1])
+        for index, ((time, image), partner) in enumerate(zip(images, partners, strict=True))
+    )
+
+
+def _of_pairs(folder: Path) -> tuple[FrameFile, ...]:
+    file = folder / _PAIRS
+    depths = {}
+    for time, image, depth in read_pairs(file, "TIME"):
+        depths[time, folder / image] = folder / depth
+    images = _in_order(file, list(depths), frames=True)
+    return tuple(FrameFile(index, *image, depths[image]) for index, image in enumerate(images))
+
+
+def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
+    """Time and name of the image, and name of its depth, of each line of a list of pairs, in either order; InputError
+    with the line of one that is none. time: how the message calls it.
+    """
+    expected = f"expected `{time} rgb/{time}.png {time} depth/{time}.png`"
+    pairs = []
+    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        words = line.split("#", 1)[0].split()
+        if not words:
+            continue
+        try:
+            first, second = (float(words[0]), words[1]), (float(words[2]), words[3])
+        except (IndexError, ValueError):
+            raise InputError(f"`{file}`, line {number}: found {line!r}; {expected}") from None
+        (seconds, image), (_, depth) = (second, first) if "depth" in first[1] else (first, second)
+        pairs.append((seconds, image, depth))
+    if not pairs:
+        raise InputError(f"`{file}` lists nothing; {expected}")
+    return pairs
 
 
 def _read_list(file: Path, frames: bool = False) -> list[_Entry]:

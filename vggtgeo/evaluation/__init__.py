@@ -5,7 +5,7 @@ from vggtgeo.evaluation.alignment import ALIGNMENTS, Alignment, Similarity, alig
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, nearest_in_time
 from vggtgeo.evaluation.calibration import focal_error, scale_error
 from vggtgeo.evaluation.clouds import CloudError, cloud_error
-from vggtgeo.evaluation.consistency import Consistency, consistency
+from vggtgeo.evaluation.consistency import Consistency, consistency, pose_consistency
 from vggtgeo.evaluation.depth import DepthError, depth_error, depth_of_cloud
 from vggtgeo.evaluation.meshes import Mesh, mesh_error, surface_points
 from vggtgeo.evaluation.relative import UNITS, RelativeError, Unit, relative_error, rotation_angle
@@ -40,6 +40,7 @@ __all__ = [
     "heading",
     "mesh_error",
     "nearest_in_time",
+    "pose_consistency",
     "relative_error",
     "rotation_angle",
     "scale_error",

@@ -9,8 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, nearest_in_time
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
 
@@ -69,3 +73,35 @@ def consistency(
     count, degrees = errors.shape
     low, high = chi2.ppf([0.5 * (1 - level), 0.5 * (1 + level)], count * degrees) / count
     return Consistency((white**2).sum(axis=1), degrees, float(low), float(high), level)
+
+
+def pose_consistency(
+    estimate: Trajectory,
+    truth: Trajectory,
+    place_sigma: Float[np.ndarray, " n"],
+    rotation_sigma: Float[np.ndarray, " n"],
+    scale: float = 1.0,
+    max_dt: float = MAX_TIME_DIFFERENCE,
+) -> tuple[Consistency, Consistency]:
+    """NEES of the places and the rotations of a trajectory, by standard deviations stated relative to its first pose.
+
+    Both trajectories are taken relative to the first pose that has a true one, so that errors are those of the
+    statement, and that true pose counts in each. A deviation (metres, rad) is that of each of three directions. scale:
+    that lengths of the estimate are to be multiplied by. Poses whose deviation is zero or NaN are left out; InputError
+    where no other is left.
+    """
+    if not len(estimate) == len(place_sigma) == len(rotation_sigma):
+        raise InputError(f"`estimate` has {len(estimate)} poses; expected as many standard deviations")
+    rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)
+    found, true = (
+        rigid.invert(poses[:1]) @ poses if len(poses) else poses
+        for poses in (estimate.poses[rows], truth.poses[others])
+    )
+    moved = scale * found[:, :3, 3] - true[:, :3, 3]
+    turned = Rotation.from_matrix(found[:, :3, :3].mT @ true[:, :3, :3]).as_rotvec() if len(rows) else moved
+    return _by_deviations(moved, place_sigma[rows]), _by_deviations(turned, rotation_sigma[rows])
+
+
+def _by_deviations(errors: np.ndarray, sigma: np.ndarray) -> Consistency:
+    stated = np.isfinite(sigma) & (sigma > 0)
+    return consistency(errors[stated], sigma[stated, None, None] ** 2 * np.eye(3))
