@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,12 @@ from scipy.spatial.transform import Rotation
 from test_stereo import keyframe_of, slots_of
 
 from vggtgeo.evaluation import surface_points
+from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.mapping.tsdf import fused_mesh
+from vggtgeo.mapping.fusion import SurfaceFusion, fused_mesh
 from vggtgeo.slam.keyframe import Keyframe
 
 RADIUS, AWAY, VOXEL = 0.5, 2.0, 0.04
@@ -69,6 +71,69 @@ def test_the_mesh_is_the_sphere() -> None:
     found = surface_points((mesh.vertices, mesh.faces), 0.025)
     assert np.abs(np.linalg.norm(found, axis=1) - RADIUS).mean() < 0.25 * VOXEL
     assert np.abs(found.mean(axis=0)).max() < 0.05 * RADIUS  # even: no side has more points than another
+
+
+def moved(keyframe: Keyframe, metres: float) -> Keyframe:
+    """The keyframe with its camera moved along its own optical axis."""
+    pose = keyframe.pose.copy()
+    pose[2, 3] += metres
+    return replace(keyframe, pose=pose)
+
+
+def away(keyframe: Keyframe, number: int) -> Keyframe:
+    """The keyframe of that number, whose camera and all that it sees are 10 m along the world's x."""
+    pose = keyframe.pose.copy()
+    pose[:3, 3] -= pose[:3, :3] @ [10.0, 0, 0]
+    return replace(keyframe, number=number, pose=pose)
+
+
+def test_what_moved_is_fused_again_and_nothing_else() -> None:
+    """A map with one view two voxels off, which dents the sphere before it, is brought back when that view is put
+    right, by making anew only some of its blocks; a view that moves by less than the bound costs nothing, and one that
+    comes late or goes is taken in or out. Oracle: the mesh of all views at once, to the last digit.
+    """
+    keyframes, depth_maps = sphere_views()
+    far = [away(keyframes[0], 26), away(keyframes[1], 27)]  # another sphere, 10 m away
+    keyframes, depth_maps = [*far, *keyframes], [*depth_maps[:2], *depth_maps]
+    first = len(far)
+    wrong = [*far, moved(keyframes[first], 2 * VOXEL), *keyframes[first + 1 :]]
+    whole = fused_mesh(keyframes, depth_maps, INTRINSICS, VOXEL)
+    fusion = SurfaceFusion(INTRINSICS, VOXEL, bound=0.5)
+    fusion.update(wrong[:-1], depth_maps[:-1])
+    fusion.update(wrong, depth_maps)
+    towards = rigid.centre(keyframes[first].pose) / AWAY
+    near = [mesh.vertices[np.abs(mesh.vertices).max(1) < 1] for mesh in (fusion.mesh, whole)]
+    before = [vertices[vertices @ towards > 0.9 * RADIUS] for vertices in near]
+    dent, sound = (np.abs(np.linalg.norm(vertices, axis=1) - RADIUS).mean() for vertices in before)
+    assert dent > 1.5 * sound, (dent, sound)
+    every = SurfaceFusion(INTRINSICS, VOXEL).update(keyframes, depth_maps)
+    again = fusion.update(keyframes, depth_maps)
+    assert 0 < again < every, (again, every)
+    same(fusion.mesh, whole)
+    for metres, some in ((0.4 * VOXEL, False), (0.6 * VOXEL, True)):
+        assert bool(fusion.update([moved(keyframes[0], metres), *keyframes[1:]], depth_maps)) is some
+    fusion.update(keyframes[1:], depth_maps[1:])
+    same(fusion.mesh, fused_mesh(keyframes[1:], depth_maps[1:], INTRINSICS, VOXEL))
+
+
+def same(found: Mesh, expected: Mesh) -> None:
+    for name in ("vertices", "faces", "normals", "colours"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_a_second_view_changes_what_one_view_is_enough_for() -> None:
+    """One view makes a surface alone; of two from opposite sides, both must have seen a voxel, so that next to nothing
+    is left. Oracle: both fused at once.
+    """
+    keyframes, depth_maps = sphere_views()
+    opposite = [keyframes[0], keyframes[-1]], [depth_maps[0], depth_maps[-1]]
+    fusion = SurfaceFusion(INTRINSICS, VOXEL)
+    fusion.update(*(part[:1] for part in opposite))
+    assert len(fusion.mesh.faces)
+    fusion.update(*opposite)
+    same(fusion.mesh, fused_mesh(*opposite, INTRINSICS, VOXEL))
+    with pytest.raises(InputError, match="`bound` is -1"):
+        SurfaceFusion(INTRINSICS, VOXEL, bound=-1)
 
 
 def test_a_small_piece_is_left_out() -> None:

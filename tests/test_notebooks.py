@@ -8,7 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
+
+from vggtgeo.simulation import simulate
+from vggtgeo.simulation.tum_folder import write_tum_folder
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 LONGEST_CELL = 25
@@ -53,6 +57,20 @@ def test_notebook_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every cell runs, in order, without an error or a warning, and prints something."""
     _run(path, {})
     assert capsys.readouterr().out, f"`{path.name}` printed nothing"
+
+
+def test_solve_starts_from_a_recording_where_there_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The first two cells take a folder in place of the rendered pair, and find how its camera moved; oracle: truth."""
+    for _ in write_tum_folder(simulate("office", 10, 5, (320, 240)), tmp_path):
+        pass
+    namespace: dict[str, Any] = {}
+    for cell in _cells(NOTEBOOKS[0].with_name("solve.ipynb"), "code")[:2]:
+        source = "".join(cell["source"])
+        exec(source.replace('Path("recording")', f"Path({str(tmp_path)!r})"), namespace)
+    assert namespace["sequence"].camera.width == 320
+    true = np.linalg.inv(namespace["truth"].poses[0]) @ namespace["truth"].poses[9]
+    np.testing.assert_allclose(namespace["centre"], true[:3, 3], atol=0.02)
+    assert "true [cm]" in capsys.readouterr().out
 
 
 @pytest.mark.slow

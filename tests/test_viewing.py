@@ -11,8 +11,10 @@ import sysconfig
 import time
 import urllib.request
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 from urllib.parse import unquote
 
@@ -30,9 +32,11 @@ from vggtgeo.benchmark.page import write_page
 from vggtgeo.benchmark.worker import recorded
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.results.files import write_depth, write_settings, write_trajectories
+from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.folder import _log_depth
 from vggtgeo.viewing.target import check_target, has_screen
@@ -110,6 +114,120 @@ def test_the_recording_holds_every_entity(recording: Path) -> None:
         assert {"frame", "time"} <= found[path], path
     for path in ("/plots/solver/energy", "/plots/convergence/step", "/world/iteration", "/world/covariance"):
         assert "iteration" in found[path], path
+
+
+def components_of(path: Path, entity: str, component: str) -> dict[int, list[Any]]:
+    """What `entity` of the recording `path` holds as `component`, by frame, the last of each; rerun's own reader."""
+    import rerun as rr
+
+    found: dict[int, list[Any]] = {}
+    for chunk in rr.chunk.RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if str(chunk.entity_path) == entity and component in batch.schema.names:
+            values = batch.column(component).to_pylist()
+            frames = batch.column("frame").to_pylist()
+            found |= {frame: value for frame, value in zip(frames, values, strict=True) if value is not None}
+    return found
+
+
+def logged(states: Sequence[Slam], path: Path, cloud: PointCloud | None = None) -> Path:
+    """A recording of what `RerunCallback` shows of the map in these states, state n at frame n."""
+    from vggtgeo.viewing import entities
+    from vggtgeo.viewing.live_map import LiveMap
+    from vggtgeo.viewing.target import open_target
+
+    stream = open_target(str(path), "test", path).stream
+    live = LiveMap(stream)
+    for number, slam in enumerate(states):
+        stream.set_time("frame", sequence=number)
+        live.update(slam)
+        entities.log_loops(stream, slam, apart=2)
+        entities.log_lost(stream, slam)
+    if cloud is not None:
+        live.clear()
+        entities.log_map(stream, cloud)
+    stream.disconnect()
+    return path
+
+
+def moved(slam: Slam, number: int, along: tuple[float, float, float]) -> Slam:
+    """The state with one keyframe's camera moved `along` in the world, metres."""
+    keyframe = slam.keyframes[number]
+    to_world = rigid.invert(keyframe.pose)
+    to_world[:3, 3] += along
+    changed = replace(keyframe, pose=rigid.invert(to_world))
+    return replace(slam, keyframes=(*slam.keyframes[:number], changed, *slam.keyframes[number + 1 :]))
+
+
+def test_a_keyframe_that_moves_takes_its_cloud_along(run: RecordedRun, tmp_path: Path) -> None:
+    """Points are logged once, as the final map has them; a keyframe that is half a metre wrong and then put right has
+    its transform logged again, and no other keyframe has. Oracle: the poses, and the true depth's bounds.
+    """
+    from vggtgeo.viewing.live_map import AT_ONCE, MOST_POINTS
+
+    slam = run.slam
+    assert 3 <= len(slam.keyframes) <= AT_ONCE
+    path = logged([moved(slam, 1, (0.5, 0, 0)), moved(slam, 1, (0.5, 0, 0)), slam], tmp_path / "live.rrd")
+    found = [components_of(path, f"/world/live/{k}", "Transform3D:translation") for k in range(3)]
+    assert [sorted(one) for one in found] == [[0], [0, 1, 2], [0]]
+    wrong, right = (np.array(found[1][frame]).reshape(3) for frame in (0, 2))
+    np.testing.assert_allclose(wrong - right, [0.5, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(right, rigid.centre(slam.keyframes[1].pose), atol=1e-6)
+    clouds = components_of(path, "/world/live/1", "Points3D:positions")
+    assert sorted(clouds) == [0]
+    points = np.array(clouds[0])
+    assert 0.5 * MOST_POINTS < len(points) <= MOST_POINTS
+    depth = slam.keyframes[1].depth
+    assert np.nanmin(depth) <= points[:, 2].min() <= points[:, 2].max() <= np.nanmax(depth)
+
+
+def test_the_map_grows_while_the_run_goes_on_and_is_replaced_at_its_end(recording: Path, run: RecordedRun) -> None:
+    """Keyframes' clouds come at different frames, and the final map, which a static one would show from the first frame
+    on, comes at the last, where they are cleared; oracle: rerun's own reader.
+    """
+    last = run.slam.frames[-1].frame
+    begun = [components_of(recording, f"/world/live/{k.number}", "Points3D:positions") for k in run.slam.keyframes]
+    assert len({min(frames) for frames in begun if frames}) > 1
+    assert sorted(components_of(recording, "/world/map", "Points3D:positions")) == [last]
+    assert sorted(components_of(recording, "/world/live", "Clear:is_recursive")) == [last]
+
+
+def test_points_without_depth_are_logged_again_when_they_left_the_window(run: RecordedRun, tmp_path: Path) -> None:
+    """Of a map of free scale the points are shown; those of a keyframe that were twice as far as they are now are
+    logged again once it has left the window, and not before. Oracle: the inverse depths.
+    """
+    right = replace(run.slam, metric=False, window=(0, 1))
+    points = right.keyframes[0].points
+    far = replace(right.keyframes[0], points=replace(points, inverse_depth=points.inverse_depth / 2))
+    states = [replace(right, keyframes=(far, *right.keyframes[1:])), right, replace(right, window=(1,))]
+    found = components_of(logged(states, tmp_path / "free.rrd"), "/world/live/0", "Points3D:positions")
+    assert sorted(found) == [0, 2]
+    np.testing.assert_allclose(np.array(found[0]), 2 * np.array(found[2]), rtol=1e-5)
+
+
+def test_loops_and_lost_frames_are_shown(run: RecordedRun, tmp_path: Path) -> None:
+    """A map without a loop gets one, and frames that had a pose lose it: each is drawn from then on, between the places
+    by hand; a piece that nothing joins has a path of its own and no line to it. Oracle: the poses.
+    """
+    slam = replace(run.slam, factors=(), pairs=())
+    first, second = slam.keyframes[0], slam.keyframes[2]
+    loop = replace(slam, factors=(MeasuredRelativePose(0, 2, second.pose @ rigid.invert(first.pose), np.eye(6)),))
+    lost = [replace(record, tracked=record.frame not in (3, 4)) for record in run.slam.frames]
+    states = [slam, loop, replace(run.slam, frames=tuple(lost)), replace(slam, frames=tuple(lost))]
+    path = logged(states, tmp_path / "lost.rrd")
+    ends = [rigid.centre(keyframe.pose) for keyframe in (first, second)]
+    strips = components_of(path, "/world/loops", "LineStrips3D:strips")
+    assert strips[0] == []
+    np.testing.assert_allclose(np.array(strips[1]), [ends], atol=1e-6)
+    gaps = components_of(path, "/world/lost", "LineStrips3D:strips")
+    assert gaps[0] == gaps[3] == []
+    around = [rigid.centre(slam.pose(slam.frames[row])) for row in (2, 5)]
+    np.testing.assert_allclose(np.array(gaps[2]), [around], atol=1e-6)
+    begun = components_of(path, "/world/lost/begun", "Points3D:positions")
+    np.testing.assert_allclose(np.array(begun[3]), around[:1], atol=1e-6)
+    unjoined = components_of(path, "/world/unjoined", "LineStrips3D:strips")
+    assert unjoined[2] == []
+    assert len(unjoined[3]) == len(slam.keyframes) - 1
 
 
 def test_the_blueprint_shows_what_is_logged(recording: Path) -> None:

@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from vggtgeo.learning.window_dataset import RunWindows as RunWindows
     from vggtgeo.learning.window_dataset import WindowDataset as WindowDataset
     from vggtgeo.learning.window_dataset import WindowWriter as WindowWriter
+    from vggtgeo.mapping.fusion import SurfaceFusion as SurfaceFusion
     from vggtgeo.results import Result as Result
     from vggtgeo.results import evaluate as evaluate
     from vggtgeo.results import read as read
@@ -150,6 +151,7 @@ _HOME = {
     "bundle.problem_file": ("load_problem", "save_problem"),
     "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),
     "learning.window_dataset": ("RunWindows", "WindowDataset", "WindowWriter"),
+    "mapping.fusion": ("SurfaceFusion",),
     "results": ("Result", "evaluate", "read"),
     "results.reconstruction": ("reconstruct",),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),

@@ -57,6 +57,7 @@ def run(
     depth: options.DepthOption = None,
     dense: options.DenseOption = "auto",
     save_depth: options.SaveDepthOption = False,
+    save_every_depth: options.SaveEveryDepthOption = False,
     assignments: AssignmentsOption = None,
     rerun: RerunOption = None,
     map_file: options.MapOption = None,
@@ -104,7 +105,7 @@ def run(
         perceived,
         slam_settings,
         Output(
-            *(output, flags, rerun, save_depth, quiet, as_json),
+            *(output, flags, rerun, "every" if save_every_depth else save_depth, quiet, as_json),
             source=Path(path),
             save_map=save_map,
             resume=resume,

@@ -80,6 +80,13 @@ DenseOption = Annotated[
 SaveDepthOption = Annotated[
     bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
 ]
+SaveEveryDepthOption = Annotated[
+    bool,
+    typer.Option(
+        "--save-every-depth/--no-save-every-depth",
+        help="Write the depth of every frame: the sensor's, and where it has none what near keyframes saw.",
+    ),
+]
 MapOption = Annotated[
     Path | None,
     typer.Option("--map", help="Map of an earlier run (`--save-map`): frames are placed in it, and extend it."),

@@ -16,12 +16,15 @@ from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.progress import ProgressBar, print_result
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence
+from vggtgeo.datasets.reduced import reduced
 from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.network_errors import as_input_errors
+from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.result import DepthChoice
 from vggtgeo.results.run_folder import RESERVE, RunFolder, taken
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.presets import Perception
@@ -48,7 +51,7 @@ class Output:
     folder: Path
     flags: Mapping[str, Any]
     rerun: str | None = None
-    save_depth: bool = False
+    save_depth: DepthChoice = False
     quiet: bool = False
     as_json: bool = False
     source: Path | None = None
@@ -87,7 +90,7 @@ def run_and_write(
         checkpoints = Checkpoints(folder.checkpoint, bool(output.resume), output.checkpoint_every)
         if output.resume and not folder.checkpoint.is_file():
             typer.echo(f"there is nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)
-        callbacks, url = _rerun_callbacks(output, folder, title)
+        callbacks, url = _rerun_callbacks(output, folder, title, settings.window.size)
         if callbacks:
             settings = updated(settings, {"window": {"record_iterations": True}})
         with as_input_errors(), ProgressBar(console) as bar:
@@ -110,7 +113,8 @@ def run_and_write(
             bar.on_stage("writing")
             if output.save_map is not None:
                 result.save_map(output.save_map)
-            summary = result.save_into(folder, depth=output.save_depth, settings=output.flags)
+            frames = _with_own_depth(sequence, roles, settings) if output.save_depth == "every" else None
+            summary = result.save_into(folder, depth=output.save_depth, frames=frames, settings=output.flags)
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: everything was done and is written", err=True)
     print_result(console, result, summary, output.folder)
@@ -122,6 +126,13 @@ def run_and_write(
         raise typer.Exit(EXIT_INTERRUPTED)
     if result.verdict.level == "failed":
         raise typer.Exit(EXIT_FAILED)
+
+
+def _with_own_depth(sequence: Sequence, roles: Roles | Perception, settings: SlamSettings) -> Sequence | None:
+    """The frames as the run saw them, where they come again and their own depth is what it used."""
+    own = roles.roles if isinstance(roles, Perception) else roles
+    again = len(sequence) > 0 and sequence.has_depth and isinstance(own.depth, SensorDepth)
+    return reduced(sequence, settings.camera.most_pixels) if again else None
 
 
 class _EarlyFiles(Callback):
@@ -144,7 +155,9 @@ class _EarlyFiles(Callback):
         self._written = time.monotonic()
 
 
-def _rerun_callbacks(output: Output, folder: RunFolder, name: str) -> tuple[tuple[Callback, ...], str | None]:
+def _rerun_callbacks(
+    output: Output, folder: RunFolder, name: str, window: int
+) -> tuple[tuple[Callback, ...], str | None]:
     """What logs the run, if anything, and where a served run is to be seen; a file in the run's folder grows in its
     stage.
     """
@@ -156,4 +169,4 @@ def _rerun_callbacks(output: Output, folder: RunFolder, name: str) -> tuple[tupl
     opened = open_target(target, name, folder.stage / STAND_IN)
     if opened.url is not None:
         typer.echo(f"follow the run in a browser: {opened.url}", err=True)
-    return (RerunCallback(opened.stream),), opened.url
+    return (RerunCallback(opened.stream, window),), opened.url

@@ -14,9 +14,9 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.fusion import fused_mesh, measured_depth
 from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
-from vggtgeo.mapping.tsdf import fused_mesh
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
@@ -113,25 +113,19 @@ def dense_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: st
     own = map_in_threads(_measured, zip(keyframes, fused_depths(keyframes, intrinsics), strict=True))
     if mode in ("sensor", "network") or (mode == "auto" and measured):
         return own
-    return [_filled(*pair) for pair in zip(own, stereo_depths(keyframes, intrinsics), strict=True)]
+    return [filled(*pair) for pair in zip(own, stereo_depths(keyframes, intrinsics), strict=True)]
 
 
 def _measured(pair: tuple[Keyframe, np.ndarray | None]) -> DepthMap | None:
     keyframe, depth = pair
-    if depth is None:
-        return None
-    return DepthMap(
-        depth.astype(np.float32),
-        keyframe.depth_sigma.astype(np.float32),
-        (keyframe.depth_confidence / 255.0).astype(np.float32),
-    )
+    return None if depth is None else measured_depth(keyframe, depth)
 
 
-def _filled(measured: DepthMap | None, stereo: DepthMap | None) -> DepthMap | None:
-    """The measured depth, and that of the pictures in its holes."""
-    if measured is None or stereo is None:
-        return stereo if measured is None else measured
+def filled(measured: DepthMap | None, other: DepthMap | None) -> DepthMap | None:
+    """The measured depth, and the other in its holes; None where there is neither."""
+    if measured is None or other is None:
+        return other if measured is None else measured
     hole = ~np.isfinite(measured.depth)
     return DepthMap(
-        *(np.where(hole, getattr(stereo, name), getattr(measured, name)) for name in ("depth", "sigma", "confidence"))
+        *(np.where(hole, getattr(other, name), getattr(measured, name)) for name in ("depth", "sigma", "confidence"))
     )

@@ -11,7 +11,7 @@ surfaces meet without a seam.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -25,10 +25,8 @@ from skimage.measure import marching_cubes
 
 from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.mesh import Mesh
-from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe
 
 Block = tuple[int, int, int]
 """Corner of a block of voxels, in blocks."""
@@ -37,7 +35,7 @@ SIDE = 16
 TRUNCATION = 4.0
 """Of the distance, in voxels."""
 FREE = 4.0
-"""As far in front of a surface a view says that nothing is there, in truncations: a block at most, see `_together`."""
+"""As far in front of a surface a view says that nothing is there, in truncations: a block at most, see `together`."""
 BATCH = 1024
 """Blocks held at a time: 100 MB."""
 GROUP = 32
@@ -58,53 +56,18 @@ class View:
     intrinsics: np.ndarray
 
 
-def fused_mesh(
-    keyframes: Sequence[Keyframe],
-    depth_maps: Sequence[DepthMap | None],
-    intrinsics: np.ndarray,
-    voxel: float = 0.02,
-    least_views: int = 2,
-) -> Mesh:
-    """One coloured mesh of all keyframes' depth, in the world frame.
-
-    Args:
-        keyframes: poses world -> camera.
-        depth_maps: one a keyframe, None where there is none.
-        intrinsics: float64 [4], pixels.
-        voxel: edge of a voxel, metres.
-        least_views: keyframes that must have measured at a voxel, where there are so many; 1 where each depth was
-            confirmed by other views already.
-
-    """
-    if not voxel > 0:
-        raise InputError(f"`voxel` is {voxel}; it must be positive metres")
-    views = [
-        View(depth_map, keyframe.image, keyframe.pose, np.asarray(intrinsics, np.float64))
-        for keyframe, depth_map in zip(keyframes, depth_maps, strict=True)
-        if depth_map is not None and not depth_map.empty
-    ]
-    touched: dict[Block, list[int]] = defaultdict(list)
-    for number, view in enumerate(views):
-        for block in _blocks(view, voxel):
-            touched[block].append(number)
-    # Blocks share layers of voxels: all of them must see such a layer by the same views.
-    seen_by = {block: _together(block, touched) for block in touched}
-    least = min(least_views, len(views))
-    blocks = sorted(block for block, numbers in seen_by.items() if len(numbers) >= least)
-    parts = [
-        _batch(blocks[first : first + BATCH], seen_by, views, voxel, least) for first in range(0, len(blocks), BATCH)
-    ]
-    return _without_crumbs(_joined([mesh for part in parts for mesh in part], voxel))
-
-
-def _together(block: Block, seen_by: Mapping[Block, Sequence[int]]) -> list[int]:
-    """The views of a block and of all that touch it: whoever says something within `FREE` of a voxel is among them."""
+def around(block: Block) -> list[Block]:
+    """A block and all that touch it."""
     x, y, z = block
-    near = ((x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1))
-    return sorted({number for other in near for number in seen_by.get(other, ())})
+    return [(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
 
 
-def _blocks(view: View, voxel: float) -> list[Block]:
+def together(block: Block, seen_by: Mapping[Block, Collection[int]]) -> list[int]:
+    """The views of a block and of all that touch it: whoever says something within `FREE` of a voxel is among them."""
+    return sorted({number for other in around(block) for number in seen_by.get(other, ())})
+
+
+def blocks_of(view: View, voxel: float) -> list[Block]:
     """Corners, in blocks, of those that the view's surface passes within the truncation."""
     depth = view.depth_map.depth
     step = max(1, max(depth.shape) // 160)  # some centimetres apart, where a block is some tens wide
@@ -119,14 +82,14 @@ def _blocks(view: View, voxel: float) -> list[Block]:
     return list(map(tuple, cells[first].tolist()))
 
 
-def _batch(
+def meshes_of(
     blocks: Sequence[Block],
     seen_by: Mapping[Block, Sequence[int]],
-    views: Sequence[View],
+    views: Mapping[int, View],
     voxel: float,
     least: int,
-) -> list[Mesh]:
-    """The meshes of some blocks."""
+) -> list[Mesh | None]:
+    """The mesh of each block, None where there is none."""
     volume = np.zeros((len(blocks), SIDE + 1, SIDE + 1, SIDE + 1, 6), np.float32)
     rows_of: dict[int, list[int]] = defaultdict(list)
     for row, block in enumerate(blocks):
@@ -142,8 +105,7 @@ def _batch(
             padded = jnp.asarray(corners[np.resize(chosen, GROUP)])
             added = np.asarray(_measured(padded, motion, pixels, intrinsics, np.float32(TRUNCATION * voxel)))
             volume[chosen] += added[: len(chosen)]
-    parts = [_surface(volume[row], corners[row], voxel, least) for row in range(len(blocks))]
-    return [part for part in parts if part is not None]
+    return [_surface(volume[row], corners[row], voxel, least) for row in range(len(blocks))]
 
 
 def _packed(view: View) -> Array:
@@ -226,7 +188,7 @@ def _in_known_cubes(centres: np.ndarray, known: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _joined(parts: Sequence[Mesh], voxel: float) -> Mesh:
+def joined(parts: Sequence[Mesh], voxel: float) -> Mesh:
     """One mesh; vertices that blocks share become one."""
     if not parts:
         nothing = np.zeros((0, 3), np.float32)
@@ -243,7 +205,7 @@ def _joined(parts: Sequence[Mesh], voxel: float) -> Mesh:
     return Mesh(vertices[first], faces[~flat].astype(np.int32), normals[first], colours[first])
 
 
-def _without_crumbs(mesh: Mesh) -> Mesh:
+def without_crumbs(mesh: Mesh) -> Mesh:
     """The mesh without pieces of fewer than `LEAST_PART` faces, and without vertices that no face has."""
     count = len(mesh.vertices)
     if not len(mesh.faces):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ DEPTH_UNIT = 5000.0
 
 MOST_COUNTS = 65535
 DEPTH_NOTE = (
-    "NNNNNN.depth.png: depth z of the keyframe of frame NNNNNN, 16 bit, 0 = none.\n"
+    "NNNNNN.depth.png: depth z of frame NNNNNN, 16 bit, 0 = none.\n"
     "NNNNNN.confidence.png: its confidence, 8 bit, 255 = 1.\n"
 )
 METRES = "5000 counts are one metre, as in the TUM RGB-D format.\n"
@@ -91,19 +91,27 @@ def write_depth(
     A keyframe without any depth has no files; where none has any there is no folder, and a warning.
     """
     pairs = zip(keyframes, depth_maps, strict=True)
-    written = [(keyframe, depth_map) for keyframe, depth_map in pairs if depth_map is not None and not depth_map.empty]
-    if not written:
-        warnings.warn("no keyframe has dense depth: there is none to save", InputWarning, stacklevel=3)
-        return
-    write_text(folder / "depth" / "README.txt", DEPTH_NOTE + (METRES if metric else NO_METRES))
-    for keyframe, depth_map in written:
+    write_depth_maps(folder, ((keyframe.frame, depth_map) for keyframe, depth_map in pairs), metric)
+
+
+def write_depth_maps(folder: Path, depth_maps: Iterable[tuple[int, DepthMap | None]], metric: bool = True) -> None:
+    """The same of any frames, each with its number."""
+    written = False
+    for frame, depth_map in depth_maps:
+        if depth_map is None or depth_map.empty:
+            continue
+        written = True
         counts = np.rint(np.nan_to_num(depth_map.depth) * DEPTH_UNIT)
         counts = np.where(counts <= MOST_COUNTS, counts, 0).astype(np.uint16)  # farther than 13.1 m: none, not 13.1 m
         confidence = np.rint(255 * depth_map.confidence).astype(np.uint8)
         for name, image in (("depth", counts), ("confidence", confidence)):
             # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
-            with atomic_open(folder / "depth" / f"{keyframe.frame:06d}.{name}.png", "wb") as file:
+            with atomic_open(folder / "depth" / f"{frame:06d}.{name}.png", "wb") as file:
                 file.write(cv2.imencode(".png", image)[1].tobytes())
+    if not written:
+        warnings.warn("no keyframe has dense depth: there is none to save", InputWarning, stacklevel=3)
+        return
+    write_text(folder / "depth" / "README.txt", DEPTH_NOTE + (METRES if metric else NO_METRES))
 
 
 def write_settings(path: Path, values: Mapping[str, Any]) -> None:

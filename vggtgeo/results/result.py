@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
+from vggtgeo.datasets.frame import Sequence
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
 from vggtgeo.figures.result_figure import result_figure
@@ -22,9 +23,11 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
 from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
+from vggtgeo.results.every_depth import every_depth
 from vggtgeo.results.files import (
     read_uncertainty,
     write_depth,
+    write_depth_maps,
     write_settings,
     write_trajectories,
     write_uncertainty,
@@ -41,6 +44,9 @@ from vggtgeo.slam.trust.evidence import Evidence
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.window_recorder import WindowRecord
+
+DepthChoice = bool | Literal["every"]
+"""Whose depth a folder of results holds: nobody's, that of the keyframes, or of every frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +175,8 @@ class Result:
         self,
         folder: str | os.PathLike[str],
         *,
-        depth: bool = False,
+        depth: DepthChoice = False,
+        frames: Sequence | None = None,
         settings: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
         """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (where there is dense
@@ -182,22 +189,29 @@ class Result:
 
         Args:
             folder: made where it does not exist.
-            depth: write each keyframe's dense depth and confidence as well.
+            depth: write each keyframe's dense depth and confidence as well, or, where it is "every", each frame's: its
+                own where `frames` have some, else what the nearest keyframes saw of its view.
+            frames: what the run read; needed for the sensor's depth of frames that are no keyframes.
             settings: flags of the command line that tell how the run was made, beside the pipeline's own settings.
 
         Returns:
             What `summary.json` holds: the summary, and of a run how long it took with all its files.
 
         Raises:
-            InputError: `depth` is asked of a result that was read from a folder, or the folder cannot be written, is
-                in use by a run, or holds a sequence of images.
+            InputError: `frames` are of another size than those of the run, `depth` is asked of a result that was read
+                from a folder, or the folder cannot be written, is in use by a run, or holds a sequence of images.
 
         """
         with taken_beside(folder) as place:
-            return self.save_into(place, depth=depth, settings=settings)
+            return self.save_into(place, depth=depth, frames=frames, settings=settings)
 
     def save_into(
-        self, run: RunFolder, *, depth: bool = False, settings: Mapping[str, Any] | None = None
+        self,
+        run: RunFolder,
+        *,
+        depth: DepthChoice = False,
+        frames: Sequence | None = None,
+        settings: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
         """The same, into a folder that is taken already."""
         place = run.stage
@@ -224,7 +238,11 @@ class Result:
                 write_scene(place, self.record.slam)
             meshed.result()
         if depth and self.record is not None:
-            write_depth(place, self.record.slam.keyframes, self.record.dense.depth_maps, self.record.slam.metric)
+            slam, depth_maps = self.record.slam, self.record.dense.depth_maps
+            if depth == "every":
+                write_depth_maps(place, every_depth(slam, depth_maps, frames), slam.metric)
+            else:
+                write_depth(place, slam.keyframes, depth_maps, slam.metric)
         if self.record is not None:
             plain = with_writing(plain, time.perf_counter() - began)
         write_json(place / "summary.json", plain)

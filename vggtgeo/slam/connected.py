@@ -33,3 +33,20 @@ def pieces_by_size(slam: Slam) -> tuple[tuple[int, ...], ...]:
     hanging = np.bincount(label[[r.reference for r in slam.frames if r.tracked]], minlength=label.max(initial=-1) + 1)
     order = np.argsort(-hanging, kind="stable")
     return tuple(tuple(int(number) for number in np.nonzero(label == piece)[0]) for piece in order)
+
+
+def loop_edges(slam: Slam, apart: int) -> tuple[tuple[int, int], ...]:
+    """Pairs of keyframes, by their numbers, that saw one place at different times: joined by matches or by a measured
+    motion, and at least `apart` keyframes (those of a window) apart.
+    """
+    ends = [tie.keyframes for tie in slam.ties] + [
+        pair.key for pair in slam.pairs if len(pair.points) + len(pair.lines)
+    ]
+    return tuple(sorted({(first, second) for first, second in ends if abs(second - first) >= apart}))
+
+
+def lost_stretches(slam: Slam) -> tuple[tuple[int, int], ...]:
+    """First and last row of `slam.frames` of each stretch of frames that have no pose."""
+    lost = np.array([False, *(not record.tracked for record in slam.frames), False])
+    first, past = np.flatnonzero(np.diff(lost)).reshape(-1, 2).T
+    return tuple((int(i), int(j) - 1) for i, j in zip(first, past, strict=True))

@@ -13,23 +13,28 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
+from vggtgeo.slam.setting_groups import WindowSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
 from vggtgeo.viewing import entities
+from vggtgeo.viewing.live_map import LiveMap
 from vggtgeo.viewing.target import flush
 
 
 class RerunCallback(Callback):
     """Logs to `stream`. Timelines: `frame`, `time` (seconds of the sequence) and `iteration` (tried
-    steps of the window's solver, counted through the run).
+    steps of the window's solver, counted through the run). window: keyframes of a window; a pair that is farther apart
+    is a loop.
     """
 
-    def __init__(self, stream: Any):
+    def __init__(self, stream: Any, window: int = WindowSettings().size):
         import rerun as rr
 
         self.stream = stream
         self._recorder = WindowRecorder()
+        self._window, self._live = window, LiveMap(stream)
         self._keyframes = self._notes = self._iterations = 0
+        self._was_lost = False
         stream.log("world", rr.ViewCoordinates.RDF, static=True)
 
     @in_double_precision
@@ -43,7 +48,10 @@ class RerunCallback(Callback):
         self.stream.set_time("frame", sequence=frame.index)
         self.stream.set_time("time", duration=frame.timestamp)
         entities.log_camera(self.stream, slam.last_pose, slam.intrinsics, frame.image)
-        entities.log_tracking(self.stream, slam.frames[-1].inliers)
+        entities.log_tracking(self.stream, slam)
+        if bool(slam.lost) != self._was_lost:
+            self._was_lost = bool(slam.lost)
+            entities.log_lost(self.stream, slam)
         for note in slam.notes[self._notes :]:
             entities.log_note(self.stream, note)
         self._notes = len(slam.notes)
@@ -53,8 +61,9 @@ class RerunCallback(Callback):
         self._log_adjusted(slam)
 
     def on_finish(self, slam: Slam, cloud: PointCloud) -> None:
-        """The path after the last adjustment, and the map."""
-        entities.log_path(self.stream, frame_trajectory(slam), keyframe_trajectory(slam))
+        """The path after the last adjustment, and the map in place of the live one."""
+        self._log_path(slam)
+        self._live.clear()
         entities.log_map(self.stream, cloud)
         counts = f"{len(slam.frames)} frames, {len(slam.keyframes)} keyframes, {len(cloud)} points in the map"
         entities.log_note(self.stream, f"finished: {counts}", level="INFO")
@@ -63,6 +72,7 @@ class RerunCallback(Callback):
     @in_double_precision
     def _log_adjusted(self, slam: Slam) -> None:
         """Keyframes appear once their window is adjusted."""
+        self._live.update(slam)
         self._recorder.on_adjust(slam)
         if len(slam.adjusted_keyframes) > self._keyframes:
             self._keyframes = len(slam.adjusted_keyframes)
@@ -75,7 +85,7 @@ class RerunCallback(Callback):
         joined = [pair for pair in slam.pairs if pair.second == newest]
         entities.log_keyframe(self.stream, members[-1], max(joined, key=lambda pair: pair.first, default=None))
         entities.log_window(self.stream, members, list(slam.pairs))
-        entities.log_path(self.stream, frame_trajectory(slam), keyframe_trajectory(slam))
+        self._log_path(slam)
         entities.log_points(self.stream, members, slam.intrinsics)
         if slam.solved is None or not self._recorder.records:
             return
@@ -84,6 +94,11 @@ class RerunCallback(Callback):
         entities.log_covariance(self.stream, members, found)
         entities.log_residuals(self.stream, self._recorder.records[-1])
         self._log_iterations(slam)
+
+    def _log_path(self, slam: Slam) -> None:
+        entities.log_path(self.stream, frame_trajectory(slam), keyframe_trajectory(slam))
+        entities.log_loops(self.stream, slam, self._window)
+        entities.log_lost(self.stream, slam)
 
     def _log_iterations(self, slam: Slam) -> None:
         if slam.energies is None:

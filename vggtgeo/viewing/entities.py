@@ -11,8 +11,11 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.slam.connected import loop_edges, lost_stretches, piece_of
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe, read_at
+from vggtgeo.slam.run import frame_trajectory
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecord
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
@@ -24,8 +27,12 @@ ENTITIES = (
     "/world/keyframes",
     "/world/covariance",
     "/world/covisibility",
+    "/world/loops",
+    "/world/lost",
+    "/world/unjoined",
     "/world/iteration",
     "/world/points",
+    "/world/live/0",
     "/world/map",
     "/keyframe/image",
     "/keyframe/image/matches",
@@ -42,12 +49,14 @@ ENTITIES = (
     "/plots/convergence/gradient",
     "/plots/convergence/step",
     "/plots/tracking/inliers",
+    "/plots/tracking/lost",
     "/notes",
 )
 """All paths that a recording of a run with depth and lines holds."""
 SIGMAS = 20.0
 """Standard deviations that the ellipsoids reach: those of a good window are millimetres."""
 _BLUE, _ORANGE, _GREEN, _GREY = (31, 95, 191), (224, 123, 26), (58, 143, 92), (150, 150, 150)
+_RED, _PURPLE = (200, 40, 40), (142, 95, 176)
 _GRAPH_RADIUS = 160.0
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
@@ -74,6 +83,35 @@ def log_path(stream: Any, trajectory: Trajectory, keyframes: Trajectory) -> None
 
     stream.log("world/trajectory", rr.LineStrips3D([trajectory.positions], colors=[_BLUE], radii=-1.5))
     stream.log("world/keyframes", rr.Points3D(keyframes.positions, colors=[_BLUE], radii=-4.0))
+
+
+def log_loops(stream: Any, slam: Slam, apart: int) -> None:
+    """Lines between keyframes that a loop joins, see `loop_edges`."""
+    import rerun as rr
+
+    ends = [[rigid.centre(slam.keyframes[number].pose) for number in edge] for edge in loop_edges(slam, apart)]
+    stream.log("world/loops", rr.LineStrips3D(ends, colors=[_PURPLE] * len(ends), radii=-1.5))
+
+
+def log_lost(stream: Any, slam: Slam) -> None:
+    """Where frames have no pose: a point where the camera was lost and, in one piece of map, a line to where it was
+    found; and the paths of the pieces of map that nothing joins with the largest, whose places are only guesses.
+    """
+    import rerun as rr
+
+    label = piece_of(slam) if slam.keyframes else np.zeros(0, int)
+    begun, gaps = [], []
+    for first, last in lost_stretches(slam):
+        around = [slam.frames[row] for row in (first - 1, last + 1) if 0 <= row < len(slam.frames)]
+        centres = [rigid.centre(slam.pose(record)) for record in around]
+        if first:
+            begun.append(centres[0])
+        if len(around) == 2 and label[around[0].reference] == label[around[1].reference]:
+            gaps.append(centres)
+    stream.log("world/lost", rr.LineStrips3D(gaps, colors=[_RED] * len(gaps), radii=-2.0))
+    stream.log("world/lost/begun", rr.Points3D(np.reshape(begun, (-1, 3)), colors=[_RED], radii=-6.0))
+    paths = [frame_trajectory(slam, piece).positions for piece in range(1, label.max(initial=0) + 1)]
+    stream.log("world/unjoined", rr.LineStrips3D(paths, colors=[_ORANGE] * len(paths), radii=-1.5))
 
 
 def log_covariance(stream: Any, keyframes: list[Keyframe], covariances: np.ndarray) -> None:
@@ -173,10 +211,10 @@ def log_mesh(stream: Any, mesh: Mesh) -> None:
 
 
 def log_map(stream: Any, cloud: PointCloud) -> None:
-    """The dense map; at all times, so that a finished recording opens with it."""
+    """The dense map, from the time that is set on: before it the map was what `LiveMap` shows."""
     import rerun as rr
 
-    stream.log("world/map", rr.Points3D(cloud.points, colors=cloud.colours, radii=0.011), static=True)
+    stream.log("world/map", rr.Points3D(cloud.points, colors=cloud.colours, radii=0.011))
 
 
 def log_residuals(stream: Any, record: WindowRecord) -> None:
@@ -214,11 +252,12 @@ def _centres(poses: Any) -> np.ndarray:
     return rigid.invert(rigid.to_matrix(np.asarray(poses, np.float64)))[:, :3, 3]
 
 
-def log_tracking(stream: Any, inliers: int) -> None:
-    """How many points the frame was tracked with."""
+def log_tracking(stream: Any, slam: Slam) -> None:
+    """How many points the last frame was tracked with, and for how many frames the camera has been lost."""
     import rerun as rr
 
-    stream.log("plots/tracking/inliers", rr.Scalars(float(inliers)))
+    stream.log("plots/tracking/inliers", rr.Scalars(float(slam.frames[-1].inliers)))
+    stream.log("plots/tracking/lost", rr.Scalars(float(slam.lost)))
 
 
 def log_note(stream: Any, text: str, level: str = "WARN") -> None:

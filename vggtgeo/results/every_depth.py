@@ -1,0 +1,71 @@
+"""Depth of every frame of a run: the sensor's own, read once more, and where it has none what keyframes saw there."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from itertools import islice
+
+import numpy as np
+
+from vggtgeo.datasets import Sequence as Frames
+from vggtgeo.geometry.camera import Undistorter
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.frame_depth import FrameDepths
+from vggtgeo.models.classical import SensorDepth
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.threads import map_in_threads
+
+AT_ONCE = 16
+"""Frames in memory."""
+
+
+def every_depth(
+    slam: Slam, depth_maps: Sequence[DepthMap | None], frames: Frames | None = None
+) -> Iterator[tuple[int, DepthMap | None]]:
+    """Number and depth of every frame, in their order; see `FrameDepths`.
+
+    slam: after the last adjustment. depth_maps: the keyframes' dense depth. frames: what the run read; the depth of
+    those that have some is theirs, undistorted as in the run, with the noise of a depth camera. None: no frame has any.
+
+    Raises:
+        InputError: the images of `frames` are of another size than those of the run.
+
+    """
+    found, rows = FrameDepths(slam, depth_maps), iter(_own_depths(slam, frames))
+    while some := list(islice(rows, AT_ONCE)):
+        depths = map_in_threads(lambda pair: found.of(*pair), some)
+        yield from ((slam.frames[row].frame, depth) for (row, _), depth in zip(some, depths, strict=True))
+
+
+def _own_depths(slam: Slam, frames: Frames | None) -> Iterator[tuple[int, DepthMap | None]]:
+    """Rows of `slam.frames`, each with the depth that came with the frame."""
+    row_of = {record.frame: row for row, record in enumerate(slam.frames)}
+    if frames is None or not frames.has_depth or not slam.metric or not row_of:
+        yield from ((row, None) for row in range(len(slam.frames)))
+        return
+    camera, (height, width) = slam.lens or frames.camera, slam.keyframes[0].size
+    if (frames.camera.width, frames.camera.height) != (width, height):
+        raise InputError(
+            f"`frames` are of {frames.camera.width} x {frames.camera.height} pixels, those of the run of "
+            f"{width} x {height}; give the frames that the run read"
+        )
+    undistorter, sensor = camera.undistorter(), SensorDepth()
+    with warnings.catch_warnings():  # what cannot be read was told when the run came to it
+        warnings.simplefilter("ignore", InputWarning)
+        for frame in frames.frames(min(row_of), max(row_of) + 1, _step(list(row_of))):
+            if frame.index in row_of:
+                own = None if frame.depth is None else _measured(frame.image, frame.depth, undistorter, sensor)
+                yield row_of.pop(frame.index), own
+    yield from ((row, None) for row in row_of.values())
+
+
+def _step(numbers: list[int]) -> int:
+    """The stride that a run took frames with."""
+    return int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+
+
+def _measured(image: np.ndarray, depth: np.ndarray, undistorter: Undistorter, sensor: SensorDepth) -> DepthMap:
+    found = sensor.estimate(image, undistorter.depth(depth))
+    return DepthMap(found.depth, found.sigma_rel, found.confidence)
