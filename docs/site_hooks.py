@@ -124,4 +124,4 @@ def _mathjax() -> Path:
     for file in metadata.files("sphinx-mathjax-offline") or ():
         if file.as_posix().endswith("static/mathjax/tex-svg.js"):
             return Path(str(file.locate()))
-    raise FileNotFoundError("`sphinx-mathjax-offline` has no `tex-svg.js`; `pip install 'vggtgeo[docs]'` installs it")
+    raise FileNotFoundError("`sphinx-mathjax-offline` has no `tex-svg.js`; `pip install -e '.[docs]'` installs it")

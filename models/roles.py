@@ -6,7 +6,7 @@ that checks its shapes when it is made, so that a wrong implementation is caught
 
 | role | protocol | a network that fits |
 |---|---|---|
-| point matches | `PointMatcher` | MASt3R (encoder once an image, decoder once a pair, `index_j = -1`) |
+| point matches | `PointMatcher` | MASt3R (encoder once an image, decoder once a pair, `index_j = -1`), ALIKE, XFeat |
 | line segments | `LineDetector`, `LineMatcher` | LETR, M-LSD |
 | metric depth | `MetricDepth` | MoGe-2 |
 | dense confidence | `DenseConfidence` | DINOv3 |

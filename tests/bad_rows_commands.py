@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from bad_row import Row, good, line, nothing, rows, run_with
 
 from vggtgeo.cli.address_space import check_address_space
 from vggtgeo.export import export
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.jax_environment import cache_folder
 from vggtgeo.results import Result
 from vggtgeo.results.run_folder import taken
@@ -170,11 +172,27 @@ def limited(gigabytes: float) -> None:
         check_address_space("run")
 
 
+def summary_of(level: str, *reasons: str) -> str:
+    """A run's summary with this verdict."""
+    return json.dumps({"verdict": {"level": level, "reasons": reasons, "segments": []}, "scale": "metric"})
+
+
+def run_without_points(folder: Path) -> Path:
+    """The folder of a run that never began."""
+    PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)).save_ply(folder / "map.ply")
+    return folder_of_run(summary_of("failed", "no map was ever started"))(folder)
+
+
+def run_without_surfaces(folder: Path) -> Path:
+    """The folder of a run with `--dense none`."""
+    return folder_of_run(summary_of("good"))(folder)
+
+
 def exported_over(folder: Path) -> Path:
     """A run's folder, and one with a trajectory of somebody else."""
     (folder / "run").mkdir()
     (folder / "mine").mkdir()
-    folder_of_run("{}")(folder / "run")
+    folder_of_run(summary_of("good"))(folder / "run")
     for name in ("trajectory", "keyframes"):
         bad.walk(folder / f"run/{name}.txt", 0)
     bad.walk(folder / "mine/trajectory.txt", 1)
@@ -227,7 +245,10 @@ RUN = rows(
         ("a preset that is none", good, flags("--preset", "papers")),
         ("a preset whose networks are not there", good, flags("--preset", "light", "--models", "no")),
         ("`--memory-limit-gb 0`", good, flags("--memory-limit-gb", "0")),
-        ("`--features orb --preset paper`", good, flags("--features", "orb", "--preset", "paper")),
+        ("`--points` of somebody who finds lines", good, flags("--points", "mlsd")),
+        ("`--lines mlsd --no-lines`", good, flags("--lines", "mlsd", "--no-lines")),
+        ("`--dense network` without a network", good, flags("--dense", "network")),
+        ("`--save-depth --dense none`", good, flags("--save-depth", "--dense", "none")),
         ("`--set` without a value", good, flags("--set", "nonsense")),
         ("`--set` of a setting that is none", good, flags("--set", "tracking.least_inlier=3")),
         ("`--set` of a wrong value", good, flags("--set", "tracking.least_inliers=-3")),
@@ -309,6 +330,16 @@ OTHERS = rows(
             exported_over,
             {"call": lambda made: export(made / "run", "tum", made / "mine")},
         ),
+        (
+            "`export` of a run without points",
+            run_without_points,
+            {"argv": lambda made: ["export", made, "--to", "ply"]},
+        ),
+        (
+            "`export --to glb` of a run with `--dense none`",
+            run_without_surfaces,
+            {"argv": lambda made: ["export", made, "--to", "glb"]},
+        ),
         ("`demo` of 10^20 frames", nothing, {"argv": line("demo", "--frames", "1" + "0" * 20)}),
         ("`demo --frames many`", nothing, {"argv": line("demo", "--frames", "many")}),
         ("`demo` of a scene that is none", nothing, {"argv": line("demo", "--scene", "moon")}),
@@ -385,7 +416,7 @@ RESULTS = rows(
         ("without a summary", nothing, {}),
         ("a summary that is no JSON", folder_of_run("{"), {}),
         ("a summary that is a list", folder_of_run("[1, 2]"), {}),
-        ("a summary that lacks the intrinsics", folder_of_run("{}"), {}),
+        ("a summary that lacks the intrinsics", folder_of_run(summary_of("good")), {}),
         ("ten thousand brackets", folder_of_run("[" * 10_000), {}),
         ("a run that was killed", folder_of_run("{}", unfinished=True), {}),
     ],

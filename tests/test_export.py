@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import struct
 from pathlib import Path
@@ -22,6 +23,7 @@ from vggtgeo.export import FORMATS, export
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.mapping.tracks import make_tracks
 from vggtgeo.results.scene import Scene
 from vggtgeo.slam.covisibility import Pair
@@ -88,8 +90,9 @@ def test_colmap_reads_the_model_and_finds_the_error_that_is_stated(folder: Path,
     assert model.num_points3D() == len(scene.tracks) == stated["points"]
     assert stated["points"] > 50
     model.update_point_3d_errors()
-    assert model.compute_mean_reprojection_error() == pytest.approx(stated["mean_reprojection_error_px"], abs=1e-3)
-    assert 0.01 < stated["mean_reprojection_error_px"] < 2.0
+    error = stated["mean_reprojection_error_over_points_px"]
+    assert model.compute_mean_reprojection_error() == pytest.approx(error, abs=1e-3)
+    assert 0.01 < error < 2.0
     for image in model.images.values():
         assert cv2.imread(str(tmp_path / "images" / image.name)).shape[:2] == scene.size[::-1]
 
@@ -221,16 +224,50 @@ def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) ->
 
 
 def test_clouds_that_a_format_cannot_hold_are_named(folder: Path, tmp_path: Path) -> None:
-    # Proves the errors of a cloud wider than LAS counts millimetres, and of an empty one. Oracle: the sentences.
-    pytest.importorskip("laspy"), pytest.importorskip("trimesh")
+    # Proves the error of a cloud wider than LAS counts millimetres. Oracle: the sentence.
+    pytest.importorskip("laspy")
     copy = _changed(folder, tmp_path)
-    (copy / "mesh.ply").unlink()
     PointCloud(np.array([[0.0, 0, 0], [3e6, 0, 0]]), np.zeros((2, 3), np.uint8)).save_ply(copy / "map.ply")
     with pytest.raises(vg.InputError, match=r"is 3e\+06 m across; LAS in millimetres holds 2147484 m"):
         export(copy, "las", tmp_path / "out")
+
+
+def test_a_run_without_points_or_surfaces_is_refused(folder: Path, tmp_path: Path) -> None:
+    # Proves that a format is not written of nothing, and that the error has the verdict's reason; where the format
+    # needs neither points nor surfaces, a failed verdict is told and the files are written. Oracle: sentences, files.
+    copy = _changed(folder, tmp_path)
+    summary = json.loads((copy / "summary.json").read_text())
+    verdict = {"level": "failed", "reasons": ["only 3 % of the frames were tracked"], "segments": []}
+    (copy / "summary.json").write_text(json.dumps({**summary, "verdict": verdict}))
+    (copy / "mesh.ply").unlink()
     PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)).save_ply(copy / "map.ply")
-    with pytest.raises(vg.InputError, match="has no points, and there is no mesh"):
-        export(copy, "glb", tmp_path / "out")
+    with np.load(copy / "scene.npz") as data:
+        empty = {name: data[name][:0] if name.startswith("track") else data[name] for name in data}
+    np.savez(copy / "scene.npz", **empty)
+    for name, sentence in (
+        ("colmap", r"scene.npz` has no point that two keyframes saw: .* \(the verdict of the run is failed: only 3 %"),
+        ("nerfstudio", r"map.ply` has no points: .* \(the verdict of the run is failed: only 3 %"),
+        ("ply", "has no points"),
+        ("las", "has no points"),
+        ("glb", "the run has no surfaces; run again with `--dense auto`, or `--dense mvs`"),
+    ):
+        with pytest.raises(vg.InputError, match=sentence):
+            export(copy, name)
+        assert not (copy / "export" / name).exists()
+    with pytest.warns(InputWarning, match="the verdict of the run is failed: only 3 % of the frames were tracked"):
+        export(copy, "tum")
+    assert (copy / "export/tum/trajectory.txt").is_file()
+
+
+def test_an_export_says_what_it_lacks_and_what_its_error_is_of(folder: Path, tmp_path: Path) -> None:
+    # Proves the hint of a nerfstudio export without depth images, and the words beside COLMAP's reprojection error.
+    # Oracle: the sentences.
+    copy = _changed(folder, tmp_path)
+    shutil.rmtree(copy / "depth")
+    with pytest.warns(InputWarning, match="has no `depth/`, so there is none in the export; run again with `--save-"):
+        export(copy, "nerfstudio")
+    done = CliRunner().invoke(make_app(), ["export", str(copy), "--to", "colmap"])
+    assert re.search(r", 0\.\d+ px mean reprojection error over points$", done.stdout.strip()), done.stdout
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:

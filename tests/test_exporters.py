@@ -3,6 +3,8 @@
 The networks themselves are exported in test_exporters_torch.py, which needs torch and the published code.
 """
 
+import signal
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,9 +64,43 @@ def test_a_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.M
     result = invoke("models", "export", "moge2", *RANDOM, "--source", str(tmp_path / "code"))
     assert result.exit_code == 2
     assert "`torch`" in result.output
-    assert "vggtgeo[export]" in result.output
+    assert "pip install -e '.[export]'" in result.output
     with pytest.raises(ExportError, match="no_such_package"):
         packages.load("no_such_package")
+
+
+SLOW = """
+import signal, sys, time, types
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts jobs in the background without it
+sys.modules.update({name: types.ModuleType(name) for name in ("torch", "onnx", "onnxscript")})
+from vggtgeo.models.exporters import export
+def write(recipe, request, path, *_):
+    path.write_bytes(b"half of it")
+    print(path.parent, flush=True, file=sys.__stdout__)  # what exporters print is not shown
+    time.sleep(20)
+export._write = write
+from vggtgeo.cli import main
+main()
+"""
+"""`vggtgeo`, whose exports stop in the middle of the file, without torch."""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_an_export_that_is_ended_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
+    # Proves that SIGTERM and Ctrl-C in the middle of an export take its temporary folder away. Oracle: the folder.
+    marker = tmp_path / "code" / RECIPES["mlsd"].checkout.marker
+    marker.parent.mkdir(parents=True)
+    marker.touch()
+    arguments = ["models", "export", "mlsd", "--random-weights", "--source", tmp_path / "code"]
+    command = [sys.executable, "-c", SLOW, *arguments, "-o", tmp_path / "out/mlsd.onnx"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        folder = Path(process.stdout.readline().strip())
+        assert folder.parent == tmp_path / "out"
+        assert [file.name for file in folder.iterdir()] == ["mlsd.onnx"]
+        process.send_signal(number)
+        process.wait(30)
+    assert process.returncode == 128 + number
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_every_contract_can_be_exported() -> None:

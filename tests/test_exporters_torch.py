@@ -33,6 +33,8 @@ SMALL = {
     "mast3r_encoder": {"variant": "test", "height": 96, "width": 128},
     "mast3r_decoder": {"variant": "test", "height": 96, "width": 128},
     "mlsd": {},
+    "alike": {"variant": "tiny", "height": 96, "width": 128},
+    "xfeat": {"height": 96, "width": 128},
 }
 HALF = ("vggt", "dinov3", "moge2", "mast3r_encoder", "mast3r_decoder")
 

@@ -30,6 +30,8 @@ from vggtgeo.slam.known_map import as_map, save_map
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.judge import judge
 
 FRAMES, HALF = 18, 9
 FIXED = replace(SETTINGS, keyframes=replace(SETTINGS.keyframes, localise_only=True))
@@ -152,6 +154,8 @@ def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     slam = run(0, 6, seed=3, settings=FIXED, known_map=known)
     assert not any(record.tracked for record in slam.frames)
     assert len(slam.waiting) == 6
+    assert "none of the 6 frames was found in the known map" in judge(slam).reasons[0]
+    assert not Estimate.of(first_half()).in_known_map
 
 
 def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:

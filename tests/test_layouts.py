@@ -347,6 +347,17 @@ def test_a_stream_is_read_until_it_ends(tmp_path: Path) -> None:
         open_sequence("rtsp://127.0.0.1:9/nothing")
 
 
+def test_a_camera_that_is_not_there_is_one_error(capfd: pytest.CaptureFixture[str]) -> None:
+    # Proves that OpenCV's own warnings do not stand before the error, and that its level of logging stays as it was.
+    # Oracle: the process's stderr.
+    logging = cv2.utils.logging
+    level = logging.getLogLevel()
+    with pytest.raises(InputError, match="`webcam:97` cannot be opened: is the camera there"):
+        open_sequence("webcam:97")
+    assert capfd.readouterr().err == ""
+    assert logging.getLogLevel() == level
+
+
 def test_a_video_of_varying_rate_has_its_own_times(tmp_path: Path) -> None:
     # Proves that frames of a phone's video have the times of the container, not those of a mean rate. Oracle: a file
     # with a pause of a quarter of a second.

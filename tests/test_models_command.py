@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from vggtgeo.models.onnx.session import open_session
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.network_files import fetch_network, networks_folder
+from vggtgeo.slam.presets import perception
 
 SMALL = NETWORKS["moge2-small"]
 
@@ -37,9 +39,13 @@ def test_every_network_is_listed_with_its_terms(tmp_path: Path) -> None:
     assert [row["name"] for row in found["networks"]] == list(NETWORKS)
     assert [row["name"] for row in found["networks"] if row["present"]] == ["letr"]
     assert all(row["licence"] and row["allows"] and row["paper"] and row["megabytes"] > 0 for row in found["networks"])
+    uses = {row["name"]: row["use"] for row in found["networks"]}
+    assert uses["dinov3"] == "--line-matcher dinov3 --confidence dinov3"
+    assert uses["mast3r_decoder"] == "--points mast3r"
     text = invoke("models", "list", "--models", tmp_path).output
     for row in found["networks"]:
-        assert f"{row['paper']}\n    {row['licence']}: {row['allows']}\n    {row['get']}" in text
+        terms = f"{row['licence']}: {row['allows']}"
+        assert "\n    ".join((row["paper"], terms, row["get"], f"vggtgeo run PATH {row['use']}")) in text
     assert "vggtgeo models fetch moge2\n" in text
     assert "letr  present, random weights: its answers mean nothing" in text
     assert [row["name"] for row in found["networks"] if row["random"]] == ["letr"]
@@ -226,9 +232,37 @@ def test_another_content_is_not_kept(tmp_path: Path, entry: Network) -> None:
         with pytest.raises(InputError, match="it was replaced by its authors; nothing was downloaded"):
             fetch_network(entry, tmp_path, hub.address)
         assert {method for method, _ in hub.requests} == {"HEAD"}
+    sentence = "its authors replaced it, or the download was damaged; nothing was kept"
+    with serve(Hub(other, etag="0" * 40)) as hub, pytest.raises(InputError, match=sentence):
+        fetch_network(entry, tmp_path, hub.address)
+    with serve(Hub(other)) as hub, pytest.raises(InputError, match="else make it from the weights: vggtgeo models exp"):
+        fetch_network(entry, tmp_path, hub.address)
     with serve(Hub(other, etag=entry.hub.sha256)) as hub, pytest.raises(InputError, match="the download was damaged"):
         fetch_network(entry, tmp_path, hub.address)
     assert [path for path in tmp_path.iterdir() if path.is_file()] == []
+
+
+def test_a_file_is_carried_to_a_machine_without_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves the steps of docs/models.md: fetched on one machine, copied, checked and used on another, where nobody
+    # answers; a file that was damaged on the way is not taken for the right one. Oracle: a server that is gone.
+    content = tiny.moge2(tmp_path / "published.onnx").read_bytes()
+    hub_file = HubFile("someone/something", "model.onnx", hashlib.sha256(content).hexdigest())
+    monkeypatch.setitem(NETWORKS, SMALL.name, replace(SMALL, hub=hub_file))
+    with serve(Hub(content)) as hub:
+        done = invoke("models", "fetch", SMALL.name, "--models", tmp_path / "one", "--endpoint", hub.address)
+    assert done.exit_code == 0, done.output
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    file = tmp_path / "two" / SMALL.file
+    again = invoke("models", "fetch", SMALL.name, "--models", tmp_path / "two", "--endpoint", hub.address)
+    assert again.stdout.strip() == str(file)
+    assert invoke("models", "verify", file, "--runs", 1).exit_code == 0
+    roles = perception("classical", None, tmp_path / "two", mixed={"depth": SMALL.name}).roles
+    assert np.isfinite(roles.depth.estimate(views.texture(0, (64, 48)), None, (55.4, 55.4, 31.5, 23.5)).depth).any()
+    file.write_bytes(content[:-1])
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    damaged = invoke("models", "fetch", SMALL.name, "--models", tmp_path / "two", "--endpoint", hub.address)
+    assert damaged.exit_code == 2
+    assert "could not be downloaded" in damaged.output
 
 
 def test_what_cannot_be_fetched_says_why(tmp_path: Path, entry: Network) -> None:

@@ -88,8 +88,8 @@ def test_values_that_are_not_finite_cost_the_answer_only() -> None:
     assert not np.isfinite(depth.estimate(IMAGE).depth).any()
     assert len(lines.detect(IMAGE)) == 0
     assert (confidence.confidence(IMAGE) == AVERAGE).all()
-    nothing = Features(np.zeros((0, 2)), np.zeros(0))
-    assert len(points.match(nothing, nothing)) == 0
+    some = Features(np.ones((3, 2)), np.ones(3))
+    assert len(points.match(some, some)) == 0
     guess = window.window([IMAGE, IMAGE])
     assert not guess.found.any()
     assert not np.isfinite(guess.depth).any()

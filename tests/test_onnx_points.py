@@ -1,4 +1,4 @@
-"""MASt3R and DINOv3 behind ONNX, and the cache of what networks answer."""
+"""MASt3R, ALIKE, XFeat and DINOv3 behind ONNX, and the cache of what networks answer."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +8,9 @@ import plane_views as views
 import pytest
 import tiny_networks as tiny
 from vggtgeo.models.onnx import contracts
+from vggtgeo.models.onnx.bounds import BoundedPoints
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
+from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks, vectors_at
 from vggtgeo.models.onnx.dinov3 import DescriptorGrid, DinoFeatures, saliency
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.fit import Fit
@@ -53,6 +55,68 @@ def test_blank_images_have_no_key_points(tmp_path: Path) -> None:
     assert len(blank) == 0
     assert len(matcher.match(blank, full)) == 0
     assert len(matcher.match(full, blank)) == 0
+
+
+@pytest.mark.parametrize("size", [SIZE, ("H", "W")], ids=["fixed", "open"])
+def test_key_points_of_maps_follow_the_known_motion(tmp_path: Path, size: tuple) -> None:
+    # Proves key points, their vectors and their matches, of a file with the size of the images (no multiple of 32, so
+    # that they are resized) fixed or open: the tiny network's maps are filters of the image. Oracle: the homography
+    # between two views of a plane; a blank image.
+    fixed = (256, 320) if size == SIZE else size
+    session = open_session(tiny.alike(tmp_path / "alike.onnx", fixed), contracts.ALIKE)
+    matcher = DensePointMatcher(session)
+    assert isinstance(matcher, PointMatcher)
+    first, second, homography = views.plane_pair(MOTION)
+    described = matcher.describe(first), matcher.describe(second)
+    assert np.allclose(np.linalg.norm(described[0].descriptors.vectors, axis=1), 1.0, atol=1e-5)
+    matches = matcher.match(*described)
+    errors = np.linalg.norm(views.move(homography, matches.pixels_i) - matches.pixels_j, axis=1)
+    measured = f"{len(matches)} matches, median error {np.median(errors):.3f} px, {np.mean(errors > 3):.1%} wrong"
+    assert len(matches) > 150, measured
+    assert np.median(errors) < 0.2, measured
+    assert np.mean(errors > 3) < 0.03, measured
+    assert (described[1].pixels[matches.index_j] - matches.pixels_j).max() < 3
+    blank = matcher.describe(np.full((*SIZE, 3), 90, np.uint8))
+    assert len(blank) == 0
+    assert len(matcher.match(blank, described[0])) == len(matcher.match(described[0], blank)) == 0
+
+
+def test_answers_that_are_no_maps_give_no_key_point(tmp_path: Path) -> None:
+    # Proves that scores of NaN cost the image, not the run, and are counted. Oracle: the count.
+    maps = {"scores": np.full((1, 1, 64, 64), np.nan), "descriptors": np.ones((1, 8, 64, 64))}
+    file = tiny.constant(tmp_path / "alike.onnx", "alike", {"image": (1, 3, 64, 64)}, maps)
+    matcher = BoundedPoints(DensePointMatcher(open_session(file, contracts.ALIKE)))
+    nothing = matcher.describe(np.zeros((64, 64, 3), np.uint8))
+    assert len(nothing) == 0
+    assert len(matcher.match(nothing, nothing)) == 0
+    assert (matcher.refusals.asked, matcher.refusals.without) == (1, 1)
+
+
+def test_peaks_and_vectors_lie_between_pixels() -> None:
+    # Proves the place of a maximum between pixels, the least score, and vectors of a map as large as the image and of
+    # one 8 times coarser. Oracle: a bell at a known place, a map that is linear in the place.
+    y, x = np.mgrid[:64, :96].astype(np.float64)
+    bell = np.exp(-0.5 * ((x - 40.3) ** 2 + (y - 20.8) ** 2) / 4) + 0.3 * (np.hypot(x - 70, y - 30) < 0.5)
+    places, values = peaks(bell, 0.2)
+    np.testing.assert_allclose(places[values.argmax()], [40.3, 20.8], atol=0.05)
+    assert len(places) == 2
+    assert len(peaks(bell, 0.5)[0]) == 1
+    for step in (1, 8):
+        rows, columns = (np.arange(0, side, step) + 0.5 * (step - 1) for side in (64, 96))
+        grid = np.stack(np.broadcast_arrays(columns[None, :], rows[:, None], 50.0))
+        found = vectors_at(grid, np.array([[40.3, 20.8], [12.0, 9.5]]), (64, 96))
+        for vector, place in zip(found, ((40.3, 20.8, 50.0), (12.0, 9.5, 50.0)), strict=True):
+            np.testing.assert_allclose(vector, np.array(place) / np.linalg.norm(place), atol=1e-5)
+
+
+def test_xfeat_s_blocks_have_vectors(tmp_path: Path) -> None:
+    # Proves the adapter on the other contract, and that the two are told apart by their signatures. Oracle: shapes.
+    file = tiny.xfeat(tmp_path / "xfeat.onnx")
+    features = DensePointMatcher(open_session(file, contracts.XFEAT)).describe(views.texture(0, (128, 96)))
+    assert features.descriptors.vectors.shape == (len(features), 64)
+    assert len(features) > 20
+    with pytest.raises(NetworkFileError, match="it looks like a file of `xfeat`"):
+        open_session(file, contracts.ALIKE)
 
 
 def test_an_image_is_encoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

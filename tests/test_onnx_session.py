@@ -20,6 +20,8 @@ MAKERS = {
     "mlsd": tiny.mlsd,
     "mast3r_encoder": tiny.mast3r_encoder,
     "mast3r_decoder": tiny.mast3r_decoder,
+    "alike": tiny.alike,
+    "xfeat": tiny.xfeat,
 }
 
 
@@ -218,7 +220,7 @@ def test_cuda_is_refused_where_there_is_none(monkeypatch: pytest.MonkeyPatch) ->
     available = "vggtgeo.models.onnx.session.onnxruntime.get_available_providers"
     monkeypatch.setattr(available, lambda: ["CPUExecutionProvider"])
     assert choose_provider("auto") == "cpu"
-    with pytest.raises(NetworkFileError, match=r"pip install -e \.\[gpu\]"):
+    with pytest.raises(NetworkFileError, match=r"pip install -e '\.\[gpu\]'"):
         choose_provider("cuda")
     monkeypatch.setattr(available, lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     assert choose_provider("auto") == "cuda"

@@ -1,15 +1,18 @@
 """The package imports from anywhere, as a wheel and editable, and collides with nobody's folders."""
 
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
 from conftest import ROOT
+from vggtgeo.models.extras import install_hint
 
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "vggtgeo", "solvers", "models")
 
@@ -32,6 +35,20 @@ while pending:
         pending += [f"{name}.{m.name}" for m in pkgutil.iter_modules(getattr(module, "__path__", ()))]
 print("rerun imported\\t" * ("rerun" in sys.modules))
 """
+
+
+def test_every_hint_to_install_names_an_extra_that_is_there() -> None:
+    # Proves that what is said of a missing package works in a clone: one function writes it, and each extra that the
+    # code asks for is in pyproject.toml. Oracle: the sources, pyproject.toml.
+    sources = [file for folder in ("vggtgeo", "models", "solvers") for file in (ROOT / folder).rglob("*.py")]
+    texts = {file.name: file.read_text(encoding="utf-8") for file in sources}
+    asked = {extra for text in texts.values() for extra in re.findall(r"install_hint\([\"'](\w+)", text)}
+    assert asked == {"bags", "bench", "cluster", "export", "fetch", "gpu", "maps"}
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    assert asked <= set(known)
+    assert [name for name, text in texts.items() if "pip install" in text] == ["extras.py"]
+    assert "`pip install -e '.[gpu]'` in a clone" in install_hint("gpu")
+    assert any(package.startswith("jupyterlab") for package in known["notebooks"])
 
 
 def _run(*arguments: str, cwd: Path = ROOT) -> str:

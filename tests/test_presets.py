@@ -7,6 +7,7 @@ import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -14,16 +15,17 @@ import tiny_networks as tiny
 from tiny_sequences import seven_scenes
 from typer.testing import CliRunner
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
-from vggtgeo.models.onnx.registry import NETWORKS
+from vggtgeo.models.onnx.registry import NETWORKS, files_of, players
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import PoseQuery
 from vggtgeo.models.window_locator import WindowLocator
 
 from vggtgeo.cli.main import make_app
+from vggtgeo.cli.models import FLAGS
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.simulation.sequence import SyntheticSequence, simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
-from vggtgeo.slam.presets import NEEDED, Perception, perception
+from vggtgeo.slam.presets import CHOICES, NEEDED, Perception, perception
 from vggtgeo.slam.run import frame_trajectory, run
 from vggtgeo.slam.setting_groups import RefinementSettings
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -47,6 +49,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tiny.mlsd(folder / "mlsd.onnx")
     tiny.mast3r_encoder(folder / "mast3r_encoder.onnx", SIZE)
     tiny.mast3r_decoder(folder / "mast3r_decoder.onnx", SIZE, reach=4)
+    for name in ("alike", "alike-tiny"):
+        tiny.alike(folder / f"{name}.onnx", SIZE)
+    tiny.xfeat(folder / "xfeat.onnx", SIZE)
     return folder
 
 
@@ -316,5 +321,48 @@ def test_roles_are_mixed_by_name(files: Path) -> None:
     assert set(less.networks) == {"dinov3-small", "letr"}
     assert less.roles.depth is classical.depth
     assert less.roles.line_matches.source.features is less.roles.confidence.source
-    with pytest.raises(InputError, match="`lines` is 'moge2'; what can be mixed is points: classical, mast3r;"):
+    with pytest.raises(InputError, match="`lines` is 'moge2'; what can be mixed is points: classical, orb, mast3r,"):
         perception("classical", classical, files, mixed={"lines": "moge2"})
+
+
+def test_every_mixture_of_roles_is_reached_from_the_command_line(
+    files: Path, tmp_path: Path, called: dict[str, object]
+) -> None:
+    # Proves that each name of each role can be given as a flag, alone and together, is played by its own class and
+    # opens its own files; and that a role that nothing asks opens none. Oracle: the classes, the files.
+    def run(*flags: str) -> set[str]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)
+            result = _run(tmp_path, "--models", files, *flags)
+        assert result.exit_code == 0, result.output
+        return set(called["facts"].get("networks", {}))
+
+    kinds = {
+        "mast3r": "Mast3rMatcher", "alike": "DensePointMatcher", "alike-tiny": "DensePointMatcher",
+        "xfeat": "DensePointMatcher", "mlsd": "MlsdDetector", "letr": "LetrDetector", "moge2": "MogeDepth",
+        "moge2-small": "MogeDepth", "vggt": "BoundedWindow", "orb": "OrbMatcher",
+        "constant-velocity": "ConstantVelocity",
+    }  # fmt: skip
+    for role, names in CHOICES.items():
+        for name in names:
+            networks = run(FLAGS[role], name)
+            assert networks == (set(files_of(name)) if name in players(role) else set()), name
+            player = getattr(called["roles"], role)
+            found = type(getattr(player, "source", getattr(player, "model", player))).__name__
+            dense = {"line_matches": "DenseLineMatcher", "confidence": "DinoFeatures"}
+            expected = dense[role] if name.startswith("dinov3") else kinds.get(name)
+            assert expected in (None, found), name
+    mixed = ("--depth", "moge2", "--points", "alike", "--lines", "mlsd", "--confidence", "dinov3-small")
+    assert run(*mixed, "--line-matcher", "dinov3") == {"moge2", "alike", "mlsd", "dinov3-small", "dinov3"}
+    assert run("--preset", "light", "--no-lines", "--no-confidence") == {"moge2-small"}
+    assert run("--preset", "light", "--no-lines") == {"moge2-small", "dinov3-small"}
+    assert called["roles"].flow is None or called["roles"].follows is False
+
+
+def test_the_flags_name_those_who_can_play() -> None:
+    # Proves that the names of the flags are those of the roles. Oracle: the registry.
+    hints = get_type_hints(importlib.import_module("vggtgeo.cli.run").run)
+    for role, flag in FLAGS.items():
+        choice = get_args(hints[flag.lstrip("-").replace("-", "_")])[0]
+        assert set(get_args(choice)) == set(CHOICES[role]), flag
+    assert set(FLAGS) == set(CHOICES)

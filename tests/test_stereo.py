@@ -7,7 +7,8 @@ from functools import cache
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vggtgeo.models.roles import Features, LineFeatures, Segments
+from vggtgeo.models.classical import SensorDepth
+from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
@@ -21,6 +22,15 @@ from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.keyframe_images import KeyframeImages
 
 SIZE = (200, 150)
+
+
+class DepthOfANetwork:
+    """A `MetricDepth` that is no sensor's."""
+
+    def estimate(self, image: np.ndarray, sensor_depth: object = None, intrinsics: object = None) -> DepthEstimate:
+        raise NotImplementedError
+
+
 SMOOTH, JUMP = 0.04, 0.5
 
 
@@ -199,6 +209,11 @@ def test_what_cannot_be_is_refused() -> None:
         check_dense("magic", True)
     with pytest.raises(vg.InputError, match="`dense` is 'sensor', but no depth was measured"):
         check_dense("sensor", False)
+    with pytest.raises(vg.InputError, match="`dense` is 'network', but no network plays the role of depth; choose one"):
+        check_dense("network", True, SensorDepth())
+    with pytest.raises(vg.InputError, match="`dense` is 'sensor', but depth is a network's; take `network`"):
+        check_dense("sensor", True, DepthOfANetwork())
+    check_dense("network", True, DepthOfANetwork())
     with pytest.raises(vg.InputError, match="`window` must be odd"):
         StereoSettings(window=4)
     with pytest.raises(vg.InputError, match="`planes` is 2"):

@@ -27,3 +27,12 @@ def test_a_run_that_never_began_has_failed(healthy: Walk) -> None:
     never = replace(healthy.estimate, tracked=np.arange(40) == 0)
     assert [f.level for f in check_record(never)] == ["failed"]
     assert [f.level for f in check_record(replace(healthy.estimate, started=False))] == ["failed"]
+
+
+def test_a_run_that_is_found_nowhere_in_a_map_says_so(healthy: Walk) -> None:
+    """In a known map the reason is that no frame, or one alone, was found there; oracle: the sentence."""
+    for found, word in ((0, "none"), (1, "1")):
+        estimate = replace(healthy.estimate, tracked=np.arange(40) < found, in_known_map=True)
+        (finding,) = check_record(estimate)
+        assert finding.level == "failed"
+        assert finding.text.startswith(f"{word} of the 40 frames was found in the known map: they show another place")

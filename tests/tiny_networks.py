@@ -165,6 +165,54 @@ def mast3r_decoder(path: Path, size: tuple[int, int] = (48, 64), reach: int = 7)
     return save(path, nodes, inputs, outputs, constants, metadata)
 
 
+def alike(path: Path, size: Sequence[int | str] = (96, 128), channels: int = 24) -> Path:
+    """Scores: how much a pixel differs from its surroundings. Descriptors: random filters of the image around it."""
+    constants = {**_spot(), "filters": _filters(channels)}
+    nodes = [*_scores(), *_vectors("image", "descriptors")]
+    outputs = {"scores": (1, 1, *size), "descriptors": (1, channels, *size)}
+    metadata = {METADATA_NETWORK: "alike", METADATA_WEIGHTS: "random"}
+    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, metadata)
+
+
+def xfeat(path: Path, size: tuple[int, int] = (96, 128)) -> Path:
+    """The same, with descriptors of 8 x 8 blocks."""
+    blocks = (1, 64, size[0] // 8, size[1] // 8)
+    pool = helper.make_node("AveragePool", ["every pixel"], ["block_descriptors"], kernel_shape=[8, 8], strides=[8, 8])
+    nodes = [*_scores(), *_vectors("image", "every pixel"), pool]
+    outputs = {"scores": (1, 1, *size), "block_descriptors": blocks}
+    metadata = {METADATA_NETWORK: "xfeat", METADATA_WEIGHTS: "random"}
+    constants = {**_spot(), "filters": _filters(64)}
+    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, metadata)
+
+
+def _spot() -> dict[str, np.ndarray]:
+    """A difference of two Gaussians over all colours, and the border that it needs."""
+    y, x = np.mgrid[-4:5, -4:5]
+    near, far = (np.exp(-0.5 * (x**2 + y**2) / sigma**2) for sigma in (1.0, 2.0))
+    spot = np.tile(near / near.sum() - far / far.sum(), (1, 3, 1, 1)).astype(np.float32)
+    return {"spot": spot, "border": np.array([0, 0, 4, 4, 0, 0, 4, 4])}
+
+
+def _filters(channels: int, reach: int = 7) -> np.ndarray:
+    filters = np.random.default_rng(1).normal(0, 1, (channels, 3, 2 * reach + 1, 2 * reach + 1))
+    return (filters - filters.mean(axis=(2, 3), keepdims=True)).astype(np.float32)
+
+
+def _scores() -> list[onnx.NodeProto]:
+    return [
+        helper.make_node("Pad", ["image", "border"], ["framed"], mode="edge"),
+        helper.make_node("Conv", ["framed", "spot"], ["response"]),
+        helper.make_node("Abs", ["response"], ["scores"]),
+    ]
+
+
+def _vectors(image: str, name: str) -> list[onnx.NodeProto]:
+    return [
+        helper.make_node("Conv", [image, "filters"], ["maps"], pads=[7] * 4),
+        helper.make_node("LpNormalization", ["maps"], [name], axis=1, p=2),
+    ]
+
+
 def _decoded(view: int, reach: int) -> list[onnx.NodeProto]:
     def name(what: str) -> str:
         return f"{what} {view}"

@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 from vggtgeo.models.exporters.request import ExportError
+from vggtgeo.models.extras import install_hint
 
 
 def load(name: str) -> Any:
@@ -14,8 +15,7 @@ def load(name: str) -> Any:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         raise ExportError(
-            f"exporting needs the package `{error.name}`, which is not installed; "
-            "install the extra `export`: `pip install -e .[export]` in a clone, `pip install vggtgeo[export]` elsewhere"
+            f"exporting needs the package `{error.name}`, which is not installed; {install_hint('export')}"
         ) from None
 
 

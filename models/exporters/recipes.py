@@ -107,6 +107,8 @@ RECIPES = {
         Recipe("letr", "letr", ("resnet50", "resnet101", "test"), (480, 640), half=False),
         Recipe("mast3r_encoder", "mast3r", ("vitl", "test"), (384, 512), "build_encoder", multiple=16),
         Recipe("mast3r_decoder", "mast3r", ("vitl", "test"), (384, 512), "build_decoder", multiple=16),
+        Recipe("alike", "alike", ("normal", "tiny", "small", "large"), (480, 640), multiple=32, half=False),
+        Recipe("xfeat", "xfeat", ("published",), (480, 640), multiple=32, half=False),
         Recipe("mlsd", "mlsd", ("tiny",), (512, 512), fixed_height=512, fixed_width=512, half=False),
     )
 }

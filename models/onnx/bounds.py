@@ -172,15 +172,21 @@ class BoundedPoints:
 
     def describe(self, image: np.ndarray) -> Features:
         """See `PointMatcher.describe`."""
-        return self.source.describe(image)
+        try:
+            return self.source.describe(image)
+        except NetworkValueError:
+            self.refusals.note(1, 1, left=False)
+            return Features(np.zeros((0, 2)), np.zeros(0))
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
         """See `PointMatcher.match`."""
+        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
+        if not (len(features_i) and len(features_j)):
+            return PointMatches(none, none, nowhere, nowhere, np.zeros(0))
         try:
             found = self.source.match(features_i, features_j, predicted)
         except NetworkValueError:
             self.refusals.note(1, 1, left=False)
-            none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
             return PointMatches(none, none, nowhere, nowhere, np.zeros(0))
         self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
         return found

@@ -7,6 +7,7 @@
 | `moge2` | metric depth | Wang et al., 2025 |
 | `letr`, `mlsd` | line segments | Xu et al., CVPR 2021; Gu et al., AAAI 2022 |
 | `mast3r_encoder`, `mast3r_decoder` | point matches | Leroy et al., ECCV 2024 |
+| `alike`, `xfeat` | point matches | Zhao et al., IEEE TMM 2022; Potje et al., CVPR 2024 |
 
 Shapes are written as in a paper: a number is fixed, a letter is any size but the same wherever it stands, `Patches` is
 the number of tokens of an H x W image. A file may leave sizes open; those it fixes must agree.
@@ -79,12 +80,14 @@ class Normalisation:
 class Contract:
     """What one network's file takes and gives, and how an image is prepared for it.
 
-    multiple: H and W are multiples of this. optional tensors may be missing; other tensors beside those named may be
-    outputs (they are not read) but not inputs.
+    role: in words. plays: the fields of `vggtgeo.Roles` that it can be, alone or with another file. multiple: H and W
+    are multiples of this. optional tensors may be missing; other tensors beside those named may be outputs (they are
+    not read) but not inputs.
     """
 
     network: str
     role: str
+    plays: tuple[str, ...]
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
     multiple: int = 1
@@ -94,6 +97,7 @@ class Contract:
 VGGT = Contract(
     network="vggt",
     role="geometry of a window",
+    plays=("geometry",),
     inputs=(Tensor("images", ("views", 3, "H", "W")),),
     outputs=(
         Tensor("pose_enc", ("views", 9)),
@@ -108,6 +112,10 @@ field of view (radians), world -> camera, of views in the frame of the first. `d
 DINOV3 = Contract(
     network="dinov3",
     role="descriptors and dense confidence",
+    plays=(
+        "line_matches",
+        "confidence",
+    ),
     inputs=(Tensor("image", (1, 3, "H", "W")),),
     outputs=(
         Tensor("patch_descriptors", (1, Patches(16), "C")),
@@ -122,6 +130,7 @@ the four registers (the five queries) attend to class token, registers and patch
 MOGE2 = Contract(
     network="moge2",
     role="metric depth",
+    plays=("depth",),
     inputs=(Tensor("image", (1, 3, "H", "W")), Tensor("num_tokens", (), ("int64",), optional=True)),
     outputs=(
         Tensor("points", (1, "H", "W", 3)),
@@ -136,6 +145,7 @@ MOGE2 = Contract(
 LETR = Contract(
     network="letr",
     role="line segments",
+    plays=("lines",),
     inputs=(Tensor("image", (1, 3, "H", "W")),),
     outputs=(Tensor("pred_logits", (1, "Q", 2)), Tensor("pred_lines", (1, "Q", 4))),
     normalisation=Normalisation((0.538, 0.494, 0.453), (0.257, 0.263, 0.273)),
@@ -145,6 +155,7 @@ LETR = Contract(
 MLSD = Contract(
     network="mlsd",
     role="line segments",
+    plays=("lines",),
     inputs=(Tensor("image", (1, 4, 512, 512)),),
     outputs=(Tensor("maps", (1, 9, 256, 256)),),
     normalisation=Normalisation((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
@@ -158,6 +169,7 @@ _MAST3R = Normalisation((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
 MAST3R_ENCODER = Contract(
     network="mast3r_encoder",
     role="point matches",
+    plays=("points",),
     inputs=(Tensor("image", (1, 3, "H", "W")),),
     outputs=(Tensor("features", (1, Patches(16), "C")),),
     multiple=16,
@@ -178,6 +190,7 @@ def _view(number: int) -> tuple[Tensor, ...]:
 MAST3R_DECODER = Contract(
     network="mast3r_decoder",
     role="point matches",
+    plays=("points",),
     inputs=(Tensor("features_1", (1, Patches(16), "C")), Tensor("features_2", (1, Patches(16), "C"))),
     outputs=(*_view(1), *_view(2)),
     multiple=16,
@@ -185,7 +198,26 @@ MAST3R_DECODER = Contract(
 )
 """Both views' points in the frame of the first; descriptors of unit length; confidences above 0."""
 
-CONTRACTS = {
-    contract.network: contract for contract in (VGGT, DINOV3, MOGE2, LETR, MLSD, MAST3R_ENCODER, MAST3R_DECODER)
-}
+ALIKE = Contract(
+    network="alike",
+    role="point matches",
+    plays=("points",),
+    inputs=(Tensor("image", (1, 3, "H", "W")),),
+    outputs=(Tensor("scores", (1, 1, "H", "W")), Tensor("descriptors", (1, "C", "H", "W"))),
+    multiple=32,
+)
+"""RGB in [0, 1]. A score in [0, 1] and a unit vector of each pixel."""
+
+XFEAT = Contract(
+    network="xfeat",
+    role="point matches",
+    plays=("points",),
+    inputs=(Tensor("image", (1, 3, "H", "W")),),
+    outputs=(Tensor("scores", (1, 1, "H", "W")), Tensor("block_descriptors", (1, 64, "rows", "columns"))),
+    multiple=32,
+)
+"""RGB in [0, 1], made grey and normalised inside. A score in [0, 1] of each pixel, a unit vector of each 8 x 8."""
+
+_ALL = (VGGT, DINOV3, MOGE2, LETR, MLSD, MAST3R_ENCODER, MAST3R_DECODER, ALIKE, XFEAT)
+CONTRACTS = {contract.network: contract for contract in _ALL}
 """Every contract by its network's name."""

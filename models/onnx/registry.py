@@ -9,7 +9,11 @@ from vggtgeo.models.onnx.contracts import CONTRACTS, Contract
 
 @dataclass(frozen=True)
 class HubFile:
-    """An ONNX file that its authors publish on the Hugging Face hub. sha256: of the file, hexadecimal."""
+    """An ONNX file that its authors publish on the Hugging Face hub. sha256: of the file, hexadecimal.
+
+    The SHA-256 pins the content, whatever the branch holds by now: a file that was replaced is refused. A commit would
+    pin no more, and none is known for certain.
+    """
 
     repository: str
     path: str
@@ -33,6 +37,7 @@ class Network:
 
     contract_name: key of `CONTRACTS`. weights: where they are published. megabytes: of the float32 file. variant: of
     the export, where it is not the default one. hub: a published ONNX file; None where the file must be exported.
+    part_of: the name by which it is chosen for a role, where it is one of several files.
     """
 
     name: str
@@ -42,6 +47,12 @@ class Network:
     megabytes: int
     variant: str = ""
     hub: HubFile | None = None
+    part_of: str = ""
+
+    @property
+    def choice(self) -> str:
+        """The name by which it is chosen for a role."""
+        return self.part_of or self.name
 
     @property
     def file(self) -> str:
@@ -83,6 +94,12 @@ _MAST3R = Publication(
     "non-commercial use only; see also the terms of its training data",
     "naver/mast3r",
 )
+_ALIKE = Publication(
+    "Zhao et al., ALIKE, IEEE TMM 2022, arXiv:2112.02906", "BSD-3-Clause", "any use", "Shiaoming/ALIKE"
+)
+_XFEAT = Publication(
+    "Potje et al., XFeat, CVPR 2024, arXiv:2404.19174", "Apache-2.0", "any use", "verlab/accelerated_features"
+)
 _MAST3R_WEIGHTS = "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth, linked in the repository"
 
 _ALL = (
@@ -116,8 +133,21 @@ _ALL = (
     ),
     Network("letr", "letr", _LETR, "stage 2 with ResNet-50, linked in the repository", 244),
     Network("mlsd", "mlsd", _MLSD, "models/mlsd_tiny_512_fp32.pth in the repository", 3),
-    Network("mast3r_encoder", "mast3r_encoder", _MAST3R, _MAST3R_WEIGHTS, 1214),
-    Network("mast3r_decoder", "mast3r_decoder", _MAST3R, _MAST3R_WEIGHTS, 1536),
+    Network("mast3r_encoder", "mast3r_encoder", _MAST3R, _MAST3R_WEIGHTS, 1214, part_of="mast3r"),
+    Network("mast3r_decoder", "mast3r_decoder", _MAST3R, _MAST3R_WEIGHTS, 1536, part_of="mast3r"),
+    Network("alike", "alike", _ALIKE, "models/alike-n.pth in the repository", 2),
+    Network("alike-tiny", "alike", _ALIKE, "models/alike-t.pth in the repository", 1, "tiny"),
+    Network("xfeat", "xfeat", _XFEAT, "weights/xfeat.pt in the repository", 3),
 )
 NETWORKS = {network.name: network for network in _ALL}
 """Every network by its name."""
+
+
+def files_of(choice: str) -> tuple[str, ...]:
+    """Names of the networks that are chosen by one name."""
+    return tuple(network.name for network in _ALL if network.choice == choice)
+
+
+def players(role: str) -> tuple[str, ...]:
+    """The names that can be chosen for a role, a field of `vggtgeo.Roles`."""
+    return tuple(dict.fromkeys(network.choice for network in _ALL if role in network.contract.plays))

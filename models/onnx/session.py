@@ -20,6 +20,7 @@ import numpy as np
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime
 from onnxruntime.capi import onnxruntime_pybind11_state as raised
+from vggtgeo.models.extras import install_hint
 from vggtgeo.models.onnx.contracts import METADATA_WEIGHTS, RANDOM_WEIGHTS, Contract
 from vggtgeo.models.onnx.file_checks import (
     NetworkFileError,
@@ -210,10 +211,7 @@ def choose_provider(provider: Provider) -> str:
     """The device, "cuda" or "cpu"; raises `NetworkFileError` if CUDA is asked for and this onnxruntime has none."""
     has_cuda = _PROVIDERS["cuda"] in onnxruntime.get_available_providers()
     if provider == "cuda" and not has_cuda:
-        raise NetworkFileError(
-            "`provider` is cuda, but this onnxruntime runs on the CPU only; install the extra `gpu`: "
-            "`pip install -e .[gpu]` in a clone, `pip install vggtgeo[gpu]` elsewhere"
-        )
+        raise NetworkFileError(f"`provider` is cuda, but this onnxruntime runs on the CPU only; {install_hint('gpu')}")
     return provider if provider != "auto" else "cuda" if has_cuda else "cpu"
 
 

@@ -1,4 +1,4 @@
-"""Runs on a Ray cluster (`pip install "vggtgeo[cluster]"`): a run is a task with processors and, if asked for, a GPU.
+"""Runs on a Ray cluster (extra `cluster`): a run is a task with processors and, if asked for, a GPU.
 
 A task starts the same process with the same limits as `scheduling` does, and hands back its row and its small files,
 which the driver writes into the store: a result is taken once, whatever was tried how often. Ray starts a task again
@@ -25,6 +25,7 @@ from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import JOB, LOG, ROW
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
+from vggtgeo.models.extras import install_hint
 
 RETRIES = 3
 """Of a task whose worker or node is gone."""
@@ -122,7 +123,7 @@ def _connected(cluster: Cluster) -> Any:
     try:
         import ray
     except ImportError:
-        raise InputError("a cluster needs Ray: pip install 'vggtgeo[cluster]'") from None
+        raise InputError(f"a cluster needs Ray; {install_hint('cluster')}") from None
     try:
         _check_answers(cluster.address)
         ray.init(address=cluster.address, log_to_driver=False)

@@ -27,7 +27,8 @@ from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, 
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.simulation import SimulatedOracle, simulate
 from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
-from vggtgeo.slam.presets import Perception, classical_roles, perception
+from vggtgeo.slam.presets import Perception, perception
+from vggtgeo.slam.run import default_roles
 from vggtgeo.slam.settings import Roles
 
 DATA_VARIABLE = "VGGTGEO_DATA"
@@ -228,7 +229,8 @@ def _without(sequence: Sequence, spec: Mapping[str, Any]) -> Sequence:
 
 
 def _perceived(spec: Mapping[str, Any], has_depth: bool) -> Perception:
-    start = spec["start_of_pose"]
     if spec["perception"] == "simulated":
         raise InputError("`perception` is 'simulated', which needs a rendered walk: a sequence with `simulate`")
-    return perception(spec["perception"], classical_roles(has_depth, start, spec["features"]))
+    names = {"points": spec["features"], "geometry": spec["start_of_pose"]}
+    mixed = {role: name for role, name in names.items() if name not in ("sift", "pnp")}
+    return perception(spec["perception"], default_roles(has_depth), mixed=mixed)

@@ -12,6 +12,7 @@ from typing import Any
 from vggtgeo.benchmark.store import Row
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
+from vggtgeo.models.extras import install_hint
 
 FIRST = (
     *("suite", "sequence", "setting", "seed", "status", "message", "simulated", "protocol", "verdict"),
@@ -46,7 +47,7 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise InputError("a Parquet table needs PyArrow: pip install 'vggtgeo[bench]'") from None
+        raise InputError(f"a Parquet table needs PyArrow; {install_hint('bench')}") from None
     values = {name: [row.get(name) for row in rows] for name in columns(rows)}
     table = pyarrow.table({name: pyarrow.array(_alike(column)) for name, column in values.items()})
     with atomic_path(path) as temporary:

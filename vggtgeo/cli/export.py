@@ -30,5 +30,10 @@ def export(
     if as_json:
         typer.echo(json.dumps({"folder": str(target), "format": to, **written}))
     elif not quiet:
-        counts = ", ".join(f"{value:.6g} {name.replace('_', ' ')}" for name, value in written.items())
-        typer.echo(f"{target}: {counts}")
+        typer.echo(f"{target}: {', '.join(_in_words(*item) for item in written.items())}")
+
+
+def _in_words(name: str, value: float) -> str:
+    """`3 images`, `0.42 px mean reprojection error over points`."""
+    unit = " px" if name.endswith("_px") else ""
+    return f"{value:.6g}{unit} {name.removesuffix('_px').replace('_', ' ')}"

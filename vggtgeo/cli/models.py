@@ -25,6 +25,16 @@ Folder = Annotated[
 ]
 Provider = Literal["auto", "cuda", "cpu"]
 
+FLAGS = {
+    "points": "--points",
+    "lines": "--lines",
+    "line_matches": "--line-matcher",
+    "confidence": "--confidence",
+    "geometry": "--init",
+    "depth": "--depth",
+}
+"""The flag of `vggtgeo run` that chooses who plays a role, by the field of `vggtgeo.Roles`."""
+
 models = typer.Typer(
     no_args_is_help=True, add_completion=False, help="List, check, fetch and export the networks of the roles."
 )
@@ -56,6 +66,7 @@ def list_networks(folder: Folder = None, as_json: JsonOption = False) -> None:
         typer.echo(f"    {row['paper']}")
         typer.echo(f"    {row['licence']}: {row['allows']}")
         typer.echo(f"    {row['get']}")
+        typer.echo(f"    vggtgeo run PATH {row['use']}")
     typer.echo(f"folder: {place}")
 
 
@@ -126,5 +137,6 @@ def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
         "paper": network.publication.paper,
         "licence": network.publication.licence,
         "allows": network.publication.allows,
+        "use": " ".join(f"{FLAGS[role]} {network.choice}" for role in network.contract.plays),
         "get": f"vggtgeo models fetch {network.name}" if network.hub else made,
     }

@@ -31,7 +31,9 @@ def _ended_in_order() -> Iterator[None]:
 def export(
     name: Annotated[
         str,
-        typer.Argument(metavar="NAME", help="vggt, dinov3, moge2, letr, mast3r_encoder, mast3r_decoder or mlsd."),
+        typer.Argument(
+            metavar="NAME", help="vggt, dinov3, moge2, letr, mast3r_encoder, mast3r_decoder, mlsd, alike or xfeat."
+        ),
     ],
     source: Annotated[Path, typer.Option(help="Checkout of the network's published code.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.onnx", help="File to write.")],

@@ -40,12 +40,10 @@ def run(
     intrinsics: options.IntrinsicsOption = None,
     rgb_only: options.RgbOnlyOption = False,
     depth_scale: options.DepthScaleOption = None,
-    lines: options.LinesOption = True,
+    no_lines: options.NoLinesOption = False,
     depth_prior: options.DepthPriorOption = True,
-    confidence: options.ConfidenceOption = True,
+    no_confidence: options.NoConfidenceOption = False,
     global_adjustment: options.GlobalOption = True,
-    init: options.InitOption = "pnp",
-    features: options.FeaturesOption = "sift",
     refine_intrinsics: options.RefineIntrinsicsOption = None,
     preset: options.PresetOption = "classical",
     models: options.ModelsOption = None,
@@ -53,7 +51,10 @@ def run(
     provider: options.ProviderOption = "auto",
     memory_limit_gb: options.MemoryOption = None,
     points: options.PointsOption = None,
-    line_detector: options.LineDetectorOption = None,
+    lines: options.LinesOption = None,
+    line_matcher: options.LineMatcherOption = None,
+    confidence: options.ConfidenceOption = None,
+    init: options.InitOption = None,
     depth: options.DepthOption = None,
     dense: options.DenseOption = "auto",
     save_depth: options.SaveDepthOption = False,
@@ -74,17 +75,20 @@ def run(
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
     from vggtgeo.slam.known_map import load_map
-    from vggtgeo.slam.presets import classical_roles
+    from vggtgeo.slam.run import default_roles
     from vggtgeo.slam.setting_groups import DepthSettings
     from vggtgeo.slam.settings_table import Tables
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
-    check_flags(preset, features, memory_limit_gb, fps)
-    check_provider(preset, provider)
+    check_flags(memory_limit_gb, fps)
+    check_provider(provider)
+    if save_depth and dense == "none":
+        text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
+        warnings.warn(text, InputWarning, stacklevel=2)
     switches: dict[str, Tables] = {
-        "lines": {"line": {"use_lines": lines}},
-        "confidence": {"weights": {"use_confidence": confidence}},
+        "no_lines": {"line": {"use_lines": not no_lines}},
+        "no_confidence": {"weights": {"use_confidence": not no_confidence}},
         "depth_prior": {"depth_terms": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},
         "global_adjustment": {"refinement": {"global_adjustment": global_adjustment}},
         "refine_intrinsics": {"camera": {"refine_intrinsics": REFINE[refine_intrinsics]}},
@@ -96,8 +100,12 @@ def run(
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     with collected_warnings() as warned:
         sequence = open_input(path, kind, intrinsics, rgb_only, fps, depth_scale)
-    classical = classical_roles(sequence.has_depth, init, features)
-    mixed = {"points": points, "lines": line_detector, "depth": depth}
+    classical = default_roles(sequence.has_depth)
+    named = {
+        **{"points": points, "lines": lines, "line_matches": line_matcher},
+        **{"confidence": confidence, "geometry": init, "depth": depth},
+    }
+    mixed = mixture(named, no_lines, no_confidence)
     perceived = make_perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
     flags = settings.values() if settings else {}
     run_and_write(
@@ -145,18 +153,31 @@ def _is_map(file: Path) -> bool:
     return True
 
 
-def check_flags(preset: str, features: str, memory_limit_gb: float | None, fps: float | None = None) -> None:
-    """InputError for flags that do not go together, or cannot be."""
-    if preset == "paper" and features != "sift":
-        raise InputError(f"`--features {features}` has no effect with `--preset paper`, whose points are MASt3R's")
+def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool) -> dict[str, str]:
+    """Who plays which role, of those that were named; a role that nothing asks needs no network.
+
+    InputError for a name of a role that is left out.
+    """
+    unasked = {
+        **({"lines": "--no-lines", "line_matches": "--no-lines"} if no_lines else {}),
+        **({"confidence": "--no-confidence"} if no_confidence else {}),
+    }
+    for role, flag in unasked.items():
+        if named[role] is not None:
+            raise InputError(f"`{named[role]}` is named, but `{flag}` leaves its role out; give one of the two")
+    return {role: name for role, name in named.items() if name is not None} | dict.fromkeys(unasked, "classical")
+
+
+def check_flags(memory_limit_gb: float | None, fps: float | None = None) -> None:
+    """InputError for numbers that cannot be."""
     if memory_limit_gb is not None and not 0 < memory_limit_gb < float("inf"):
         raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be a positive number")
     if fps is not None and not 0 < fps <= MOST_FPS:
         raise InputError(f"`--fps` is {fps:g}; it must be a positive number of frames a second, at most {MOST_FPS:g}")
 
 
-def check_provider(preset: str, provider: options.Provider) -> None:
-    """InputError for a GPU that is asked for and not there; a warning where no network would use it."""
+def check_provider(provider: options.Provider) -> None:
+    """InputError for a GPU that is asked for and not there."""
     if provider != "cuda":
         return
     from vggtgeo.io.network_errors import as_input_errors
@@ -164,8 +185,6 @@ def check_provider(preset: str, provider: options.Provider) -> None:
 
     with as_input_errors():
         choose_provider(provider)
-    if preset == "classical":
-        warnings.warn("`--provider cuda` has no effect with `--preset classical`", InputWarning, stacklevel=2)
 
 
 def open_input(
@@ -194,13 +213,16 @@ def make_perception(
     cache: Path | None,
     provider: options.Provider,
     memory_limit_gb: float | None,
-    mixed: Mapping[str, str | None],
+    mixed: Mapping[str, str],
 ) -> Perception:
-    """The roles of a preset, some played by others; warns of networks whose weights are random."""
+    """The roles of a preset, some played by others; warns of networks whose weights are random, and of a GPU that none
+    uses.
+    """
     from vggtgeo.slam.presets import perception
 
-    chosen = {role: name for role, name in mixed.items() if name is not None}
-    perceived = perception(preset, classical, models, cache, provider, memory_limit_gb, chosen)
+    perceived = perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
+    if provider == "cuda" and not perceived.networks:
+        warnings.warn("`--provider cuda` has no effect: no network plays a role", InputWarning, stacklevel=2)
     if perceived.random:
         warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
     return perceived

@@ -20,17 +20,12 @@ IntrinsicsOption = Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixel
 RgbOnlyOption = Annotated[
     bool, typer.Option("--rgb-only/--no-rgb-only", help="Ignore depth images: the scale stays free.")
 ]
-LinesOption = Annotated[bool, typer.Option("--lines/--no-lines", help="Residuals of lines; without them: an ablation.")]
 DepthPriorOption = Annotated[
     bool,
     typer.Option(
         "--depth-prior/--no-depth-prior",
         help="Depth holds the estimate; without it, it starts it only: an ablation.",
     ),
-]
-ConfidenceOption = Annotated[
-    bool,
-    typer.Option("--confidence/--no-confidence", help="Weights by confidence; without it, all are one: an ablation."),
 ]
 GlobalOption = Annotated[
     bool,
@@ -47,21 +42,44 @@ RefineIntrinsicsOption = Annotated[
         show_default=False,
     ),
 ]
-InitOption = Annotated[Literal["pnp", "constant-velocity"], typer.Option(help="How a new frame's pose starts.")]
-FeaturesOption = Annotated[Literal["sift", "orb"], typer.Option(help="Key points.")]
 PresetOption = Annotated[
     Literal["classical", "light", "paper"],
     typer.Option(help="Who perceives: classical code, or networks (see `vggtgeo models list`)."),
 ]
-PointsOption = Annotated[
-    Literal["classical", "mast3r"] | None, typer.Option(help="Who matches points, in place of the preset's choice.")
+NoLinesOption = Annotated[
+    bool, typer.Option("--no-lines/--use-lines", help="Leave out residuals of lines: an ablation.")
 ]
-LineDetectorOption = Annotated[
-    Literal["classical", "mlsd", "letr"] | None,
-    typer.Option(help="Who finds line segments, in place of the preset's choice."),
+NoConfidenceOption = Annotated[
+    bool, typer.Option("--no-confidence/--use-confidence", help="All matches weigh the same: an ablation.")
+]
+# Who plays a role, by the names of `vggtgeo.slam.presets.CHOICES`.
+PointsOption = Annotated[
+    Literal["classical", "orb", "mast3r", "alike", "alike-tiny", "xfeat"] | None,
+    typer.Option(help="Who finds and matches points, in place of the preset's choice; classical is SIFT."),
+]
+LinesOption = Annotated[
+    Literal["classical", "letr", "mlsd"] | None,
+    typer.Option(help="Who finds line segments, in place of the preset's choice; classical is LSD."),
+]
+LineMatcherOption = Annotated[
+    Literal["classical", "dinov3", "dinov3-small"] | None,
+    typer.Option(help="Who matches line segments, in place of the preset's choice; classical is bands of gradients."),
+]
+ConfidenceOption = Annotated[
+    Literal["classical", "dinov3", "dinov3-small"] | None,
+    typer.Option(
+        help="Whose confidence weighs matches, in place of the preset's choice; classical is the structure tensor."
+    ),
+]
+InitOption = Annotated[
+    Literal["classical", "constant-velocity", "vggt"] | None,
+    typer.Option(
+        help="How a new frame's pose starts, in place of the preset's choice; classical is PnP and two views; "
+        "constant-velocity: an ablation."
+    ),
 ]
 DepthOption = Annotated[
-    Literal["classical", "moge2-small", "moge2"] | None,
+    Literal["classical", "moge2", "moge2-small"] | None,
     typer.Option(help="Whose depth is used, in place of the preset's choice; classical is the sensor's."),
 ]
 ModelsOption = Annotated[Path | None, typer.Option("--models", help="Folder of the networks' files.")]

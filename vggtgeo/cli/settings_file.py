@@ -1,6 +1,6 @@
 """Settings files: a TOML file says what the flags say, and a run leaves the settings it used in its folder.
 
-A key is the long name of a flag without its dashes (`rgb-only = true`, `lines = false`, also `no-lines = true`), or the
+A key is the long name of a flag without its dashes (`rgb-only = true`, also `no-rgb-only = false`), or the
 name of an argument (`path = "..."`). A table holds the pipeline's own settings (`[tracking]`, `least_inliers = 20`), as
 `--set tracking.least_inliers=20` does.
 The file takes the place of the defaults, so a flag that is given wins over it.
@@ -135,7 +135,7 @@ def _short(value: Any) -> str:
 
 
 def _affirmed(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
-    """`no-lines = true` as `lines = false`: what a flag can say, a file can."""
+    """`no-global = true` as `global = false`: what a flag can say, a file can."""
     values = dict(given)
     for key, name in _keys(context, negated=True).items():
         if key in values:

@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 bags, read without ROS by the package rosbags (`pip install 'vggtgeo[bags]'`).
+"""ROS 1 and ROS 2 bags, read without ROS by the package rosbags (extra `bags`).
 
 Topics are found by their types: the first with colour images (`sensor_msgs/Image` or `CompressedImage`), the first with
 depth (encoding 16UC1, millimetres, or 32FC1, metres), the camera's `CameraInfo`, and a path of poses for the truth
@@ -21,6 +21,7 @@ from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.models.extras import install_hint
 
 _DELAY = 0.02
 """Seconds between an image and its depth."""
@@ -128,7 +129,7 @@ def _reader(path: Path) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError("bags of ROS need the package rosbags: pip install 'vggtgeo[bags]'") from None
+        raise InputError(f"bags of ROS need the package rosbags; {install_hint('bags')}") from None
     if not path.is_dir() and not path.is_file():  # a pipe has no end
         raise InputError(f"`{path}` is no regular file; give a bag of ROS")
     place = path.parent if path.suffix in (".db3", ".mcap") else path

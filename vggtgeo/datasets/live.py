@@ -5,7 +5,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import cv2
 
@@ -92,7 +92,12 @@ class LiveCamera:
 
 def _capture(source: str) -> cv2.VideoCapture:
     webcam = _WEBCAM.fullmatch(source)
-    capture = cv2.VideoCapture(int(webcam.group(1) or 0) if webcam else source)
+    logging: Any = cv2.utils.logging
+    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the error below says what its warnings would
+    try:
+        capture = cv2.VideoCapture(int(webcam.group(1) or 0) if webcam else source)
+    finally:
+        logging.setLogLevel(level)
     if not capture.isOpened():
         capture.release()
         raise InputError(f"`{source}` cannot be opened: is the camera there, and its address right?")

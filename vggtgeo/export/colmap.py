@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vggtgeo.export.contents import EmptyRunError
 from vggtgeo.export.pictures import copy_pictures
 from vggtgeo.geometry import rigid
 from vggtgeo.io.files import atomic_open
@@ -25,9 +26,12 @@ PINHOLE = 1
 def write_colmap(source: Path, target: Path) -> dict[str, float]:
     """`images/` and `sparse/0/` below `target`, of the run in `source`.
 
-    Returns what was written: counts, and the mean reprojection error in pixels.
+    Returns what was written: counts, and the mean over the points of each one's mean reprojection error, pixels.
+    EmptyRunError where no point was seen from two keyframes.
     """
     scene = Scene.load(source)
+    if not len(scene.tracks):
+        raise EmptyRunError(f"`{source / 'scene.npz'}` has no point that two keyframes saw: there is nothing to export")
     copy_pictures(scene, source, target)
     place_of = _places(scene)
     model = target / "sparse" / "0"
@@ -42,7 +46,7 @@ def write_colmap(source: Path, target: Path) -> dict[str, float]:
         "images": len(scene.frames),
         "points": len(scene.tracks),
         "observations": len(scene.tracks.point),
-        "mean_reprojection_error_px": scene.tracks.mean_error(scene.poses, scene.intrinsics),
+        "mean_reprojection_error_over_points_px": scene.tracks.mean_error(scene.poses, scene.intrinsics),
     }
 
 

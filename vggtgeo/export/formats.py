@@ -5,14 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 from vggtgeo.export.colmap import write_colmap
+from vggtgeo.export.contents import EmptyRunError
 from vggtgeo.export.nerfstudio import write_nerfstudio
 from vggtgeo.export.paths import write_kitti, write_tum
 from vggtgeo.export.surfaces import write_glb, write_las, write_ply
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.results.summary_file import read_summary
 
 FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
     "colmap": write_colmap,
@@ -37,11 +40,13 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
         target: folder, made where it does not exist; by default `export/` and the format's name, in `source`.
 
     Returns:
-        What was written: counts, and for COLMAP the mean reprojection error in pixels.
+        What was written: counts, and for COLMAP the mean over the points of each one's mean reprojection error, pixels.
+        An InputWarning says of a run whose verdict is "failed" why it is.
 
     Raises:
-        InputError: an unknown format, no run in `source`, or files of it that are damaged, `target` is the run itself,
-            or has files in the way that no export wrote, or a package is not installed.
+        InputError: an unknown format, no run in `source`, or files of it that are damaged, the run has no points or no
+            surfaces for this format, `target` is the run itself, or has files in the way that no export wrote, or a
+            package is not installed.
 
     """
     place = Path(source)
@@ -52,6 +57,8 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     output = Path(target) if target is not None else place / "export" / to
     if output.resolve() == place.resolve():
         raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
+    verdict = read_summary(place)[1]
+    failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""
     made = not output.exists()
     output.mkdir(parents=True, exist_ok=True)
     stage = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=output))
@@ -62,10 +69,14 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
         for name in names:
             (output / name).parent.mkdir(parents=True, exist_ok=True)
             (stage / name).replace(output / name)
+    except EmptyRunError as error:
+        raise InputError(f"{error} ({failed})" if failed else str(error)) from None
     finally:
         shutil.rmtree(stage, ignore_errors=True)
         if made and not any(output.iterdir()):
             output.rmdir()
+    if failed:
+        warnings.warn(f"`{place}`: {failed}", InputWarning, stacklevel=2)
     return written
 
 

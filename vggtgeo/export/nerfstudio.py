@@ -6,16 +6,17 @@ pixel. Depth images hold thousandths of the unit in 16 bit, 0 = none (nerfstudio
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from vggtgeo.export.contents import cloud_of
 from vggtgeo.export.pictures import copy_pictures
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.scene import Scene
@@ -30,7 +31,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
 
     A mask is white where the picture has a depth that other views confirm.
     """
-    scene = Scene.load(source)
+    scene, cloud = Scene.load(source), cloud_of(source)
     poses = rigid.invert(scene.poses) @ FLIP
     copy_pictures(scene, source, target)
     frames, deep = [], 0
@@ -42,7 +43,10 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
             frame |= _depth(depth, target, f"{scene.frames[view]:06d}.png")
             deep += 1
         frames.append(frame)
-    PointCloud.load_ply(source / "map.ply").save_ply(target / "points.ply")
+    if not deep:
+        text = f"`{source}` has no `depth/`, so there is none in the export; run again with `--save-depth` to have it"
+        warnings.warn(text, InputWarning, stacklevel=3)
+    cloud.save_ply(target / "points.ply")
     fx, fy, cx, cy = (float(value) for value in scene.intrinsics)
     camera = {"camera_model": "PINHOLE", "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
     size = {"w": scene.size[0], "h": scene.size[1]}

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.geometry.mesh import Mesh
-from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.export.contents import cloud_of, mesh_of
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
+from vggtgeo.models.extras import install_hint
 
 UPRIGHT = np.array([1.0, -1.0, -1.0])
 """From y down, z forward (the first camera's axes) to glTF's y up, z backward."""
@@ -21,51 +21,43 @@ _LAS_COUNTS = 2**31 - 1
 
 def write_ply(source: Path, target: Path) -> dict[str, float]:
     """`cloud.ply`, and `mesh.ply` where the run has a mesh."""
-    cloud = PointCloud.load_ply(source / "map.ply")
+    cloud = cloud_of(source)
     cloud.save_ply(target / "cloud.ply")
     if not (source / "mesh.ply").is_file():
         return {"points": len(cloud), "faces": 0}
-    mesh = Mesh.load_ply(source / "mesh.ply")
+    mesh = mesh_of(source)
     mesh.save_ply(target / "mesh.ply")
     return {"points": len(cloud), "faces": len(mesh.faces)}
 
 
 def write_glb(source: Path, target: Path) -> dict[str, float]:
-    """`map.glb`: the mesh where the run has one, else the cloud; the first camera's down is down."""
+    """`map.glb`: the mesh; the first camera's down is down."""
     trimesh = _package("trimesh")
-    if (source / "mesh.ply").is_file():
-        mesh = Mesh.load_ply(source / "mesh.ply")
-        shape = trimesh.Trimesh(
-            mesh.vertices * UPRIGHT,
-            mesh.faces,
-            vertex_normals=mesh.normals * UPRIGHT,
-            vertex_colors=mesh.colours,
-            process=False,
-        )
-        counts: dict[str, float] = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    else:
-        cloud = PointCloud.load_ply(source / "map.ply")
-        if not len(cloud):
-            raise InputError(f"`{source / 'map.ply'}` has no points, and there is no mesh: nothing to export")
-        shape = trimesh.PointCloud(cloud.points * UPRIGHT, colors=cloud.colours)
-        counts = {"vertices": len(cloud), "faces": 0}
+    mesh = mesh_of(source)
+    shape = trimesh.Trimesh(
+        mesh.vertices * UPRIGHT,
+        mesh.faces,
+        vertex_normals=mesh.normals * UPRIGHT,
+        vertex_colors=mesh.colours,
+        process=False,
+    )
     with atomic_path(target / "map.glb") as temporary:
         temporary.write_bytes(trimesh.Scene(shape).export(file_type="glb"))
-    return counts
+    return {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
 
 
 def write_las(source: Path, target: Path) -> dict[str, float]:
     """`map.las`, version 1.4, point format 7: places to a millimetre, 16-bit colours."""
     laspy = _package("laspy")
-    cloud = PointCloud.load_ply(source / "map.ply")
-    if len(cloud) and np.ptp(cloud.points.astype(np.float64), axis=0).max() >= LAS_UNIT * _LAS_COUNTS:
+    cloud = cloud_of(source)
+    if np.ptp(cloud.points.astype(np.float64), axis=0).max() >= LAS_UNIT * _LAS_COUNTS:
         raise InputError(
             f"`{source / 'map.ply'}` is {np.ptp(cloud.points, axis=0).max():.3g} m across; LAS in millimetres holds "
             f"{LAS_UNIT * _LAS_COUNTS:.0f} m: export it with `--to ply`"
         )
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales = np.full(3, LAS_UNIT)
-    header.offsets = np.floor(cloud.points.min(axis=0)) if len(cloud) else np.zeros(3)
+    header.offsets = np.floor(cloud.points.min(axis=0))
     record = laspy.LasData(header)
     record.x, record.y, record.z = cloud.points.T.astype(np.float64)
     record.red, record.green, record.blue = (cloud.colours.astype(np.uint16) * 257).T
@@ -79,4 +71,4 @@ def _package(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise InputError(f"this export needs the package `{name}`; `pip install {name}` gets it") from None
+        raise InputError(f"this export needs the package `{name}`; {install_hint('maps')}") from None

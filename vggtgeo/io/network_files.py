@@ -11,6 +11,7 @@ from typing import Any
 import platformdirs
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.models.extras import install_hint
 from vggtgeo.models.onnx.registry import NETWORKS, HubFile, Network
 
 FOLDER_VARIABLE = "VGGTGEO_MODELS"
@@ -48,30 +49,48 @@ def fetch_network(network: Network, folder: Path, endpoint: str | None = None) -
         return target
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f".{network.file}.{source.sha256[:16]}.part"
-    _download(source, part, endpoint)
+    announced = _download(network, source, part, endpoint)
     found = _sha256(part)
     if found != source.sha256:
         part.unlink()
-        raise InputError(f"{_another(source, found)}: the download was damaged; nothing was kept, try again")
+        if announced == source.sha256:
+            raise InputError(f"{_another(source, found)}: the download was damaged; nothing was kept, try again")
+        raise InputError(
+            f"{_another(source, found)}: its authors replaced it, or the download was damaged; nothing was kept, try "
+            f"once again, and {_instead(network)}"
+        )
     os.replace(part, target)
     return target
 
 
-def _download(source: HubFile, part: Path, endpoint: str | None) -> None:
-    """Append to `part` what it lacks. The client's `hf_hub_download` keeps nothing of a download that is cut off."""
+def _download(network: Network, source: HubFile, part: Path, endpoint: str | None) -> str | None:
+    """Append to `part` what it lacks; returns the SHA-256 that the server announced, if any.
+
+    The client's `hf_hub_download` keeps nothing of a download that is cut off.
+    """
     hub, http_get, broken = _hub_client()
     try:
         url = hub.hf_hub_url(source.repository, source.path, revision=source.revision, endpoint=endpoint)
         remote = hub.get_hf_file_metadata(url, token=False, endpoint=endpoint)
-        if len(remote.etag or "") == 64 and remote.etag != source.sha256:
-            raise InputError(f"{_another(source, remote.etag)}: it was replaced by its authors; nothing was downloaded")
+        announced = remote.etag if len(remote.etag or "") == 64 else None
+        if announced not in (None, source.sha256):
+            raise InputError(
+                f"{_another(source, announced)}: it was replaced by its authors; nothing was downloaded; "
+                f"{_instead(network)}"
+            )
         with part.open("ab") as file:
             http_get(remote.location, file, resume_size=file.tell(), expected_size=remote.size)
+        return announced
     except (OSError, hub.errors.HfHubHTTPError, hub.errors.HFValidationError, broken) as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"`{source.repository}/{source.path}` could not be downloaded: {reason}; call again, it goes on from there"
         ) from error
+
+
+def _instead(network: Network) -> str:
+    """What to do where the published file is another one."""
+    return f"else make it from the weights: {network.export_command} (checkout of {network.publication.code})"
 
 
 def _another(source: HubFile, found: str | None) -> str:
@@ -85,7 +104,7 @@ def _hub_client() -> tuple[Any, Any, type[Exception]]:
         from huggingface_hub.file_download import http_get
     except ImportError:
         raise InputError(
-            "fetching needs the package huggingface-hub, which is not installed: `pip install huggingface-hub`"
+            f"fetching needs the package huggingface-hub, which is not installed; {install_hint('fetch')}"
         ) from None
     # The client lets the errors of its HTTP library through, and which library that is depends on its version.
     library = type(huggingface_hub.get_session()).__module__.split(".")[0]

@@ -17,6 +17,8 @@ from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.fusion import fused_mesh, measured_depth
 from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
+from vggtgeo.models.classical import NoDepth, SensorDepth
+from vggtgeo.models.roles import MetricDepth
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
@@ -56,10 +58,17 @@ class DenseMap:
         return found if len(found.faces) else None
 
 
-def check_dense(mode: str, measured: bool) -> None:
-    """InputError for an unknown `mode`, or one that needs depth that was measured where there is none."""
+def check_dense(mode: str, measured: bool, source: MetricDepth | None = None) -> None:
+    """InputError for an unknown `mode`, or one whose depth is not there. source: who measures depth, where known."""
     if mode not in get_args(DenseMode):
         raise InputError(f"`dense` is {mode!r}; it must be one of {', '.join(get_args(DenseMode))}")
+    if mode == "network" and isinstance(source, SensorDepth | NoDepth):
+        raise InputError(
+            "`dense` is 'network', but no network plays the role of depth; choose one (`--depth moge2-small`, or a "
+            "preset), or take `mvs`, the pictures"
+        )
+    if mode == "sensor" and source is not None and not isinstance(source, SensorDepth | NoDepth):
+        raise InputError("`dense` is 'sensor', but depth is a network's; take `network`, or `--depth classical`")
     if mode in ("sensor", "network") and not measured:
         raise InputError(f"`dense` is {mode!r}, but no depth was measured; give frames with depth, or take `mvs`")
 

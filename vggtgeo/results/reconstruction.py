@@ -119,7 +119,7 @@ def reconstruct(
         source = opened(frames, camera, settings)
         source.check(start, end, stride)
         perception = _perception(roles, source.has_depth, seed)
-        check_dense(dense, perception.roles.metric)
+        check_dense(dense, perception.roles.metric, perception.roles.depth)
         selection = (start, end, stride)
         first = _first_state(known_map, source, settings)
         wanted = identity(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 import warnings
@@ -35,6 +34,7 @@ from vggtgeo.results.files import (
 from vggtgeo.results.run_folder import RunFolder, check_finished, taken_beside
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise, with_writing
+from vggtgeo.results.summary_file import read_summary, unusable
 from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pose_uncertainty import PoseUncertainty, frame_uncertainty
@@ -151,20 +151,17 @@ class Result:
         unfinished = check_finished(place)
         if unfinished:
             warnings.warn(unfinished, InputWarning, stacklevel=2)
+        summary, verdict = read_summary(place)
         try:
-            summary = json.loads((place / "summary.json").read_text(encoding="utf-8"))
             fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
-            metric = summary["scale"] == "metric"
-            verdict = Verdict.from_dict(summary["verdict"], metric)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            message = f"`{place}` has no usable `summary.json` ({error}); give a folder that `vggtgeo run` wrote"
-            raise InputError(message) from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise unusable(place, error) from None
         return cls(
             Trajectory.load_tum(place / "trajectory.txt"),
             Trajectory.load_tum(place / "keyframes.txt"),
             PointCloud.load_ply(place / "map.ply"),
             (fx, fy, cx, cy),
-            metric,
+            verdict.metric,
             verdict,
             summary,
             saved_mesh=Mesh.load_ply(place / "mesh.ply") if (place / "mesh.ply").is_file() else None,

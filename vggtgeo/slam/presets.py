@@ -20,7 +20,7 @@ from typing import Any
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.io.network_files import networks_folder
-from vggtgeo.models.classical import ConstantVelocity, NoDepth, OrbMatcher, SiftMatcher
+from vggtgeo.models.classical import ConstantVelocity, OrbMatcher
 from vggtgeo.models.onnx.bounds import (
     BoundedConfidence,
     BoundedDepth,
@@ -31,6 +31,7 @@ from vggtgeo.models.onnx.bounds import (
     Refusals,
 )
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
+from vggtgeo.models.onnx.dense_points import DensePointMatcher
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
 from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
 from vggtgeo.models.onnx.letr import LetrDetector
@@ -38,10 +39,9 @@ from vggtgeo.models.onnx.line_matcher import DenseLineMatcher
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
 from vggtgeo.models.onnx.mlsd import MlsdDetector
 from vggtgeo.models.onnx.moge2 import MogeDepth
-from vggtgeo.models.onnx.registry import NETWORKS
+from vggtgeo.models.onnx.registry import NETWORKS, files_of, players
 from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
-from vggtgeo.models.roles import PointMatcher
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.slam.settings import Roles
 
@@ -63,14 +63,13 @@ PRESETS: dict[str, dict[str, str]] = {
     },
 }
 """The networks of each preset, by role."""
-CHOICES: dict[str, tuple[str, ...]] = {
-    "points": ("classical", "mast3r"),
-    "lines": ("classical", "mlsd", "letr"),
-    "depth": ("classical", "moge2-small", "moge2"),
+_OTHERS = {"points": ("orb",), "geometry": ("constant-velocity",)}
+"""Classical implementations that are not the default."""
+CHOICES = {
+    role: ("classical", *_OTHERS.get(role, ()), *players(role))
+    for role in ("points", "lines", "line_matches", "confidence", "geometry", "depth")
 }
-"""Who may play a role apart from its preset, beside the roles that the caller has (`classical`)."""
-_FILES = {"mast3r": ("mast3r_encoder", "mast3r_decoder")}
-"""The registry's names of what is more than one file."""
+"""Who may play a role apart from its preset: the caller's own (`classical`), other classical code, networks."""
 _BOUNDED: dict[str, Callable[[Any], Any]] = {
     "points": BoundedPoints,
     "lines": BoundedLines,
@@ -79,16 +78,23 @@ _BOUNDED: dict[str, Callable[[Any], Any]] = {
     "confidence": BoundedConfidence,
 }
 """What checks the answers of a network in each role."""
+_KINDS: dict[str, Callable[..., Any]] = {
+    "alike": DensePointMatcher,
+    "letr": LetrDetector,
+    "mlsd": MlsdDetector,
+    "moge2": MogeDepth,
+    "xfeat": DensePointMatcher,
+}
+"""Adapters of one file for one role, by contract."""
 
 
 def _files(roles: Mapping[str, str]) -> tuple[str, ...]:
     """The registry's names of the networks of some roles, each once."""
-    return tuple(dict.fromkeys(file for name in roles.values() for file in _FILES.get(name, (name,))))
+    return tuple(dict.fromkeys(file for name in roles.values() for file in files_of(name)))
 
 
 NEEDED = {preset: _files(roles) for preset, roles in PRESETS.items()}
 """The networks of each preset, by their names in the registry."""
-_FEATURES: dict[str, Callable[[], PointMatcher]] = {"sift": SiftMatcher, "orb": OrbMatcher}
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,22 +134,14 @@ class Perception:
         return f"the weights of {', '.join(self.random)} are random: this result means nothing"
 
 
-def classical_roles(has_depth: bool = True, start: str = "pnp", features: str = "sift") -> Roles:
-    """The classical role objects, for a sequence with or without depth.
-
-    start: how a new frame's pose starts, "pnp" or "constant-velocity". features: "sift" or "orb". InputError for
-    others.
-    """
-    if features not in _FEATURES or start not in ("pnp", "constant-velocity"):
-        raise InputError(
-            f"`features` is {features!r} and `start` {start!r}; they must be one of {', '.join(_FEATURES)}, and of "
-            "pnp, constant-velocity"
-        )
-    roles = Roles(points=_FEATURES[features]())
-    if start == "constant-velocity":
+def _with_others(classical: Roles, parts: Mapping[str, str]) -> Roles:
+    """The caller's roles, with those that other classical code shall play."""
+    if parts.get("points") == "orb":
+        classical = replace(classical, points=OrbMatcher())
+    if parts.get("geometry") == "constant-velocity":
         # The ablation is a start by motion alone: nothing else may mend the pose before the window does.
-        roles = replace(roles, geometry=ConstantVelocity(), alignment=None)
-    return roles if has_depth else replace(roles, depth=NoDepth())
+        classical = replace(classical, geometry=ConstantVelocity(), alignment=None)
+    return classical
 
 
 def perception(
@@ -175,8 +173,9 @@ def perception(
         True
 
     """
-    classical = classical or Roles()
-    parts = _parts(preset, mixed or {})
+    chosen = _parts(preset, mixed or {})
+    classical = _with_others(classical or Roles(), chosen)
+    parts = {role: name for role, name in chosen.items() if name not in ("classical", *_OTHERS.get(role, ()))}
     if not parts:
         return Perception(classical, {})
     needed, place = _files(parts), networks_folder(folder)
@@ -200,15 +199,14 @@ def perception(
 
 
 def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
-    """The network of each role that one plays."""
+    """Who plays each role that the preset or the caller names; InputError for a name that is not there."""
     if preset not in PRESETS:
         raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(PRESETS)}")
     for role, name in mixed.items():
         if name not in CHOICES.get(role, ()):
             known = "; ".join(f"{role}: {', '.join(names)}" for role, names in CHOICES.items())
             raise InputError(f"`{role}` is {name!r}; what can be mixed is {known}")
-    parts = {**PRESETS[preset], **mixed}
-    return {role: name for role, name in parts.items() if name != "classical"}
+    return {**PRESETS[preset], **mixed}
 
 
 def _players(
@@ -224,8 +222,7 @@ def _players(
             return DenseLineMatcher(features[name]) if role == "line_matches" else features[name]
         if name == "mast3r":
             return Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache))
-        kind: Any = {"mlsd": MlsdDetector, "letr": LetrDetector}.get(name, MogeDepth)
-        return kind(networks[name], _cache(cache))
+        return _KINDS[NETWORKS[name].contract_name](networks[name], _cache(cache))
 
     bounded = {role: _BOUNDED[role](player(role, name)) for role, name in parts.items() if role in _BOUNDED}
     refusals = {role: part.refusals for role, part in bounded.items()}
@@ -234,7 +231,7 @@ def _players(
         window = BoundedWindow(model)
         bounded["geometry"] = WindowLocator(window, classical.geometry, views=model.views)
         refusals["geometry"] = window.refusals
-    if {"points", "geometry"} & parts.keys():  # these ask for every frame's own points
+    if parts.get("points") == "mast3r" or "geometry" in parts:  # these ask for every frame's own points
         bounded["flow"] = None
     return bounded, refusals
 

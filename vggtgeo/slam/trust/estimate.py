@@ -26,6 +26,7 @@ class Estimate:
     has. started: whether there ever was a map. by_surface: bool [n], frames that picture and surfaces place beyond
     doubt, without any match; None: no frame. focal_wanted: focal lengths that the last adjustment found if they are
     free, float64 [2], pixels; None where that explained nothing. readout: of the rolling shutter that was found.
+    in_known_map: whether the run began in the map of an earlier one.
     """
 
     frames: np.ndarray
@@ -43,6 +44,7 @@ class Estimate:
     by_surface: np.ndarray | None = None
     focal_wanted: np.ndarray | None = None
     readout: Readout | None = None
+    in_known_map: bool = False
 
     @classmethod
     def of(cls, slam: Slam) -> Self:
@@ -65,6 +67,7 @@ class Estimate:
             np.array([record.evidence.placed_by_surface for record in slam.frames], bool),
             slam.focal_wanted,
             slam.readout,
+            any(keyframe.frame < 0 for keyframe in slam.keyframes),
         )
 
     def __len__(self) -> int:

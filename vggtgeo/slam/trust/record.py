@@ -27,8 +27,7 @@ def check_record(estimate: Estimate) -> list[Finding]:
         return []
     share = float(np.mean(estimate.tracked))
     if not estimate.started or (len(estimate) > 2 and np.count_nonzero(estimate.tracked) <= 1):
-        text = "no map was ever started: there was not enough parallax, or nothing to see; the poses mean nothing"
-        return [Finding("start", "failed", text)]
+        return [Finding("start", "failed", _never_began(estimate))]
     found = []
     stretches = spans(~estimate.tracked)
     serious = 1 - share > MOST_LOST or bridging_error(estimate) > MOST_BRIDGED
@@ -45,6 +44,16 @@ def check_record(estimate: Estimate) -> list[Finding]:
         )
         found.append(Finding("parts", "degraded", text))
     return found
+
+
+def _never_began(estimate: Estimate) -> str:
+    if not estimate.in_known_map:
+        return "no map was ever started: there was not enough parallax, or nothing to see; the poses mean nothing"
+    found, count = np.count_nonzero(estimate.tracked), len(estimate)
+    return (
+        f"{found or 'none'} of the {count} frames was found in the known map: they show another place, or the same one "
+        "from elsewhere or in another light; there is no path to use"
+    )
 
 
 def bridging_error(estimate: Estimate) -> float:

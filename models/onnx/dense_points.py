@@ -1,0 +1,113 @@
+"""ALIKE (Zhao et al., IEEE Transactions on Multimedia 2022) and XFeat (Potje et al., CVPR 2024) as point matchers.
+
+Both answer an image with maps: a score of each pixel and descriptors, of each pixel or of each 8 x 8 block. Key points
+and their vectors are taken of the maps here, and matched as SIFT's are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from vggtgeo.models.checks import check_image
+from vggtgeo.models.classical.key_points import spread
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, match_pixels
+from vggtgeo.models.classical.sub_pixel import PatchAlignment
+from vggtgeo.models.classical.verification import EpipolarVerifier
+from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
+from vggtgeo.models.onnx.fit import Fit, at_multiples
+from vggtgeo.models.onnx.session import Session
+from vggtgeo.models.roles import Features, PointMatches
+
+_RADIUS = 2
+"""Pixels around a key point in which no other may be, as both networks are trained and published."""
+
+
+@dataclass(frozen=True, eq=False)
+class DensePointMatcher:
+    """A `PointMatcher`. Key points: the local maxima of the score map, to a fraction of a pixel, spread over the image.
+
+    count: most key points an image. score: least score, in [0, 1]; ALIKE's authors take 0.2 and XFeat's 0.05, and less
+    keeps the faint ones of white walls. ratio, radius, refinement: as for `SiftMatcher`.
+    """
+
+    session: Session
+    cache: OutputCache = field(default_factory=MemoryCache)
+    count: int = 1500
+    score: float = 0.02
+    ratio: float = 0.92
+    radius: float = 60.0
+    verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)
+    refinement: PatchAlignment | None = field(default_factory=PatchAlignment)
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ValueError(f"`count` is {self.count}, expected at least 1 key point an image")
+        if not 0 < self.ratio <= 1:
+            raise ValueError(f"`ratio` is {self.ratio}, expected a value in (0, 1]; 0.92 is usual")
+
+    def describe(self, image: np.ndarray) -> Features:
+        """Key points and unit vectors of `image` (uint8 [H, W, 3]); none where no score is high enough."""
+        check_image("image", image)
+        settings = ("key points", self.count, self.score)
+        found = self.cache.get((self.session,), settings, (image,), lambda: self._run(image))
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        return Features(found["pixels"], found["scores"], PixelDescriptors(found["vectors"], gray))
+
+    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
+        """Verified matches from view i to view j; see `PointMatcher.match`."""
+        return match_pixels(features_i, features_j, self.ratio, self.verifier, self.refinement, predicted, self.radius)
+
+    def _run(self, image: np.ndarray) -> Outputs:
+        contract = self.session.contract
+        wanted = at_multiples(image.shape[:2], contract.multiple)
+        rows, columns = self.session.inputs["image"].shape[2:]
+        fit = Fit.of(image.shape[:2], (rows or wanted[0], columns or wanted[1]))
+        scores, descriptors = (tensor.name for tensor in contract.outputs)
+        maps = self.session.run({"image": contract.normalisation.apply(fit.resize(image))[None]})
+        places, strength = peaks(maps[scores][0, 0], self.score)
+        pixels = fit.to_image(places)
+        inside = np.flatnonzero(((pixels >= 0) & (pixels <= np.array(image.shape[1::-1]) - 1)).all(axis=1))
+        keep = inside[spread(pixels[inside], strength[inside], self.count, image.shape[1::-1])]
+        vectors = vectors_at(maps[descriptors][0], places[keep], fit.network_size)
+        return {"pixels": pixels[keep], "scores": strength[keep], "vectors": vectors}
+
+
+def peaks(scores: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Local maxima of a map float [H, W] that are above `least`: float64 [M, 2] (x, y), and their values float64 [M].
+
+    The place between pixels is the top of the parabolas through a maximum and its neighbours in each direction; where
+    there is none, on a plateau or along a ridge, is no key point.
+    """
+    values = np.asarray(scores, np.float32)
+    side = 2 * _RADIUS + 1
+    highest = (values == cv2.dilate(values, np.ones((side, side), np.uint8))) & (values > least)
+    inner = np.zeros_like(highest)
+    inner[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS] = True
+    y, x = np.nonzero(highest & inner)
+    top = values[y, x].astype(np.float64)
+    before = np.stack([values[y, x - 1], values[y - 1, x]], axis=1)
+    after = np.stack([values[y, x + 1], values[y + 1, x]], axis=1)
+    bend = 2.0 * top[:, None] - before - after
+    good = (bend > 0).all(axis=1)
+    step = 0.5 * (after - before)[good] / bend[good]  # within half a pixel, as the middle one is highest
+    return np.stack([x, y], axis=1)[good] + step, top[good]
+
+
+def vectors_at(descriptors: np.ndarray, places: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Unit vectors float32 [M, C] of a map float [C, h, w] at `places` (x, y), float [M, 2], between its pixels linear.
+
+    size: (height, width) of the network's input, which `places` are pixels of; the map may be coarser.
+    """
+    scale = np.array(descriptors.shape[:0:-1]) / np.array(size[::-1])
+    last = np.array(descriptors.shape[:0:-1]) - 1
+    at = np.clip(scale * (places + 0.5) - 0.5, 0.0, last)
+    low = np.minimum(np.floor(at).astype(np.int64), np.maximum(last - 1, 0))
+    high = np.minimum(low + 1, last)
+    (u, v), (x0, y0), (x1, y1) = (at - low).T.astype(np.float32), low.T, high.T
+    above = descriptors[:, y0, x0] * (1 - u) + descriptors[:, y0, x1] * u
+    below = descriptors[:, y1, x0] * (1 - u) + descriptors[:, y1, x1] * u
+    mixed = (above * (1 - v) + below * v).T.astype(np.float32)
+    unit: np.ndarray = mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-9)
+    return unit
