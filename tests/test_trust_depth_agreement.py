@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from trust_checks import found_by_depth
 from witness import Walk, walk, with_depth
 
+from vggtgeo.slam.trust.depth_agreement import MOST_OFF, MUCH, depth_ratios
 from vggtgeo.slam.trust.evidence import FrameEvidence
 
 
@@ -88,3 +89,23 @@ def test_a_few_corners_with_depth_say_nothing_of_it(healthy: Walk) -> None:
     told = lambda evidence: "depth and depth" in [f.check for f in found_by_depth(healthy.estimate, evidence)]
     assert told(seen(len(healthy.evidence[0].ids)))
     assert not told(seen(6))
+
+
+@pytest.mark.parametrize(("tracks", "told"), [(30, False), (2000, True)])
+def test_few_corners_are_no_witness_of_a_share(healthy: Walk, tracks: int, told: bool) -> None:
+    """A third of the corners with a depth that is 40 % too long, each wherever it is seen, are told where they are
+    many; the share of a few, though each is seen again and again, may be chance.
+    """
+    ids = np.unique(np.concatenate([frame.ids for frame in healthy.evidence]))
+    kept = np.random.default_rng(0).permutation(ids)[:tracks]
+    wrong = kept[: len(kept) // 3]
+    longer = lambda frame: np.where(np.isin(frame.ids, wrong), 1.4, 1.0) * frame.depth
+    fewer = [
+        replace(f, ids=f.ids[own], pixels=f.pixels[own], depth=f.depth[own])
+        for f in healthy.evidence
+        for own in [np.isin(f.ids, kept)]
+    ]
+    changed = with_depth(fewer, longer)
+    shares = depth_ratios(healthy.estimate, changed)
+    assert np.mean(np.abs(shares.triangulated) > MUCH) > MOST_OFF
+    assert ("depth and motion" in {found.check for found in found_by_depth(healthy.estimate, changed)}) is told

@@ -36,7 +36,9 @@ right."""
 LEAST = 30
 """Corners in a run below which nothing is said."""
 MOST_OFF = 0.25
-"""Share of triangulated corners that may be off."""
+"""Share of triangulated corners that may be off, two standard errors below the share that is found. A corner is seen in
+many frames, and 40 frames have some hundred: 26 % were off in stretches of redkitchen and building-walk whose depth is
+good, 5 % of that by chance; 38 to 69 % are where depth is frozen or that of something that passes."""
 HEALTHY_OFF = 0.15
 MOST_SURFACES_OFF = 0.15
 """Share of |y| > 0.15 that is too much. It is 0.00 to 0.02 on the HoloLens clips and 0.09 on icl-office, whose corners
@@ -50,9 +52,12 @@ MOST_SPREAD = 0.10
 
 @dataclass(frozen=True, eq=False)
 class DepthRatios:
-    """Log ratios with the row of the frame they belong to: triangulated float64 [m], carried float64 [k]."""
+    """Log ratios with the row of the frame they belong to: triangulated float64 [m], with the numbers of their tracks
+    int [m], and carried float64 [k].
+    """
 
     rows: np.ndarray
+    tracks: np.ndarray
     triangulated: np.ndarray
     carried_rows: np.ndarray
     carried: np.ndarray
@@ -65,19 +70,21 @@ class DepthRatios:
 
 def depth_ratios(estimate: Estimate, evidence: Evidence) -> DepthRatios:
     """All corners of tracked frames, `GAPS` apart."""
-    rows, seen, carried_rows, carried = [np.zeros(0, int)], [np.zeros(0)], [np.zeros(0, int)], [np.zeros(0)]
+    rows, tracks, seen = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
+    carried_rows, carried = [np.zeros(0, int)], [np.zeros(0)]
     for gap in GAPS:
         for row in range(len(evidence) - gap):
             if not (estimate.tracked[row] and estimate.tracked[row + gap]):
                 continue
             relative = estimate.poses[row + gap] @ rigid.invert(estimate.poses[row])
-            x, y = _pair(evidence, row, row + gap, relative, estimate.intrinsics)
+            x, own, y = _pair(evidence, row, row + gap, relative, estimate.intrinsics)
             seen.append(x)
+            tracks.append(own)
             rows.append(np.full(len(x), row))
             carried.append(y)
             carried_rows.append(np.full(len(y), row))
     join = np.concatenate
-    return DepthRatios(join(rows), join(seen), join(carried_rows), join(carried))
+    return DepthRatios(join(rows), join(tracks), join(seen), join(carried_rows), join(carried))
 
 
 def agree(ratios: DepthRatios) -> bool:
@@ -98,8 +105,9 @@ def check_depth(estimate: Estimate, ratios: DepthRatios) -> list[Finding]:
         if abs(middle) > MOST_SCALE:
             text = f"the sensor's depth is {np.exp(middle):.2f} times what the motion between the images gives"
             found.append(Finding("depth scale", "degraded", text, scale=True))
-        off = float(np.mean(np.abs(x - middle) > MUCH))
-        if off > MOST_OFF:
+        wrong = np.abs(x - middle) > MUCH
+        off = float(np.mean(wrong))
+        if off - 2 * _standard_error(wrong, ratios.tracks) > MOST_OFF:
             text = (
                 f"{100 * off:.0f} % of the sensor's depths differ by more than {100 * MUCH:.0f} % from what the motion "
                 "between the images gives (5 to 10 % do with good depth): depth and images do not belong together"
@@ -121,9 +129,16 @@ def check_depth(estimate: Estimate, ratios: DepthRatios) -> list[Finding]:
     return found
 
 
+def _standard_error(wrong: np.ndarray, tracks: np.ndarray) -> float:
+    """Of the share of bool [m] that is true, where what is of one track int [m] goes together (Liang, Zeger, 1986)."""
+    apart = wrong - wrong.mean()
+    return float(np.sqrt(np.sum(np.bincount(tracks, apart) ** 2)) / len(wrong))
+
+
 def _pair(
     evidence: Evidence, row: int, other: int, relative: np.ndarray, intrinsics: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangulated log ratios, the numbers of their tracks, and carried log ratios."""
     first, second = evidence[row], evidence[other]
     rows, others = common(first, second)
     before, after = first.pixels[rows].astype(np.float64), second.pixels[others].astype(np.float64)
@@ -138,7 +153,7 @@ def _pair(
     both = np.isfinite(carried[:, 2]) & (carried[:, 2] > 0) & np.isfinite(there)
     both &= np.count_nonzero(both) >= LEAST_COMMON
     sure &= np.count_nonzero(sure) >= LEAST_SHARE * len(sure)
-    return np.log(inverse[sure] * depth[sure]), np.log(carried[both, 2] / there[both])
+    return np.log(inverse[sure] * depth[sure]), first.ids[rows][sure], np.log(carried[both, 2] / there[both])
 
 
 def _across(before: np.ndarray, after: np.ndarray, relative: np.ndarray, intrinsics: np.ndarray) -> float:
