@@ -109,3 +109,6 @@ def test_few_corners_are_no_witness_of_a_share(healthy: Walk, tracks: int, told:
     shares = depth_ratios(healthy.estimate, changed)
     assert np.mean(np.abs(shares.triangulated) > MUCH) > MOST_OFF
     assert ("depth and motion" in {found.check for found in found_by_depth(healthy.estimate, changed)}) is told
+    # That the depths of neighbouring frames contradict each other, too, is a witness of its own.
+    shaken = with_depth(changed, lambda frame: frame.depth * np.where((frame.ids + frame.frame) % 10 == 0, 1.3, 1.0))
+    assert "depth and motion" in {found.check for found in found_by_depth(healthy.estimate, shaken)}
