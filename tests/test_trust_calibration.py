@@ -12,6 +12,7 @@ import pytest
 from trust_checks import found_by_camera
 from witness import SIZE, K, Walk, walk
 
+from vggtgeo.slam.camera_of_pairs import CameraOpinion
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
 
 
@@ -164,3 +165,16 @@ def test_a_focal_length_that_a_map_without_depth_wants_is_told(healthy: Walk) ->
         texts = [f.text for f in check_camera(estimate, None, SIZE)]
         assert ["focal length of about 500 px" in text for text in texts] == [True] * told, factor
     assert check_camera(replace(healthy.estimate, focal_wanted=None), None, SIZE) == []
+
+
+@pytest.mark.parametrize(("value", "told"), [((-0.19, 0, 0, 0), True), ((0, 60, 0, 0), False)])
+def test_few_frames_may_tell_a_focal_length_that_most_pairs_want(
+    healthy: Walk, value: tuple[float, ...], told: bool
+) -> None:
+    """Of eight blocks of time ten deviations are enough for a focal length that 0.9 of the pairs fit better, and
+    too little for a principal point; oracle: Student's t with the blocks' degrees of freedom.
+    """
+    covariance = np.diag(np.square([0.019, 6.0, 6.0, 0.01]))
+    opinion = CameraOpinion(np.array(value, np.float64), covariance, blocks=8, better=0.9)
+    assert opinion.quantile(1e-3) < 10 < opinion.quantile(1e-4)
+    assert bool(check_camera(healthy.estimate, opinion, SIZE)) is told
