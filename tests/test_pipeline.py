@@ -26,6 +26,7 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import compile_global, expected_keyframes
 from vggtgeo.slam.connected import piece_of
+from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.global_shape import padded_count, shape_for
 from vggtgeo.slam.loops import close_loops
@@ -254,6 +255,9 @@ def test_rgb_recovers_the_shape(room) -> None:
     assert not slam.metric
     assert len(slam.frames) == len(frames)
     assert error < 0.03, f"ATE after Sim(3) {error:.4f} m"
+    _, poses = frame_poses(slam)
+    for keyframe in slam.keyframes:
+        assert np.array_equal(poses[keyframe.frame], keyframe.pose)  # the second one began the map with the first
 
 
 @dataclass(frozen=True)

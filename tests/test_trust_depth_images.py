@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from witness import Walk, with_depth
 
@@ -30,3 +31,14 @@ def test_a_wrong_unit_of_depth_is_told(healthy: Walk, factor: float) -> None:
     """A world of 3 mm or of 15 m is no room, even where poses and depth agree with each other."""
     found = check_range(healthy.estimate, with_depth(healthy.evidence, lambda f: factor * f.depth))
     assert [f.scale for f in found] == ([] if factor == 1.0 else [True])
+
+
+def test_a_room_that_ends_at_arms_length_is_told(healthy: Walk) -> None:
+    """Depth of a fifth of its length whose median is no smaller than a desk's is told by how near the farthest of it
+    is; a desk of that median before a room is told nothing.
+    """
+    small = with_depth(healthy.evidence, lambda f: np.clip(0.2 * f.depth, 0.55, 0.9))
+    assert [f.scale for f in check_range(healthy.estimate, small)] == [True]
+    assert "19 in 20 are within 0.9 m" in check_range(healthy.estimate, small)[0].text
+    desk = with_depth(healthy.evidence, lambda f: np.where(np.arange(len(f.depth)) % 12 == 0, 2.0, 0.6))
+    assert check_range(healthy.estimate, desk) == []

@@ -16,7 +16,7 @@ from witness import walk
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.results.checkpoints import CHECKPOINT
-from vggtgeo.slam.trust.enlargement import check_enlargements, followed_enlargement, matched_enlargement
+from vggtgeo.slam.trust.enlargement import check_enlargements, followed_enlargement, matched_corners
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.judge import judge
 
@@ -25,11 +25,18 @@ CHANGED = 5
 
 
 def _enlarged(frame: Frame, factor: float) -> Frame:
-    """By a lens of so many times the focal length."""
+    """By a lens of so many times the focal length, depth with it."""
+    assert frame.depth is not None
     _, _, x, y = recorded_run().sequence.camera.intrinsics
     size = frame.image.shape[1::-1]
     larger = np.array([[factor, 0.0, (1.0 - factor) * x], [0.0, factor, (1.0 - factor) * y]])
-    return replace(frame, image=cv2.warpAffine(frame.image, larger, size, borderMode=cv2.BORDER_REFLECT))
+    image = cv2.warpAffine(frame.image, larger, size, borderMode=cv2.BORDER_REFLECT)
+    depth = cv2.warpAffine(frame.depth, larger, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REFLECT)
+    return replace(frame, image=image, depth=depth)
+
+
+def _by_descriptors(before: np.ndarray, after: np.ndarray, left_out: np.ndarray | None) -> float | None:
+    return followed_enlargement(*matched_corners(before, after, left_out))
 
 
 @pytest.mark.parametrize("factor", [1.7, 1.3, 1 / 1.3, 1 / 1.7])
@@ -51,6 +58,33 @@ def test_a_lens_that_is_changed_is_told_with_its_factor(factor: float) -> None:
             assert float(reason.split("picture is ")[1].split(" times")[0]) == pytest.approx(factor, rel=0.03)
 
 
+@pytest.mark.parametrize("factor", [1.6, 1 / 1.6])
+def test_whoever_comes_nearer_at_once_changed_no_lens(factor: float) -> None:
+    """A cut to where everything is as much nearer (depth says so) is told nothing; the same pictures with the depth as
+    it was are. Oracle: depth divided by the factor.
+    """
+    run = recorded_run()
+    for nearer in (True, False):
+        recorder = EvidenceRecorder(run.sequence.camera)
+        for row, frame in enumerate(run.frames):
+            applied = factor if row >= CHANGED else 1.0
+            larger = _enlarged(frame, applied)
+            assert larger.depth is not None
+            recorder.add(replace(larger, depth=larger.depth / np.float32(applied if nearer else 1.0)))
+        reasons = [reason for reason in judge(run.slam, recorder.frames).reasons if "was the lens changed" in reason]
+        assert len(reasons) == (0 if nearer else 1)
+
+
+def test_depth_of_few_corners_explains_nothing() -> None:
+    """Nine corners with depth say nothing, ten do; oracle: the factor of the corners."""
+    pixels = np.random.default_rng(0).uniform(0, 300, (40, 2)).astype(np.float32)
+    nearer = np.full(40, np.nan)
+    nearer[:9] = np.log(1.5)
+    assert followed_enlargement(pixels, 1.5 * pixels, nearer) == pytest.approx(np.log(1.5), abs=1e-3)
+    nearer[:10] = np.log(1.5)
+    assert followed_enlargement(pixels, 1.5 * pixels, nearer) == pytest.approx(0.0, abs=1e-3)
+
+
 def test_what_has_nothing_in_common_says_nothing() -> None:
     """Corners that move at random, pictures of noise, and few corners have no factor."""
     rng = np.random.default_rng(0)
@@ -58,9 +92,9 @@ def test_what_has_nothing_in_common_says_nothing() -> None:
     assert followed_enlargement(*pixels) is None
     assert followed_enlargement(pixels[0, :10], 1.3 * pixels[0, :10]) is None
     noise = rng.integers(0, 255, (2, 240, 320)).astype(np.uint8)
-    assert matched_enlargement(*noise, None) is None
+    assert _by_descriptors(*noise, None) is None
     flat = np.full((240, 320), 128, np.uint8)
-    assert matched_enlargement(flat, flat, None) is None
+    assert _by_descriptors(flat, flat, None) is None
 
 
 def test_what_the_camera_carries_has_no_say() -> None:
@@ -73,10 +107,10 @@ def test_what_the_camera_carries_has_no_say() -> None:
     left_out = np.zeros(grey.shape, bool)
     left_out[100:] = True
     before, after = np.where(left_out, board, grey), np.where(left_out, board, larger)
-    seen = matched_enlargement(before, after, None)
+    seen = _by_descriptors(before, after, None)
     assert seen is not None
     assert abs(seen) < 0.02
-    assert matched_enlargement(before, after, left_out) == pytest.approx(np.log(1.5), abs=0.05)
+    assert _by_descriptors(before, after, left_out) == pytest.approx(np.log(1.5), abs=0.05)
 
 
 def test_an_older_checkpoint_notes_nothing(tmp_path: Path) -> None:

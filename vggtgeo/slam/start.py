@@ -85,9 +85,12 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
     )
     slam = enter(slam, second, roles, settings)
     slam = adjust(replace(slam, factors=(*slam.factors, scale_anchor(slam))), settings)
-    slam = _place_waiting(slam, slam.keyframes[first.number], roles)
+    first, second = slam.keyframes[first.number], slam.keyframes[number]
+    slam = _place_waiting(slam, first, roles)
     inliers = int(np.count_nonzero(guess.inliers))
-    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, inliers)
+    # The frames between were placed in the map of this moment: what becomes of it later is shared out over them.
+    arrival = (first.number, second.pose @ rigid.invert(first.pose))
+    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, inliers, arrival=arrival)
     return replace(slam, frames=(*slam.frames, record), waiting=())
 
 

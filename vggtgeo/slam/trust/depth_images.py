@@ -4,8 +4,10 @@
   before, while the corners moved by more than `MOVED` pixels, is the same file again.
 - Frames of indoor RGB-D clips have median depths between 0.6 and 4 m (redkitchen 1.7, corridor-office 2.4,
   building-walk 2.3, TUM's desks 1 to 1.5); sensors for rooms begin at 0.2 to 0.5 m and end at 8 to 10. A clip whose
-  median is outside `PLAUSIBLE` was most likely read in a wrong unit. A constant factor between those limits cannot be
-  seen: the world of the run is then as much larger or smaller, and agrees with itself.
+  median is outside `PLAUSIBLE` was most likely read in a wrong unit. So was one that shows nothing farther than
+  `SMALLEST_ROOM`: of each 40 frames of the four clips the farthest twentieth of the depths begins at 2.3 m at the least.
+  A constant factor between those limits cannot be seen: the world of the run is then as much larger or smaller, and
+  agrees with itself.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ LEAST_CHANGED = 0.02
 LEAST_FRAMES = 3
 NEAREST = 0.2
 """Metres: at most a tenth of a room sensor's depths at corners is nearer."""
+SMALLEST_ROOM = 1.0
+"""Metres: of the depths at corners, over the whole run, more than a twentieth is farther."""
 PLAUSIBLE = (0.5, 6.5)
 """Metres, of the median over all frames of their median depth."""
 
@@ -61,6 +65,10 @@ def check_range(estimate: Estimate, evidence: Evidence) -> list[Finding]:
     near = float(np.quantile(corners, 0.1)) if len(corners) else NEAREST
     if near < NEAREST:
         text = f"a tenth of the depths is below {near:.2g} m, nearer than sensors for rooms can see: is the unit right?"
+        return [Finding("depth range", "degraded", text, scale=True)]
+    far = float(np.quantile(corners, 0.95)) if len(corners) else SMALLEST_ROOM
+    if PLAUSIBLE[0] <= middle and far < SMALLEST_ROOM:
+        text = f"of the depths 19 in 20 are within {far:.2g} m, as in no room: is the unit of the depth images right?"
         return [Finding("depth range", "degraded", text, scale=True)]
     if PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
         return []

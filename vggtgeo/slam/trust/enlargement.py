@@ -4,7 +4,8 @@ A camera that walks enlarges what it walks towards by a few percent a frame, as 
 that is exchanged enlarges the whole picture at once. A map cannot tell: it takes the enlargement for a step forward.
 
 The factor is that of the similarity which most corners agree with (RANSAC). Where few of them could be followed, as
-over a large factor, key points are matched by their descriptors.
+over a large factor, key points are matched by their descriptors. Where depth was measured in both pictures, what it
+explains is taken out: whoever came nearer sees everything at a smaller depth, a lens changes no depth.
 """
 
 from __future__ import annotations
@@ -23,24 +24,40 @@ out of order it is 0.21, which is told as well; a lens of 1.7 times the focal le
 phones differ by factors of 1.5 and more."""
 LEAST_AGREEING = 20
 """Corners: fewer agree with some similarity where two pictures have nothing in common."""
+LEAST_WITH_DEPTH = 10
+"""Of the agreeing corners, with depth in both pictures; the median of fewer may be that of edges."""
 CLOSE = 2.0
 """Pixels of the small image that a corner may be off the similarity: what lies nearer than the rest is farther off."""
 _MATCHER = SiftMatcher(count=600, ratio=0.8, refinement=None)
 
 
-def followed_enlargement(before: np.ndarray, after: np.ndarray) -> float | None:
-    """Logarithm of the factor between corners of two pictures, float32 [m, 2] each; None where too few agree."""
+def followed_enlargement(before: np.ndarray, after: np.ndarray, nearer: np.ndarray | None = None) -> float | None:
+    """Logarithm of the factor between corners of two pictures, float32 [m, 2] each; None where too few agree.
+
+    nearer: float64 [m], logarithm of each corner's depth in the first picture over that in the second, NaN = unknown.
+    """
     if len(before) < LEAST_AGREEING:
         return None
     found, agree = cv2.estimateAffinePartial2D(before, after, method=cv2.RANSAC, ransacReprojThreshold=CLOSE)
     if found is None or np.count_nonzero(agree) < LEAST_AGREEING:
         return None
     factor = float(np.hypot(found[0, 0], found[1, 0]))
-    return float(np.log(factor)) if factor > 0 else None
+    if factor <= 0:
+        return None
+    return float(np.log(factor)) - (0.0 if nearer is None else _median_nearer(nearer[agree.ravel() == 1]))
 
 
-def matched_enlargement(before: np.ndarray, after: np.ndarray, left_out: np.ndarray | None) -> float | None:
-    """The same by descriptors, from grey images uint8 [h, w]; left_out: bool [h, w], what the camera carries."""
+def _median_nearer(nearer: np.ndarray) -> float:
+    known = nearer[np.isfinite(nearer)]
+    return float(np.median(known)) if len(known) >= LEAST_WITH_DEPTH else 0.0
+
+
+def matched_corners(
+    before: np.ndarray, after: np.ndarray, left_out: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners that two grey images uint8 [h, w] share by their descriptors, float32 [m, 2] each; left_out: bool [h, w],
+    what the camera carries.
+    """
     first, second = (_MATCHER.describe(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)) for image in (before, after))
     matches = _MATCHER.match(first, second)
     start, end = matches.pixels_i.astype(np.float32), matches.pixels_j.astype(np.float32)
@@ -48,7 +65,7 @@ def matched_enlargement(before: np.ndarray, after: np.ndarray, left_out: np.ndar
         columns, rows = np.clip(np.rint(end), 0, np.array(left_out.shape[::-1]) - 1).astype(int).T
         kept = ~left_out[rows, columns]
         start, end = start[kept], end[kept]
-    return followed_enlargement(start, end)
+    return start, end
 
 
 def beyond_neighbours(enlarged: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.enlargement import followed_enlargement, matched_enlargement
+from vggtgeo.slam.trust.enlargement import followed_enlargement, matched_corners
 
 WIDTH = 320
 """Pixels of the longer side of the images that corners are followed in."""
@@ -32,6 +32,8 @@ CONTRAST = 50.0
 """Grey levels, standard deviation."""
 ROUND_TRIP = 0.5
 """Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
+STRIDE = 8
+"""Pixels between the depths that are kept of the last frame."""
 MOST_WAITING = 4
 """Frames that wait to be looked at; they hold their images."""
 _PATCH = (15, 15)
@@ -49,7 +51,8 @@ class FrameEvidence:
     ids: int32 [m], a track's number, the same in each frame that saw it. pixels: float32 [m, 2], of the ideal pinhole
     image. depth: float32 [m], the sensor's, metres, NaN = none. depth_changed: share of the pixels with depth whose
     depth is not exactly that of the frame before, NaN without depth. contrast: standard deviation of the grey levels.
-    enlarged: logarithm of the factor by which the picture is larger than the one before, None where nothing says.
+    enlarged: logarithm of the factor by which the picture is larger than the one before, less what measured depth
+    explains by coming nearer; None where nothing says.
     """
 
     frame: int
@@ -145,13 +148,17 @@ class EvidenceRecorder(Callback):
     def _add(self, frame: Frame) -> None:
         scale = max(frame.image.shape[:2]) / WIDTH
         grey, contrast = _small_grey(frame.image)
+        depth_before, (changed, median) = self._depth, self._compare_depth(frame.depth)
         enlarged = None
         if self._image is not None and len(self._ids):
             pixels, kept = follow(self._image, grey, self._pixels)
             kept &= self._of_the_world(pixels)
-            enlarged = followed_enlargement(self._pixels[kept], pixels[kept])
+            nearer = lambda start, end: _nearer(depth_before, self._depth, start, end, scale)
+            corners = self._pixels[kept], pixels[kept]
+            enlarged = followed_enlargement(*corners, nearer(*corners))
             if enlarged is None:
-                enlarged = matched_enlargement(self._image, grey, self._left_out)
+                corners = matched_corners(self._image, grey, self._left_out)
+                enlarged = followed_enlargement(*corners, nearer(*corners))
             self._ids, self._pixels = one_a_cell(self._ids[kept], pixels[kept])
         fresh = new_corners(grey, self._pixels)
         fresh = fresh[self._of_the_world(fresh)]
@@ -161,7 +168,6 @@ class EvidenceRecorder(Callback):
         self._pixels = np.concatenate([self._pixels, fresh])
         self._image = grey
         full = (self._pixels + 0.5) * scale - 0.5
-        changed, median = self._compare_depth(frame.depth)
         depth = np.full(len(full), np.nan, np.float32) if frame.depth is None else _read(frame.depth, full)
         ideal = self._camera.undistorted(full).astype(np.float32)
         numbers = self._ids.copy()
@@ -181,7 +187,7 @@ class EvidenceRecorder(Callback):
         if depth is None:
             self._depth = None
             return float("nan"), float("nan")
-        small = depth[4::8, 4::8].copy()
+        small = depth[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE].copy()
         before, self._depth = self._depth, small
         known = np.isfinite(small)
         median = float(np.median(small[known])) if np.any(known) else float("nan")
@@ -248,6 +254,18 @@ def _read(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     columns, rows = np.rint(pixels).astype(int).T
     height, width = depth.shape
     return depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float32)
+
+
+def _nearer(
+    before: np.ndarray | None, after: np.ndarray | None, start: np.ndarray, end: np.ndarray, scale: float
+) -> np.ndarray | None:
+    """Logarithm of the depth at corners of one small image over that at the same corners of the next, float64 [m], NaN
+    = unknown; None without depth. before, after: float32 [h, w], every `STRIDE`-th depth.
+    """
+    if before is None or after is None:
+        return None
+    at = lambda depth, pixels: _read(depth, ((pixels + 0.5) * scale - 0.5 - STRIDE // 2) / STRIDE)
+    return np.asarray(np.log(at(before, start)) - np.log(at(after, end)), np.float64)
 
 
 def common(first: FrameEvidence, second: FrameEvidence) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,61 @@
+"""The poses of frames between keyframes, after the keyframes have moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from test_keyframe_depth import SIZE, keyframe
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.state import FramePose, Slam
+
+KEYFRAMES = (0, 4, 8)
+
+
+def _straight(length: float) -> np.ndarray:
+    """A straight walk of nine frames, float64 [9, 4, 4], world -> camera: so many metres a frame."""
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :3, 3] = -length * np.arange(9)[:, None] * (1.0, 0.5, 0.2)
+    return poses
+
+
+def _walked(begins: tuple[int, ...]) -> Slam:
+    """A walk of 1 m a frame whose keyframes the adjustment has put 1.5 m a frame apart. The keyframe numbers in
+    `begins` begin a piece of map; the others were tracked against the one before.
+    """
+    tracked, adjusted = _straight(1.0), _straight(1.5)
+    like = keyframe(0, np.ones(SIZE))
+    keyframes = tuple(
+        replace(like, number=number, frame=frame, timestamp=float(frame), pose=adjusted[frame])
+        for number, frame in enumerate(KEYFRAMES)
+    )
+    records = []
+    for frame in range(9):
+        number = frame // 4
+        if frame not in KEYFRAMES:
+            relative = tracked[frame] @ rigid.invert(tracked[4 * number])
+            records.append(FramePose(frame, float(frame), number, relative, True, 50))
+        elif number in begins:
+            records.append(FramePose(frame, float(frame), number, np.eye(4), True, 50))
+        else:
+            arrival = (number - 1, tracked[frame] @ rigid.invert(tracked[frame - 4]))
+            records.append(FramePose(frame, float(frame), number, np.eye(4), True, 50, arrival=arrival))
+    given = np.array([500.0, 500.0, 320.0, 240.0])
+    return Slam(given, given, np.full(4, 5.0), True, keyframes=keyframes, frames=tuple(records))
+
+
+def test_frames_between_keyframes_share_what_the_adjustment_changed() -> None:
+    """Keyframes that are pulled apart evenly take the frames between along; oracle: the straight path through them."""
+    _, poses = frame_poses(_walked(begins=(0,)))
+    assert np.allclose(poses, _straight(1.5), atol=1e-12)
+
+
+def test_a_keyframe_that_begins_a_piece_keeps_its_pose_and_begins_its_own_share() -> None:
+    """The frame that a piece begins with stands where its keyframe does, and the frames behind it share what changed
+    from there on; those before it, which nothing ties to it, stay as they were tracked. Oracle: the straight paths.
+    """
+    _, poses = frame_poses(_walked(begins=(0, 1)))
+    assert np.allclose(poses[4:], _straight(1.5)[4:], atol=1e-12)
+    assert np.allclose(poses[:4], _straight(1.0)[:4], atol=1e-12)
