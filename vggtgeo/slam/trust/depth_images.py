@@ -5,8 +5,8 @@
 - Frames of indoor RGB-D clips have median depths between 0.6 and 4 m (redkitchen 1.7, corridor-office 2.4,
   building-walk 2.3, TUM's desks 1 to 1.5); sensors for rooms begin at 0.2 to 0.5 m and end at 8 to 10. A clip whose
   median is outside `PLAUSIBLE` was most likely read in a wrong unit. So was one that shows nothing farther than
-  `SMALLEST_ROOM`: of each 40 frames of the four clips the farthest twentieth of the depths begins at 2.3 m at the least.
-  A constant factor between those limits cannot be seen: the world of the run is then as much larger or smaller, and
+  `SMALLEST_ROOM`: of each 40 frames of the four clips the farthest twentieth of the depths begins at 2.3 m or more. A
+  constant factor between those limits cannot be seen: the world of the run is then as much larger or smaller, and
   agrees with itself.
 """
 
