@@ -172,6 +172,7 @@ KINDS = (
     layout("ScanNet pose", layouts.scannet, "data/pose/2.txt"),
     layout("ScanNet camera", layouts.scannet, "data/intrinsic/intrinsic_depth.txt"),
     layout("recorder's camera", layouts.rgbd, "data/intrinsic.json"),
+    layout("transforms", layouts.nerfstudio, "data/transforms.json"),
     layout("EuRoC list", layouts.euroc, "data/mav0/cam0/data.csv"),
     layout("EuRoC camera", layouts.euroc, "data/mav0/cam0/sensor.yaml"),
     layout("EuRoC truth", layouts.euroc, "data/mav0/state_groundtruth_estimate0/data.csv"),

@@ -1,6 +1,7 @@
 """Readers of the benchmarks' layouts, each on a tiny recording of just that layout."""
 
 import itertools
+import json
 import shutil
 import warnings
 from collections.abc import Callable
@@ -268,7 +269,8 @@ def test_bonn_has_its_published_camera(tmp_path: Path) -> None:
 
 
 def test_seven_scenes_as_published_is_registered(tmp_path: Path) -> None:
-    # Proves that depth and poses of the depth camera are moved to the colour camera where the folder has no intrinsics,
+    # Proves that depth and poses of the depth camera are moved to the colour camera where the folder has no intrinsics
+    # or those of the depth camera,
     # and nowhere else. Oracle: the world point of a pixel of depth, seen by either camera.
     depth = np.full((480, 640), 65535, np.uint16)
     depth[200:260, 300:360] = 1500
@@ -288,10 +290,74 @@ def test_seven_scenes_as_published_is_registered(tmp_path: Path) -> None:
     assert frame.depth[round(v), round(u)] == pytest.approx(seen[2], abs=2e-3)
     np.testing.assert_allclose(seen, _TO_COLOUR[:3, :3] @ point + _TO_COLOUR[:3, 3], atol=1e-9)
     assert 0.6 < np.isfinite(frame.depth).sum() / 3600 < 1.1
+    tiny_sequences.write_calibration(tmp_path / "seq-01", (585.0, 585.0, 320.0, 240.0))  # the depth camera's
+    with pytest.warns(InputWarning, match="taken as published"):
+        copied = open_sequence(tmp_path / "seq-01")
+    np.testing.assert_array_equal(list(copied.frames())[1].depth, frame.depth)
     tiny_sequences.write_calibration(tmp_path / "seq-01", (525.0, 525.0, 320.0, 240.0))
     prepared = open_sequence(tmp_path / "seq-01")
     assert next(prepared.frames()).depth[230, 330] == pytest.approx(1.5)
     np.testing.assert_allclose(prepared.ground_truth().positions[:, 0], [0, 1])
+
+
+@pytest.mark.parametrize("per_frame", [False, True])
+def test_nerfstudio(tmp_path: Path, per_frame: bool) -> None:
+    # Proves camera (corner of the pixel, images of half the size), poses with OpenGL's axes, order by number, depth of
+    # fewer pixels. Oracle: what was written.
+    sequence = _open(tiny.nerfstudio(tmp_path / "scene", per_frame))
+    frames = _check(sequence, "Nerfstudio")
+    assert frames[1].depth[3, 6] == pytest.approx(1.016)
+    truth = sequence.ground_truth()
+    np.testing.assert_allclose(truth.poses, tiny.POSES, atol=1e-12)
+    assert [frame.timestamp for frame in with_rate(sequence, 10.0).frames()] == pytest.approx([0.0, 0.1, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"frames": []}, r"transforms.json` lists no frames"),
+        ({"frames": 3}, r"`frames` is int; expected a list"),
+        ({"fl_x": "wide"}, r"`fl_x` is wide; expected a number"),
+        ({"fl_x": -5.0}, r"transforms.json`: .*has focal lengths -5"),
+        ({"camera_model": "OPENCV_FISHEYE"}, r"`camera_model` is OPENCV_FISHEYE; read are PINHOLE"),
+        ({"w": 10, "h": 1000}, r"images of 10 x 1000 pixels; those here are .*another shape"),
+        ({"integer_depth_scale": 0}, r"`integer_depth_scale` is 0; it must be positive"),
+        ({"frames": [{"file_path": "../../secret.png"}]}, r"`file_path` is '../../secret.png'; expected a file below"),
+        ({"frames": [{"file_path": 7}]}, r"`file_path` of a frame is 7"),
+    ],
+)
+def test_a_wrong_transforms_file_is_told(tmp_path: Path, change: dict[str, object], told: str) -> None:
+    # Proves that the sentence names the file, what was found and what was expected.
+    folder = tiny.nerfstudio(tmp_path / "scene")
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").write_text(json.dumps({**content, **change}))
+    with pytest.raises(InputError, match=told):
+        open_sequence(folder)
+
+
+def test_transforms_with_a_field_of_view_or_without_a_camera(tmp_path: Path) -> None:
+    # Proves focal length by the field of view, and a guess that is told where the file has neither. Oracle: tangent.
+    folder = tiny.nerfstudio(tmp_path / "scene")
+    content = json.loads((folder / "transforms.json").read_text())
+    bare = {key: content[key] for key in ("w", "h", "frames")}
+    (folder / "transforms.json").write_text(json.dumps({**bare, "camera_angle_x": 1.0}))
+    width = tiny_sequences.WIDTH
+    assert open_sequence(folder).camera.intrinsics[:3] == pytest.approx(
+        (0.5 * width / np.tan(0.5), 0.5 * width / np.tan(0.5), 0.5 * (width - 1))
+    )
+    (folder / "transforms.json").write_text(json.dumps(bare))
+    with pytest.warns(InputWarning, match="no intrinsics found"):
+        assert not open_sequence(folder).camera.known
+
+
+def test_frames_of_several_lenses_are_told(tmp_path: Path) -> None:
+    # Proves that the middle of focal lengths that differ is taken with a word. Oracle: what was written.
+    folder = tiny.nerfstudio(tmp_path / "scene", per_frame=True)
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"][0]["fl_x"] *= 1.5
+    (folder / "transforms.json").write_text(json.dumps(content))
+    with pytest.warns(InputWarning, match="focal lengths of its frames go from"):
+        assert open_sequence(folder).camera.intrinsics[0] == pytest.approx(tiny_sequences.INTRINSICS[0])
 
 
 def test_registered_depth_keeps_the_nearer_surface() -> None:

@@ -42,6 +42,24 @@ def rgbd(folder: Path, colour: str = "rgb/{}.png", depth: str = "depth/{}.png") 
     return folder
 
 
+def nerfstudio(folder: Path, per_frame: bool = False) -> Path:
+    """Images in any order, the camera of images of twice the pixels, of the file or of each frame; depth of half the
+    pixels, millimetres; OpenGL's axes.
+    """
+    fx, fy, cx, cy = INTRINSICS
+    camera = {"fl_x": 2 * fx, "fl_y": 2 * fy, "cx": 2 * cx + 1, "cy": 2 * cy + 1, "w": 2 * WIDTH, "h": 2 * HEIGHT}
+    frames = []
+    for number in reversed(range(COUNT)):
+        write_image(folder / f"images/frame_{number + 8}.png", image(number))
+        write_image(folder / f"depth/{number}.png", depth_codes(number)[::2, ::2])
+        matrix = POSES[number] @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frame = {"file_path": f"./images/frame_{number + 8}.png", "transform_matrix": matrix.tolist()}
+        frames.append({**frame, "depth_file_path": f"depth/{number}.png", **(camera if per_frame else {})})
+    content = {**({} if per_frame else camera), "camera_model": "OPENCV", "k1": 0.0, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
 def scannet(folder: Path) -> Path:
     """An exported scan: colour of twice the pixels, millimetres, the second pose lost."""
     for number in range(COUNT):

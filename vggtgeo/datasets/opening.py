@@ -13,6 +13,7 @@ from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
+from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.not_read import reason_not_read
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
 from vggtgeo.datasets.replica import Replica
@@ -49,6 +50,7 @@ FOLDER_KINDS: dict[str, FolderReader] = {
     "icl": IclNuim,
     "7scenes": SevenScenes,
     "tum": TumRgbd,
+    "nerfstudio": Nerfstudio,
     "rgbd": RgbdFolders,
     "images": ImageFolder,
 }

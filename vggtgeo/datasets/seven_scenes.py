@@ -2,8 +2,9 @@
 
 Source: J. Shotton et al., "Scene coordinate regression forests", CVPR 2013. As published, the folder has no
 intrinsics, the depth (where 65535 means none, too) is not registered to the colour image, and poses are those of the
-depth camera. Such a folder has no file of intrinsics: its depth is registered and its poses are moved
-to the colour camera, with a Kinect's extrinsics as others use them for these scenes (calibration of LIRIS,
+depth camera. Such a folder has no file of intrinsics, or one of the depth camera (f = 585, as in the copy that comes
+with TSDF Fusion): its depth is registered and its poses are moved to the colour camera, with a Kinect's extrinsics as
+others use them for these scenes (calibration of LIRIS,
 https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html). They are those of another Kinect: near
 objects stay some pixels off.
 """
@@ -66,6 +67,8 @@ class SevenScenes(FolderSequence):
         )
         width, height = common_size(str(folder), files)
         own = camera_from_folder(folder, width, height)
+        if own is not None and own.intrinsics == _KINECT_DEPTH:  # of what is not registered to the colour camera
+            own = None
         camera = own or _published_camera(folder, width, height)
         has_depth = depth_is_usable(str(folder), files, MILLIMETRES, width, height)
         return cls(folder, folder.name, camera, files, MILLIMETRES, has_depth, own is None and camera.known)
@@ -123,8 +126,9 @@ def _published_camera(folder: Path, width: int, height: int) -> Camera:
     if (width, height) != (640, 480):
         return guess_with_warning(str(folder), width, height)
     warnings.warn(
-        f"`{folder}` has no intrinsics: taken as published, with the Kinect's colour camera, {_KINECT}; depth and "
-        "poses belong to its depth camera (f = 585) and are moved to the colour camera by a generic calibration",
+        f"`{folder}` has no intrinsics of its colour camera: taken as published, with that of a Kinect, {_KINECT}; "
+        "depth and poses belong to its depth camera (f = 585) and are moved to the colour camera by a generic "
+        "calibration",
         InputWarning,
         stacklevel=3,
     )

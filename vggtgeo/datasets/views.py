@@ -8,6 +8,7 @@ from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
+from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.rgbd_folders import RgbdFolders
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
@@ -62,7 +63,7 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
         raise InputError(f"`rate` is {rate:g}; it must be a positive number of frames a second")
     if isinstance(sequence, VideoFile):
         return replace(sequence, given_rate=rate)
-    if isinstance(sequence, ImageFolder | RgbdFolders):
+    if isinstance(sequence, ImageFolder | Nerfstudio | RgbdFolders):
         return replace(sequence, files=tuple(replace(file, timestamp=file.index / rate) for file in sequence.files))
     raise InputError(f"`{sequence.name}` has times of its own; a rate is for videos and folders of images")
 

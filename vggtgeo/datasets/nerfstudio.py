@@ -1,0 +1,209 @@
+"""`transforms.json` with images: of nerfstudio, instant-ngp, and the apps that export for them (Polycam, Record3D).
+
+| key, of the file or of a frame | meaning |
+|---|---|
+| `frames`: `file_path`, `transform_matrix` | image, and camera -> world, OpenGL's axes (x right, y up, z backward) |
+| `depth_file_path` or `depth_path` of a frame | 16-bit depth, millimetres, or `integer_depth_scale` metres a unit |
+| `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, `k1` ... `p2` | the camera; pixel (0, 0) is the corner of the top-left pixel |
+| `camera_angle_x` | field of view, radians, where there is no focal length |
+
+The poses are those of another program (COLMAP, ARKit), often of free scale: no independent truth.
+"""
+
+import math
+import statistics
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, read_depth
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
+from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
+from vggtgeo.datasets.phones import enlarged
+from vggtgeo.datasets.pose_files import read_json, trajectory_of
+from vggtgeo.geometry.camera import Camera, check_distortion
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+
+FILE = "transforms.json"
+FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL's camera axes to OpenCV's, and back."""
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+_SAME_SHAPE = 0.01
+_ONE_CAMERA = 0.02
+"""Relative difference of focal lengths up to which the frames have one camera; autofocus changes it by less."""
+
+
+@dataclass(frozen=True)
+class Nerfstudio(FolderSequence):
+    """Images with `transforms.json`. Truth: its poses. The file has no times: 30 frames a second, or as is said."""
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether `folder` has `transforms.json`."""
+        return (folder / FILE).is_file()
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Lists the frames by the numbers in the names of their images: the file has them in any order."""
+        file = folder / FILE
+        content = _object(read_json(file), f"`{file}`")
+        frames = [
+            _object(frame, f"`{file}`: a frame") for frame in _listed(content.get("frames"), f"`{file}`: `frames`")
+        ]
+        images = {_image(folder, file, frame): frame for frame in frames}
+        if not images:
+            raise InputError(f"`{file}` lists no frames; expected `frames` with `file_path` and `transform_matrix`")
+        order = sorted(images, key=lambda path: natural_key(str(path.relative_to(folder))))
+        files = tuple(
+            FrameFile(index, index / FRAMES_PER_SECOND, image, _depth(folder, file, images[image]))
+            for index, image in enumerate(order)
+        )
+        width, height = common_size(str(folder), files)
+        camera = _camera(file, content, list(images.values()), width, height)
+        has_depth = any(one.depth is not None and one.depth.is_file() for one in files)
+        unit = _positive(file, "integer_depth_scale", content.get("integer_depth_scale", 1e-3))
+        coding = replace(MILLIMETRES, units_per_metre=1.0 / unit)
+        return cls(folder, folder.resolve().name, camera, files, coding, has_depth)
+
+    def load_depth(self, path: Path) -> np.ndarray:
+        """The depth, enlarged to the images where it is smaller, as a phone's is."""
+        return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height))
+
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of the file, camera -> world."""
+        file = self.folder / FILE
+        frames = {_image(self.folder, file, frame): frame for frame in read_json(file)["frames"]}
+        poses = [_pose(file, frames[one.image]) for one in self.files if one.image in frames]
+        times = [one.timestamp for one in self.files if one.image in frames]
+        return trajectory_of(times, np.array(poses) @ FROM_OPENGL, file) if poses else None
+
+
+def _object(value: object, what: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{what} is {type(value).__name__}; expected an object")
+    return value
+
+
+def _listed(value: object, what: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise InputError(f"{what} is {type(value).__name__}; expected a list")
+    return value
+
+
+def _image(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path:
+    """The image of a frame; some writers leave its ending out."""
+    path = _inside(folder, file, "file_path", frame.get("file_path"))
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        endings = (path.with_name(path.name + suffix) for suffix in sorted(IMAGE_SUFFIXES))
+        path = next((one for one in endings if one.is_file()), path)
+    return path
+
+
+def _depth(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path | None:
+    for key in ("depth_file_path", "depth_path"):
+        if frame.get(key) is not None:
+            return _inside(folder, file, key, frame[key])
+    return None
+
+
+def _inside(folder: Path, file: Path, key: str, name: object) -> Path:
+    """A file below the folder: a list from a stranger opens nothing else."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise InputError(f"`{file}`: `{key}` of a frame is {name!r}; expected the name of a file in the folder")
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts:
+        raise InputError(f"`{file}`: `{key}` is {name!r}; expected a file below the folder of `{FILE}`")
+    return folder / path
+
+
+def _pose(file: Path, frame: Mapping[str, Any]) -> np.ndarray:
+    """float64 [4, 4] with OpenGL's axes; a last row may be missing."""
+    try:
+        pose = np.array(frame.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError):
+        pose = np.zeros(0)
+    if pose.shape == (3, 4):
+        pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
+    if pose.shape != (4, 4):
+        raise InputError(f"`{file}`: `transform_matrix` of `{frame.get('file_path')}` is no matrix of 4 x 4 numbers")
+    return pose
+
+
+def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], width: int, height: int) -> Camera:
+    """The camera of the file, or the middle of those of its frames, for images of this size."""
+    model = str(content.get("camera_model", "")).upper()
+    if model not in _PINHOLES:
+        raise InputError(
+            f"`{file}`: `camera_model` is {model}; read are {', '.join(_PINHOLES[1:])}: undistort the images"
+        )
+    across, down = (
+        float(size) if stated is None else _positive(file, key, stated)
+        for key, size in (("w", width), ("h", height))
+        for stated in [_number(file, content, frames, key)]
+    )
+    focal = _focal(file, content, frames, across)
+    if focal is None:
+        return guess_with_warning(str(file.parent), width, height)
+    fy = _number(file, content, frames, "fl_y") or focal
+    cx, cy = _number(file, content, frames, "cx"), _number(file, content, frames, "cy")
+    centre = (0.5 * across if cx is None else cx) - 0.5, (0.5 * down if cy is None else cy) - 0.5
+    lens = tuple(_number(file, content, frames, key) or 0.0 for key in _DISTORTION)
+    try:
+        distortion = check_distortion(lens if lens[4] else lens[:4]) if any(lens) else ()
+    except InputError as error:
+        raise InputError(f"`{file}`: {error}") from None
+    if abs(across * height - down * width) > _SAME_SHAPE * across * height:
+        raise InputError(
+            f"`{file}` is of images of {across:g} x {down:g} pixels; those here are {width} x {height}, which is "
+            "another shape: were they turned or cut afterwards?"
+        )
+    camera = Camera(intrinsics_of(file, (focal, fy, *centre)), round(across), round(down), distortion)
+    return camera.resized(width, height)
+
+
+def _focal(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], width: float) -> float | None:
+    focal = _number(file, content, frames, "fl_x")
+    angle = _number(file, content, frames, "camera_angle_x")
+    if focal is not None or angle is None:
+        return focal
+    if not 0 < angle < math.pi:
+        raise InputError(f"`{file}`: `camera_angle_x` is {angle:g}; expected radians between 0 and pi")
+    return 0.5 * width / math.tan(0.5 * angle)
+
+
+def _number(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], key: str) -> float | None:
+    """Of the whole file, else the middle of the frames', else None; told where focal lengths differ."""
+    if content.get(key) is not None:
+        return _finite(file, key, content[key])
+    own = [_finite(file, key, frame[key]) for frame in frames if frame.get(key) is not None]
+    if not own:
+        return None
+    middle = statistics.median(own)
+    if key == "fl_x" and max(own) - min(own) > _ONE_CAMERA * abs(middle):
+        warnings.warn(
+            f"`{file}`: focal lengths of its frames go from {min(own):g} to {max(own):g} pixels; one of {middle:g} is "
+            "taken for all",
+            InputWarning,
+            stacklevel=5,
+        )
+    return middle
+
+
+def _finite(file: Path, key: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"`{file}`: `{key}` is {str(value)[:40]}; expected a number")
+    return float(value)
+
+
+def _positive(file: Path, key: str, value: object) -> float:
+    found = _finite(file, key, value)
+    if found <= 0:
+        raise InputError(f"`{file}`: `{key}` is {found:g}; it must be positive")
+    return found
