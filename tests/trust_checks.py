@@ -11,6 +11,7 @@ from vggtgeo.slam.trust.depth_agreement import check_depth, depth_ratios
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import FrameEvidence
 from vggtgeo.slam.trust.finding import Finding
+from vggtgeo.slam.trust.pace import pace
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
 from vggtgeo.slam.trust.steps import breaks, check_steps, steps
 from vggtgeo.slam.trust.still_points import check_parts, divide
@@ -34,12 +35,12 @@ def found_by_sides(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Fi
 
 def found_by_depth(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:
     """Depth against motion and other depth."""
-    return check_depth(estimate, depth_ratios(estimate, evidence))
+    return check_depth(estimate, depth_ratios(estimate, evidence, pace(estimate, evidence)))
 
 
 def found_by_camera(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:
     """The calibration, by what the images ask for."""
-    return check_camera(estimate, camera_opinion(estimate, evidence), SIZE)
+    return check_camera(estimate, camera_opinion(estimate, evidence, pace(estimate, evidence)), SIZE)
 
 
 def found_by_scale(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:

@@ -1,7 +1,8 @@
 """The sensor's depth against the depth that the motion gives: a wrong unit, a frozen image, a delay, another camera's.
 
-For corners seen `GAPS` frames apart, with enough parallax (standard deviation of the triangulated inverse depth below
-5 %), `x = log(z_sensor / z_triangulated)`. For all corners, `y = log(z carried by the poses / z_sensor there)`.
+For corners seen `GAPS` frames apart (as many times that as the camera is slow, `pace.py`), with enough parallax
+(standard deviation of the triangulated inverse depth below 5 %), `x = log(z_sensor / z_triangulated)`. For all corners,
+`y = log(z carried by the poses / z_sensor there)`.
 
 Measured on corridor-office and building-walk with their own depth: the median of |x| within a run is 0.03, the share of
 |x| > 0.15 is 0.05 to 0.10 (corners on depth edges), the medians of single frames spread by 0.01 to 0.03, and the share
@@ -69,11 +70,11 @@ class DepthRatios:
         return np.array([np.median(group) for group in groups if len(group) >= least])
 
 
-def depth_ratios(estimate: Estimate, evidence: Evidence) -> DepthRatios:
-    """All corners of tracked frames, `GAPS` apart."""
+def depth_ratios(estimate: Estimate, evidence: Evidence, slow: int = 1) -> DepthRatios:
+    """All corners of tracked frames, `GAPS` times `slow` apart."""
     rows, tracks, seen = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
     carried_rows, carried = [np.zeros(0, int)], [np.zeros(0)]
-    for gap in GAPS:
+    for gap in (slow * frames for frames in GAPS):
         for row in range(len(evidence) - gap):
             if not (estimate.tracked[row] and estimate.tracked[row + gap]):
                 continue

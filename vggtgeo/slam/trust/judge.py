@@ -18,6 +18,7 @@ from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence
 from vggtgeo.slam.trust.extent import check_extent
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
+from vggtgeo.slam.trust.pace import pace
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
 from vggtgeo.slam.trust.sensor_drift import check_sensors
@@ -64,7 +65,8 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
     yield from check_sides(estimate, taken)
     yield from check_blind(estimate, evidence, taken)
     yield from check_parts(estimate, [divide(step) for step in taken])
-    ratios = depth_ratios(estimate, evidence)
+    slow = pace(estimate, evidence)
+    ratios = depth_ratios(estimate, evidence, slow)
     yield from check_depth(estimate, ratios)
     yield from check_frozen(estimate, evidence, harmless=agree(ratios))
     yield from check_range(estimate, evidence)
@@ -72,6 +74,6 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
     for part in wrong:
         sound[part.first : part.last + 2] = False
     yield from check_scale(estimate, hand_overs(estimate, evidence, sound))
-    yield from check_camera(estimate, camera_opinion(estimate, evidence), size)
+    yield from check_camera(estimate, camera_opinion(estimate, evidence, slow), size)
     yield from check_shutter(estimate)
     yield from check_enlargements(estimate, np.array([noted.enlarged for noted in evidence], np.float64))
