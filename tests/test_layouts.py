@@ -300,6 +300,69 @@ def test_seven_scenes_as_published_is_registered(tmp_path: Path) -> None:
     np.testing.assert_allclose(prepared.ground_truth().positions[:, 0], [0, 1])
 
 
+@pytest.mark.parametrize("colour", ["rgb_png/{}.png", "color_images/{}.png"])
+def test_a_few_loose_pictures_are_not_the_recording(tmp_path: Path, colour: str) -> None:
+    # Proves that folders whose names say the format, too, are paired, and that pictures beside them are left out with a
+    # word where they are few. Oracle: what was written.
+    folder = tmp_path / "own"
+    for number in range(12):
+        tiny_sequences.write_image(folder / colour.format(number), tiny_sequences.image(number))
+        tiny_sequences.write_image(folder / f"depth_png/{number}.png", tiny_sequences.depth_codes(number))
+    tiny_sequences.write_image(folder / "example.png", tiny_sequences.image(0))
+    tiny_sequences.write_calibration(folder, tiny_sequences.INTRINSICS)
+    with pytest.warns(InputWarning, match=r"1 images beside `.*` \(example.png, ...\) are left out"):
+        sequence = open_sequence(folder)
+    assert (type(sequence).__name__, len(sequence), sequence.has_depth) == ("RgbdFolders", 12, True)
+    for number in range(2):
+        tiny_sequences.write_image(folder / f"another{number}.png", tiny_sequences.image(0))
+    with pytest.warns(InputWarning, match="`.*` in it has 12: give that folder to read those"):
+        assert len(open_sequence(folder)) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "read"),
+    [
+        ("intrinsics.K.txt", "615.2 0 298.4\n0 615.3 247.5\n0 0 1\n", True),
+        ("cam_K.txt", "615.2, 615.3, 298.4, 247.5", True),
+        ("camera_intrinsic.csv", "615.2 0 298.4 0\n0 615.3 247.5 0\n0 0 1 0\n0 0 0 1\n", True),
+        ("camera_pose.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", False),
+        ("calib.txt", "fx: 615.2", False),
+        ("notes.txt", "615.2 615.3 298.4 247.5", False),
+        ("calib_times.txt", "0.1 0.2 0.3 0.4", False),
+    ],
+)
+def test_a_camera_in_a_file_of_another_name(tmp_path: Path, name: str, text: str, read: bool) -> None:
+    # Proves that the numbers of a pinhole, alone in a file whose name says camera, are taken with a word, and that
+    # nothing else is; so that 7-Scenes' Kinect is not assumed beside them. Oracle: what was written.
+    for number in range(2):
+        tiny_sequences.write_image(tmp_path / f"frame-{number:06d}.color.png", tiny_sequences.image(number, 640, 480))
+    (tmp_path / name).write_text(text)
+    told = "is taken for the camera, fx fy cx cy = 615.2 615.3 298.4 247.5" if read else "taken as published"
+    with pytest.warns(InputWarning, match=told):
+        camera = open_sequence(tmp_path).camera
+    assert camera.intrinsics == ((615.2, 615.3, 298.4, 247.5) if read else (525.0, 525.0, 320.0, 240.0))
+
+
+def test_two_files_that_may_be_the_camera_are_none(tmp_path: Path) -> None:
+    # Proves that nobody guesses between a left and a right camera.
+    tiny_sequences.write_image(tmp_path / "0.png", tiny_sequences.image(0, 640, 480))
+    for side in ("left", "right"):
+        (tmp_path / f"{side}_intrinsics.txt").write_text("615.2 615.3 298.4 247.5")
+    with pytest.warns(InputWarning, match="no intrinsics found"):
+        assert not open_sequence(tmp_path).camera.known
+
+
+def test_a_renamed_folder_of_tum_says_in_its_list_what_it_is(tmp_path: Path) -> None:
+    # Proves that the published camera is found by the head of `rgb.txt`. Oracle: the published numbers.
+    for number in range(2):
+        tiny_sequences.write_image(tmp_path / f"rgb/{number}.png", tiny_sequences.image(number, 640, 480))
+    head = "# color images\n# file: 'rgbd_dataset_freiburg1_desk.bag'\n# timestamp filename\n"
+    (tmp_path / "rgb.txt").write_text(head + "1.0 rgb/0.png\n1.1 rgb/1.png\n")
+    camera = open_sequence(tmp_path).camera
+    assert camera.intrinsics == (517.3, 516.5, 318.6, 255.3)
+    assert camera.known
+
+
 @pytest.mark.parametrize("per_frame", [False, True])
 def test_nerfstudio(tmp_path: Path, per_frame: bool) -> None:
     # Proves camera (corner of the pixel, images of half the size), poses with OpenGL's axes, order by number, depth of

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from trust_checks import found_by_camera, found_by_depth
+from trust_checks import found_by_depth
 from witness import Walk, walk, with_depth
 
 from vggtgeo.slam.trust.depth_agreement import check_depth, depth_ratios
@@ -44,11 +44,3 @@ def test_depth_of_another_unit_is_told_of_a_slow_camera(slow: Walk) -> None:
     assert check_depth(slow.estimate, depth_ratios(slow.estimate, wrong)) == []
     assert "depth scale" in {finding.check for finding in found_by_depth(slow.estimate, wrong)}
     assert found_by_depth(slow.estimate, slow.evidence) == []
-
-
-def test_a_slow_camera_that_is_right_is_told_nothing(slow: Walk) -> None:
-    """Its focal length is; one that is a fifth too long is told."""
-    assert found_by_camera(slow.estimate, slow.evidence) == []
-    longer = slow.estimate.intrinsics * (1.2, 1.2, 1.0, 1.0)
-    found = found_by_camera(replace(slow.estimate, intrinsics=longer, given=longer), slow.evidence)
-    assert ["focal length" in finding.text for finding in found] == [True]

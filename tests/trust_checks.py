@@ -40,7 +40,7 @@ def found_by_depth(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Fi
 
 def found_by_camera(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:
     """The calibration, by what the images ask for."""
-    return check_camera(estimate, camera_opinion(estimate, evidence, pace(estimate, evidence)), SIZE)
+    return check_camera(estimate, camera_opinion(estimate, evidence), SIZE)
 
 
 def found_by_scale(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:

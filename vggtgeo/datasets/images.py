@@ -1,6 +1,7 @@
 """A plain folder of images, in natural order (2 before 10)."""
 
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -9,7 +10,7 @@ from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 FRAMES_PER_SECOND = 30.0
 _SECONDS = re.compile(r"\d+\.\d+")
@@ -35,6 +36,7 @@ class ImageFolder(FolderSequence):
         images = image_files(folder)
         if not images:
             raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
+        _tell_of_more(folder, len(images))
         times = times_by_name(images)
         files = tuple(
             FrameFile(index, time, image) for index, (time, image) in enumerate(sorted(zip(times, images, strict=True)))
@@ -47,6 +49,19 @@ class ImageFolder(FolderSequence):
         """The true poses, if the folder has them."""
         file = self.folder / "groundtruth.txt"
         return Trajectory.load_tum(file) if file.exists() else None
+
+
+def _tell_of_more(folder: Path, count: int) -> None:
+    """The recording may be in a folder below, and what lies here a few pictures of it."""
+    below = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+    more = {path.name: len(image_files(path)) for path in below}
+    for name, number in more.items():
+        if number > count:
+            text = (
+                f"`{folder}`: reading its {count} images; `{name}` in it has {number}: give that folder to read those"
+            )
+            warnings.warn(text, InputWarning, stacklevel=4)
+            return
 
 
 def natural_key(name: str) -> list[int | str]:

@@ -24,6 +24,7 @@ MOST_BYTES = 100_000
 """Of a file with a few numbers and comments."""
 CALIBRATION = "calibration.txt"
 MATRIX = "camera-intrinsics.txt"
+_SAYS_CAMERA = re.compile(r"(intrinsic|calib|camera|(^|[_.-])k(?=[_.-])).*\.(txt|csv)$|^k$", re.IGNORECASE)
 JSON = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
 """Names that recorders give to it."""
 
@@ -73,7 +74,42 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
             check_plausible(f"`{file}`", camera)
             _warn_of_other_size(file, camera)
             return camera
-    return None
+    return _camera_of_another_name(folder, width, height)
+
+
+def _camera_of_another_name(folder: Path, width: int, height: int) -> Camera | None:
+    """The camera of a text file whose name says that it is one (`intrinsics.K.txt`, `cam_K.txt`), and which holds the
+    four numbers or the matrix of a pinhole and nothing else, with an InputWarning; None where no file, or more than
+    one, is like that.
+    """
+    named = sorted(path for path in folder.iterdir() if _SAYS_CAMERA.search(path.name) and path.is_file())
+    cameras = {path: found for path in named if (found := _bare_pinhole(path, width, height)) is not None}
+    if len(cameras) != 1:
+        return None
+    ((file, camera),) = cameras.items()
+    numbers = " ".join(f"{value:g}" for value in camera.intrinsics)
+    warnings.warn(
+        f"`{file}` is taken for the camera, fx fy cx cy = {numbers}; call it `{CALIBRATION}` if that is right",
+        InputWarning,
+        stacklevel=4,
+    )
+    return camera
+
+
+def _bare_pinhole(file: Path, width: int, height: int) -> Camera | None:
+    if file.stat().st_size > MOST_BYTES:
+        return None
+    try:
+        numbers = [float(word) for word in _without_comments(file).replace(",", " ").split()]
+        matrix = np.reshape(numbers, (4, 4) if len(numbers) == 16 else (3, 3)) if len(numbers) in (9, 16) else None
+        if matrix is not None and np.allclose([matrix[0, 1], *matrix[1:3, 0], *matrix[2, 1:3]], (0, 0, 0, 0, 1)):
+            numbers = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+        camera = Camera(check_intrinsics(numbers), width, height)
+        check_plausible(f"`{file}`", camera)
+    except (InputError, ValueError):
+        return None
+    inside = 0 < camera.intrinsics[2] < width and 0 < camera.intrinsics[3] < height
+    return camera if inside else None
 
 
 def check_plausible(where: str, camera: Camera) -> None:

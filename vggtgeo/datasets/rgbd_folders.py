@@ -21,6 +21,10 @@ from vggtgeo.io.errors import InputError, InputWarning
 
 COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
 DEPTH = ("depth", "depths")
+_SAYS_NOTHING = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
+"""Endings of the names of folders: `rgb_png`, `depth_images`."""
+MOST_LOOSE = 0.1
+"""Of the images in the folder of colour: so few beside it are none of the recording."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +37,9 @@ class RgbdFolders(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has images in a folder named as one of `COLOUR`, and none of its own."""
+        """Whether `folder` has images in a folder named as one of `COLOUR`, and hardly any of its own."""
         colour = _folder(folder, COLOUR)
-        return colour is not None and not image_files(folder)
+        return colour is not None and len(image_files(folder)) <= MOST_LOOSE * len(image_files(colour))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
@@ -43,7 +47,9 @@ class RgbdFolders(FolderSequence):
         colour, depth = _folder(folder, COLOUR), _folder(folder, DEPTH)
         if colour is None:
             raise InputError(f"`{folder}` has no folder of images named {', '.join(f'`{name}`' for name in COLOUR)}")
-        images = image_files(colour)
+        images, loose = image_files(colour), image_files(folder)
+        if loose:
+            _warn(f"`{folder}`: {len(loose)} images beside `{colour.name}` ({loose[0].name}, ...) are left out")
         times = times_by_name(images)
         depths = [] if depth is None else image_files(depth)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
@@ -68,8 +74,10 @@ class RgbdFolders(FolderSequence):
 
 
 def _folder(folder: Path, names: Sequence[str]) -> Path | None:
-    """The first of the folders `names`, in small or capital letters, that has images."""
-    there = {path.name.lower(): path for path in folder.iterdir() if path.is_dir()}
+    """The first of the folders `names`, in small or capital letters, that has images; `rgb_png` is `rgb`, too."""
+    folders = sorted(path for path in folder.iterdir() if path.is_dir())
+    there = {_SAYS_NOTHING.sub("", path.name.lower()): path for path in folders}
+    there |= {path.name.lower(): path for path in folders}
     return next((there[name] for name in names if name in there and image_files(there[name])), None)
 
 

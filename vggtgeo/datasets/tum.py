@@ -7,6 +7,7 @@ are taken at different times: an image gets the depth nearest in time, at most 0
 once. `associated.txt`, the pairs that ETH3D SLAM comes with, is read where `rgb.txt` is not there.
 """
 
+import itertools
 import math
 import warnings
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 MAX_DEPTH_DELAY = 0.02
 """Seconds between an image and its depth."""
 
+MOST_LETTERS = 200
 LATEST = 1e11
 """Seconds of a time stamp, 3,000 years: nanoseconds since 1970 are 1e18."""
 _TRUTH = "groundtruth.txt"
@@ -49,6 +51,7 @@ class TumRgbd(FolderSequence):
         camera = (
             camera_from_folder(folder, width, height)
             or published_camera(folder.resolve().name, width, height)
+            or published_camera(_recording(folder), width, height)
             or guess_with_warning(str(folder), width, height)
         )
         has_depth = depth_is_usable(str(folder), files, FIVE_THOUSANDTHS, width, height)
@@ -58,6 +61,16 @@ class TumRgbd(FolderSequence):
         """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
         file = self.folder / _TRUTH
         return Trajectory.load_tum(file) if file.exists() else None
+
+
+def _recording(folder: Path) -> str:
+    """What the benchmark's own list says it is of, `# file: 'rgbd_dataset_freiburg1_desk.bag'`: folders are renamed."""
+    file = folder / "rgb.txt"
+    if not file.is_file():
+        return ""
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        head = [line[:MOST_LETTERS] for line in itertools.islice(lines, 5)]
+    return " ".join(line.partition("file:")[2] for line in head if line.startswith("#"))
 
 
 def _of_lists(folder: Path) -> tuple[FrameFile, ...]:

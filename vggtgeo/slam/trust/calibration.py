@@ -1,8 +1,7 @@
 """The camera against the images: does what was given explain where corners with depth are seen?
 
-Pairs of frames `GAP` apart (as many times that as the camera is slow, `pace.py`), in both directions, with the sensor's
-depth at the corners; what they say of the camera is found in `slam/camera_of_pairs.py`. Without such depth it is the
-map that is asked, see `free_focal`.
+Pairs of frames `GAP` apart, in both directions, with the sensor's depth at the corners; what they say of the camera is
+found in `slam/camera_of_pairs.py`. Without such depth it is the map that is asked, see `free_focal`.
 
 With the true poses, in pieces of 60 frames of corridor-office, building-walk and redkitchen, undisturbed: focal length
 -5.5 to +1 %, principal point within 20 px, k1 -0.045 (redkitchen, whose lens has about that) to +0.02. With a
@@ -66,12 +65,9 @@ CONFIRMED = 0.3
 """Of that distance: what images that know it to a fifth of it want at most, if the given camera is theirs after all."""
 
 
-def camera_opinion(estimate: Estimate, evidence: Evidence, slow: int = 1) -> CameraOpinion | None:
-    """The camera by the run's corners, starting at that of the run and its poses; None where there is too little.
-
-    slow: factor on `GAP` and `BLOCK`.
-    """
-    return camera_of_pairs(_pairs(estimate, evidence, slow), estimate.intrinsics)
+def camera_opinion(estimate: Estimate, evidence: Evidence) -> CameraOpinion | None:
+    """The camera by the run's corners, starting at that of the run and its poses; None where there is too little."""
+    return camera_of_pairs(_pairs(estimate, evidence), estimate.intrinsics)
 
 
 def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[int, int]) -> list[Finding]:
@@ -161,12 +157,11 @@ def _check_found_middle(camera: np.ndarray, size: tuple[int, int]) -> list[Findi
     return [Finding("calibration", "degraded", text)]
 
 
-def _pairs(estimate: Estimate, evidence: Evidence, slow: int) -> list[CameraPair]:
-    gap = slow * GAP
-    spread = np.unique(np.linspace(0, max(len(evidence) - gap - 1, 0), MOST_PAIRS).astype(int))
-    starts = [int(row) for row in spread if row + gap < len(evidence)]
-    pairs = [(row, row + gap) for row in starts] + [(row + gap, row) for row in starts]
-    blocks = _blocks(estimate, evidence, starts, slow * BLOCK)
+def _pairs(estimate: Estimate, evidence: Evidence) -> list[CameraPair]:
+    spread = np.unique(np.linspace(0, max(len(evidence) - GAP - 1, 0), MOST_PAIRS).astype(int))
+    starts = [int(row) for row in spread if row + GAP < len(evidence)]
+    pairs = [(row, row + GAP) for row in starts] + [(row + GAP, row) for row in starts]
+    blocks = _blocks(estimate, evidence, starts)
     found = []
     for row, other in pairs:
         if not (estimate.tracked[row] and estimate.tracked[other]):
@@ -185,22 +180,22 @@ def _pairs(estimate: Estimate, evidence: Evidence, slow: int) -> list[CameraPair
     return found
 
 
-def _blocks(estimate: Estimate, evidence: Evidence, rows: list[int], size: int) -> np.ndarray:
-    """The block of time of each frame, `size` frames each, int [n], where it is one of `rows`; a block that shows again
-    what an earlier one did belongs to that.
+def _blocks(estimate: Estimate, evidence: Evidence, rows: list[int]) -> np.ndarray:
+    """The block of time of each frame, int [n], where it is one of `rows`; a block that shows again what an earlier one
+    did belongs to that.
 
     The errors of depth in two pictures of one view are the same: redkitchen's frames played twice "wanted" the
     principal point 60 px away, twice as surely as once.
     """
-    blocks = np.arange(len(evidence)) // size
+    blocks = np.arange(len(evidence)) // BLOCK
     for block in np.unique(blocks[rows])[1:]:
-        start = int(block) * size
-        middle = min(start + size // 2, len(evidence) - 1)
+        start = int(block) * BLOCK
+        middle = min(start + BLOCK // 2, len(evidence) - 1)
         # The block before this one is its neighbour in time, however slow the camera.
-        motion = estimate.poses[: start - size] @ rigid.invert(estimate.poses[middle])
+        motion = estimate.poses[: start - BLOCK] @ rigid.invert(estimate.poses[middle])
         moved = np.linalg.norm(motion[:, :3, 3], axis=1) / evidence[middle].depth_median
         turned = np.arccos(np.clip((np.trace(motion[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
         again = estimate.intrinsics[0] * (moved + turned) < AGAIN
         if again.any():
-            blocks[start : start + size] = blocks[int(np.argmax(again))]
+            blocks[start : start + BLOCK] = blocks[int(np.argmax(again))]
     return blocks

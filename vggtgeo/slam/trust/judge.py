@@ -65,8 +65,7 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
     yield from check_sides(estimate, taken)
     yield from check_blind(estimate, evidence, taken)
     yield from check_parts(estimate, [divide(step) for step in taken])
-    slow = pace(estimate, evidence)
-    ratios = depth_ratios(estimate, evidence, slow)
+    ratios = depth_ratios(estimate, evidence, pace(estimate, evidence))
     yield from check_depth(estimate, ratios)
     yield from check_frozen(estimate, evidence, harmless=agree(ratios))
     yield from check_range(estimate, evidence)
@@ -74,6 +73,6 @@ def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> It
     for part in wrong:
         sound[part.first : part.last + 2] = False
     yield from check_scale(estimate, hand_overs(estimate, evidence, sound))
-    yield from check_camera(estimate, camera_opinion(estimate, evidence, slow), size)
+    yield from check_camera(estimate, camera_opinion(estimate, evidence), size)
     yield from check_shutter(estimate)
     yield from check_enlargements(estimate, np.array([noted.enlarged for noted in evidence], np.float64))
