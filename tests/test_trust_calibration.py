@@ -13,7 +13,7 @@ from trust_checks import found_by_camera
 from witness import SIZE, K, Walk, walk
 
 from vggtgeo.slam.camera_of_pairs import CameraOpinion
-from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
+from vggtgeo.slam.trust.calibration import _blocks, camera_opinion, check_camera
 
 
 @pytest.mark.parametrize(
@@ -178,3 +178,16 @@ def test_few_frames_may_tell_a_focal_length_that_most_pairs_want(
     opinion = CameraOpinion(np.array(value, np.float64), covariance, blocks=8, better=0.9)
     assert opinion.quantile(1e-3) < 10 < opinion.quantile(1e-4)
     assert bool(check_camera(healthy.estimate, opinion, SIZE)) is told
+
+
+def test_a_slow_camera_sees_one_thing_however_long(healthy: Walk) -> None:
+    """Eighty frames that move by 0.0017 of the depth each are two blocks of time, neighbours, and not sixteen; at ten
+    times the speed each block is one of its own. Oracle: the distances by hand.
+    """
+    for speed, expected in ((0.0017, 2), (0.017, 8)):
+        poses = np.tile(np.eye(4), (40 if expected == 8 else 80, 1, 1))
+        depth = healthy.evidence[0].depth_median
+        poses[:, 0, 3] = -speed * depth * np.arange(len(poses))
+        evidence = [replace(healthy.evidence[0], frame=row) for row in range(len(poses))]
+        estimate = replace(healthy.estimate, poses=poses)
+        assert len(np.unique(_blocks(estimate, evidence, list(range(len(poses)))))) == expected
