@@ -9,6 +9,7 @@ import picture_bytes as bytes_of
 import pytest
 import tiny_sequences as tiny
 
+from vggtgeo.cli.run import open_input
 from vggtgeo.datasets import (
     Frame,
     ImageFolder,
@@ -24,7 +25,7 @@ from vggtgeo.datasets import (
 )
 from vggtgeo.datasets.image_files import MILLIMETRES, read_depth, read_image_file
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 
 
 def _numbers(frames: list[Frame]) -> list[int]:
@@ -353,3 +354,13 @@ def test_a_ppm_says_what_white_is(tmp_path: Path, text: bool) -> None:
     content = " ".join(map(str, values.ravel())).encode() + b"\n" if text else values.tobytes()
     (tmp_path / "white.ppm").write_bytes(header + content)
     np.testing.assert_allclose(read_image_file(tmp_path / "white.ppm").image, values * 2.55, atol=1.0)
+
+
+def test_a_camera_that_is_given_is_not_guessed(tmp_path: Path) -> None:
+    # Proves that the word about a guess is said where there is one, and not where a flag gives the camera.
+    for number in range(2):
+        tiny.write_image(tmp_path / f"{number}.png", tiny.image(number))
+    with pytest.warns(GuessedCameraWarning, match="no intrinsics found"):
+        assert not open_input(tmp_path, None, None, rgb_only=False).camera.known
+    sequence = open_input(tmp_path, None, "50,50,31.5,23.5", rgb_only=False)  # a warning is an error here
+    assert sequence.camera.intrinsics == (50.0, 50.0, 31.5, 23.5)

@@ -14,7 +14,7 @@ from vggtgeo.cli import run_options as options
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.io.checkpoint_pace import EVERY
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 
 if TYPE_CHECKING:
     from vggtgeo.datasets import Sequence
@@ -198,7 +198,10 @@ def open_input(
     """The sequence at `path`, with what the flags say otherwise."""
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_depth_scale, with_intrinsics, without_depth
 
-    sequence = open_sequence(path, kind, fps)
+    with warnings.catch_warnings():
+        if intrinsics is not None:  # then nothing is guessed
+            warnings.simplefilter("ignore", GuessedCameraWarning)
+        sequence = open_sequence(path, kind, fps)
     if depth_scale is not None:
         sequence = with_depth_scale(sequence, depth_scale)
     if intrinsics is not None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from vggtgeo.datasets.pose_files import read_json
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 
 NARROWEST, WIDEST = 1.0, 170.0
 """Degrees: fields of view that a pinhole camera may have."""
@@ -160,12 +160,12 @@ def published_camera(name: str, width: int, height: int) -> Camera | None:
 
 
 def guess_with_warning(name: str, width: int, height: int) -> Camera:
-    """A guessed camera, `known` False, and an InputWarning that says so."""
+    """A guessed camera, `known` False, and a GuessedCameraWarning that says so."""
     camera = Camera.guess(width, height)
     warnings.warn(
         f"`{name}`: no intrinsics found; starting from a guess, f = {camera.intrinsics[0]:.0f} pixels: put "
         f"`fx fy cx cy` into a file `{CALIBRATION}` beside the images, or give --intrinsics fx,fy,cx,cy",
-        InputWarning,
+        GuessedCameraWarning,
         stacklevel=3,
     )
     return camera

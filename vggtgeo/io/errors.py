@@ -18,6 +18,10 @@ class InputWarning(UserWarning):
     """Something the user gave was left out or assumed, and the work goes on; the message names it."""
 
 
+class GuessedCameraWarning(InputWarning):
+    """Nobody gave the camera: a guess is where the run starts."""
+
+
 class LeftOutWarning(InputWarning):
     """Frames of the input were left out; `frames` counts them."""
 
