@@ -14,6 +14,7 @@ from vggtgeo.benchmark import cells
 from vggtgeo.benchmark.statistics import Summary, select, values
 from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.suite import Suite
+from vggtgeo.datasets.trajectory_files import load_trajectory
 from vggtgeo.evaluation import align, associate
 from vggtgeo.figures.plots import NotebookFigure, view_axes
 from vggtgeo.geometry.trajectory import Trajectory
@@ -25,6 +26,8 @@ LINES = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8e5fb0", "#b0413e", "#7a7a2a", "#3b9
 _ROW, _MARGIN = 0.32, 0.9
 """Inches."""
 _MOST_LINES = 8
+LEAST_POSES = 3
+"""Of a path that is drawn: fewer cannot be aligned."""
 
 
 def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
@@ -96,19 +99,26 @@ class Path3:
 
 
 def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[Path3]:
-    """The first run of each setting on a sequence that left its trajectory and the truth."""
+    """The first run of each setting on a sequence that left a trajectory that can be aligned with the truth."""
     found = []
     for setting in cells.settings_of(suite, rows):
-        for row in select(rows, sequence, setting)[:1]:
-            place = folder / "runs" / f"{sequence}.{setting}.{row['seed']}"
-            estimate = Path(str(row["external"])) if row.get("external") else place / "estimate.txt"
-            truth = _truth_file(place, folder, sequence, row["seed"])
-            try:
-                pair = Trajectory.load_tum(estimate), Trajectory.load_tum(truth)
-                found.append(Path3(suite.title_of(setting).replace("`", ""), *pair, row.get("metric") is False))
-            except InputError:
-                continue
+        drawn = (_path(suite, row, folder) for row in select(rows, sequence, setting))
+        found += [one for one in [next((one for one in drawn if one is not None), None)] if one is not None]
     return found[:_MOST_LINES]
+
+
+def _path(suite: Suite, row: Row, folder: Path) -> Path3 | None:
+    """That of a run; None where it left none, or where too few of its poses have a truth to be aligned."""
+    place = folder / "runs" / f"{row['sequence']}.{row['setting']}.{row['seed']}"
+    title = suite.title_of(str(row["setting"])).replace("`", "")
+    try:
+        truth = Trajectory.load_tum(_truth_file(place, folder, str(row["sequence"]), row["seed"]))
+        external = row.get("external")
+        estimate = load_trajectory(str(external), truth) if external else Trajectory.load_tum(place / "estimate.txt")
+        one = Path3(title, estimate, truth, row.get("metric") is False)
+    except InputError:
+        return None
+    return one if len(one.errors) >= LEAST_POSES else None
 
 
 def _truth_file(place: Path, folder: Path, sequence: str, seed: object) -> Path:
