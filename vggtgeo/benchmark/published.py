@@ -48,6 +48,11 @@ class PublishedTable:
     papers: Mapping[str, str]
     uncalibrated: tuple[str, ...] = ()
 
+    @property
+    def has_gaps(self) -> bool:
+        """Whether a figure is not published."""
+        return any(None in numbers for numbers in self.rows.values())
+
     def lines(self) -> list[list[str]]:
         """A row of texts a system: its name, with a star where it was not given the intrinsics, numbers, and paper."""
         return [

@@ -13,6 +13,8 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
 _KITTI, _EUROC = 12, 17
+_ROUNDING = 1e-5
+"""Of rotations as they are printed: those stay as they are, for the errors to be what other programs make of them."""
 _NANOSECONDS = 1e17
 """Times above it: seconds since 1970 are below 1e10, nanoseconds above 1e18."""
 
@@ -63,4 +65,5 @@ def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:
     found = trajectory_of(np.arange(float(len(rows))) if clock is None else clock.timestamps, poses, file)
     if found is None:
         raise InputError(f"`{file}` holds no pose")
-    return found
+    rounded = len(found) == len(poses) and np.abs(found.poses - poses).max() < _ROUNDING
+    return Trajectory(found.timestamps, poses) if rounded else found
