@@ -2,6 +2,7 @@
 
 import csv
 import io
+import os
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -166,6 +167,18 @@ def test_the_table_comes_back_from_csv_and_parquet(tmp_path: Path) -> None:
         for name in columns(rows):
             assert typed[name] == given.get(name)
             assert text[name] == ("" if given.get(name) is None else str(given[name]))
+
+
+def test_names_that_are_no_utf8_stand_in_every_table(tmp_path: Path) -> None:
+    # Proves that the name of a folder in a message does not end a batch whose runs are all done. Oracle: the texts.
+    parquet = pytest.importorskip("pyarrow.parquet", reason="PyArrow is not installed")
+    message = f"no `x` in `{os.fsdecode(b'd' + bytes([255]))}`"
+    BenchReport(tiny.suite(), (row("walk", "full", 0, None, status="error", message=message),), tmp_path).write(
+        tmp_path
+    )
+    assert parquet.read_table(tmp_path / "runs.parquet").to_pylist()[0]["message"] == "no `x` in `d\ufffd`"
+    for name in ("runs.csv", "tables.md", "report.html"):
+        assert "no `x` in `d" in (folder / name).read_text(encoding="utf-8", errors="replace"), name
 
 
 def test_other_systems_are_rows_of_their_own(tmp_path: Path) -> None:
