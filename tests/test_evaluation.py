@@ -211,6 +211,15 @@ def test_coverage_is_the_share_of_time_that_is_followed() -> None:
     assert coverage(longer, truth) == pytest.approx(1.0)
 
 
+def test_a_picture_every_few_seconds_is_followed() -> None:
+    # Proves that a truth of a pose every three seconds is covered by an estimate of each of them, and half by one that
+    # lost track for half of it. Oracle: by hand; the longest gap alone, a second, covers nothing.
+    slow = Trajectory(3.0 * np.arange(21), _truth(21).poses)
+    assert coverage(slow, slow) == 1.0
+    assert coverage(slow.select(slice(11)), slow) == 0.5
+    assert coverage(slow.select(np.array([*range(11), 20])), slow) == 0.5
+
+
 def test_doubtful_numbers_are_named() -> None:
     # Proves the warnings of few matches, another clock, a short estimate and an absurd scale, and none for a good one.
     truth = _truth()
