@@ -134,8 +134,12 @@ def bench(
     """
     chosen = suite if isinstance(suite, Suite) else load_suite(Path(suite))
     chosen = limited(chosen, _names(sequences), _names(settings), seeds, first_seed, frames)
-    given = {"recordings": recordings, "timeout_minutes": timeout_minutes, "memory_gb": memory_gb}
-    chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
+    chosen = replace(
+        chosen,
+        recordings=chosen.recordings if recordings is None else recordings,
+        timeout_minutes=chosen.timeout_minutes if timeout_minutes is None else timeout_minutes,
+        memory_gb=chosen.memory_gb if memory_gb is None else memory_gb,
+    )
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
