@@ -1,6 +1,7 @@
 """Metrics against the `evo` package, closed forms and brute force."""
 
 import copy
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.core.units import Unit
 from scipy.spatial.transform import Rotation
 
+import vggtgeo as vg
 from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import (
     absolute_error,
@@ -209,6 +211,15 @@ def test_coverage_is_the_share_of_time_that_is_followed() -> None:
     assert coverage(longer, truth) == pytest.approx(1.0)
 
 
+def test_a_picture_every_few_seconds_is_followed() -> None:
+    # Proves that a truth of a pose every three seconds is covered by an estimate of each of them, and half by one that
+    # lost track for half of it. Oracle: by hand; the longest gap alone, a second, covers nothing.
+    slow = Trajectory(3.0 * np.arange(21), _truth(21).poses)
+    assert coverage(slow, slow) == 1.0
+    assert coverage(slow.select(slice(11)), slow) == 0.5
+    assert coverage(slow.select(np.array([*range(11), 20])), slow) == 0.5
+
+
 def test_doubtful_numbers_are_named() -> None:
     # Proves the warnings of few matches, another clock, a short estimate and an absurd scale, and none for a good one.
     truth = _truth()
@@ -230,6 +241,58 @@ def test_rpe_after_sim3_agrees_with_evo(tmp_path: Path) -> None:
     expected = _evo_statistics(metrics.RPE(), reference, evo_estimate)["rmse"]
     found = evaluate_trajectory(*_both_loaded(tmp_path)).relative_sim3.translation_statistics.rmse
     assert abs(found - expected) < TOLERANCE, f"{found} against evo's {expected}"
+
+
+OWN = (
+    ("freiburg1_xyz-rgbdslam.txt", "freiburg1_xyz-groundtruth.txt"),
+    ("freiburg1_xyz-rgbdslam_drift.txt", "freiburg1_xyz-groundtruth.txt"),
+    ("freiburg1_xyz-ORB_kf_mono.txt", "freiburg1_xyz-groundtruth.txt"),
+    ("fr2_desk_ORB.txt", "fr2_desk_groundtruth.txt"),
+    ("fr2_desk_ORB_kf_mono.txt", "fr2_desk_groundtruth.txt"),
+    ("V102.txt", "V102_groundtruth.csv"),
+    ("KITTI_00_ORB.txt", "KITTI_00_gt.txt"),
+    ("KITTI_00_SPTAM.txt", "KITTI_00_gt.txt"),
+)
+"""Estimates and truths of `test/data` in evo's repository."""
+
+
+def _read_by_evo(estimate: Path, truth: Path) -> tuple:
+    from evo.tools import file_interface
+
+    if estimate.name.startswith("KITTI"):
+        return file_interface.read_kitti_poses_file(truth), file_interface.read_kitti_poses_file(estimate)
+    of_euroc, of_tum = file_interface.read_euroc_csv_trajectory, file_interface.read_tum_trajectory_file
+    both = (of_euroc if truth.suffix == ".csv" else of_tum)(truth), of_tum(estimate)
+    for one in both:  # V102.txt has four poses twice, which evo counts twice
+        one.reduce_to_ids(np.unique(one.timestamps, return_index=True)[1])
+    return sync.associate_trajectories(*both, max_diff=0.01)
+
+
+@pytest.mark.parametrize("names", OWN, ids=lambda names: names[0])
+@pytest.mark.filterwarnings("ignore::vggtgeo.io.errors.InputWarning")  # times that are there twice
+def test_errors_on_evos_own_trajectories_are_evos(names: tuple[str, str]) -> None:
+    # Proves ATE after SE(3) and Sim(3) and RPE over one pose on evo's own test data, to 1e-9 of a metre and a radian.
+    # Oracle: evo, which reads, matches and aligns the files itself. `EVO_DATA` names its folder `test/data`.
+    folder = Path(os.environ.get("EVO_DATA", "no folder"))
+    if not folder.is_dir():
+        pytest.skip("`EVO_DATA` names no folder `test/data` of evo's repository")
+    estimate, truth = (folder / name for name in names)
+    reference, theirs = _read_by_evo(estimate, truth)
+    ours = vg.evaluate(estimate, truth)
+    for with_scale, errors in ((False, ours.se3), (True, ours.sim3)):
+        aligned = copy.deepcopy(theirs)
+        aligned.align(reference, correct_scale=with_scale)
+        expected = _evo_statistics(metrics.APE(), reference, aligned)
+        found = errors.statistics
+        off = [abs(found.rmse - expected["rmse"]), abs(found.maximum - expected["max"])]
+        assert max(off) < TOLERANCE * max(1.0, expected["max"]), f"ATE differs by {off} (scale: {with_scale})"
+    for relation, found in (
+        (metrics.PoseRelation.translation_part, ours.relative.translation_statistics.rmse),
+        (metrics.PoseRelation.rotation_angle_rad, ours.relative.rotation_statistics.rmse),
+    ):
+        metric = metrics.RPE(relation, 1, Unit.frames)
+        expected = _evo_statistics(metric, reference, theirs)["rmse"]
+        assert abs(found - expected) < TOLERANCE, f"RPE {relation} differs by {abs(found - expected)}"
 
 
 @pytest.mark.parametrize("max_dt", [0.0, 0.002, 0.01, 0.05])

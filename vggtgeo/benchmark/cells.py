@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,19 +82,48 @@ def comparable(rows: Sequence[Row], column: Column) -> list[Row]:
 
 
 def summary_of(rows: Sequence[Row], column: Column) -> Summary:
-    """The summary of a column in its unit."""
-    return Summary.of(column.factor * values(comparable(rows, column), column.name))
+    """The summary of a column in its unit, over the runs that ended with a result."""
+    return Summary.of(column.factor * values(comparable(finished(rows), column), column.name))
+
+
+def finished(rows: Iterable[Row]) -> list[Row]:
+    """The rows of runs that ended with a result."""
+    return [row for row in rows if row["status"] == "ok"]
+
+
+def is_whole(rows: Sequence[Row], column: Column) -> bool:
+    """Whether every run has a number: a mean over those that came through favours who loses the hard ones."""
+    return bool(rows) and summary_of(rows, column).count == len(rows)
 
 
 def text_of(rows: Sequence[Row], column: Column) -> str:
-    """`summary_of` as text."""
-    free = bool(rows) and not comparable(rows, column)
-    return FREE if free else number_cell(summary_of(rows, column), column.digits)
+    """`summary_of` as text, and of how many of the runs it is where some have no number; empty where none has."""
+    good = finished(rows)
+    if good and not comparable(good, column):
+        return FREE
+    text = number_cell(summary_of(rows, column), column.digits)
+    return text if not text or is_whole(rows, column) else f"{text} ({summary_of(rows, column).count} of {len(rows)})"
 
 
-def ranked(groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]:
-    """A cell of a column for each group of rows."""
-    return placed([summary_of(own, column) for own in groups], [text_of(own, column) for own in groups], column)
+def _text_or_ending(rows: Sequence[Row], column: Column) -> str:
+    """Where no run has a number, how those ended that failed."""
+    lost = [row for row in rows if row["status"] != "ok" or row.get("verdict") == "failed"]
+    return text_of(rows, column) or verdicts(lost)
+
+
+def ranked(groups: Sequence[Sequence[Row]], column: Column, beside_count: bool = False) -> list[Cell]:
+    """A cell of a column for each group of rows; those that some runs have no number of are not compared.
+    beside_count: `runs_text` stands beside, so that the cells need not say of how many runs they are.
+    """
+    whole = [summary_of(own, column) if is_whole(own, column) else Summary.of(np.array([])) for own in groups]
+    texts = [text_of(finished(own), column) if beside_count else _text_or_ending(own, column) for own in groups]
+    return placed(whole, texts, column)
+
+
+def runs_text(rows: Sequence[Row]) -> str:
+    """How many runs ended with a result, and of how many, where that is not all."""
+    good = len(finished(rows))
+    return str(good) if good == len(rows) else f"{good} of {len(rows)}"
 
 
 def placed(summaries: Sequence[Summary], texts: Sequence[str], column: Column) -> list[Cell]:
@@ -120,7 +149,9 @@ def sequences_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
 
 
 def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str, list[Cell]]]:
-    """A row a setting, a column a sequence, and the mean over the sequences that all of them have a number for."""
+    """A row a setting, a column a sequence, and the mean over the sequences that all runs of all of them have a number
+    for. rows: those without a result, too.
+    """
     settings, sequences = settings_of(suite, rows), sequences_of(suite, rows)
     groups = {name: [select(rows, name, setting) for setting in settings] for name in sequences}
     by_column = [ranked(groups[name], column) for name in sequences]
@@ -136,12 +167,12 @@ def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str,
 
 
 def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """The sequences that every setting has a number for: a mean over others would favour who fails on the hard ones."""
+    """The sequences that every run of every setting has a number for."""
     settings = settings_of(suite, rows)
     return [
         name
         for name in sequences_of(suite, rows)
-        if all(summary_of(select(rows, name, setting), column).count for setting in settings)
+        if all(is_whole(select(rows, name, setting), column) for setting in settings)
     ]
 
 

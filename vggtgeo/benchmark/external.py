@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.suite import ExternalTable, Suite
 from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets.trajectory_files import load_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 
 def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> list[Row]:
@@ -24,11 +26,28 @@ def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> 
     for table in suite.external:
         places: dict[Path, Job] = {}
         for job in jobs:
-            file = base / table.files.format(sequence=job.sequence, seed=job.seed)
-            if file.is_file():
+            file = base / table.file(job.sequence, job.seed)
+            if _is_file(file):
                 places.setdefault(file, job)
         found += [_row(suite, table, job, file, runs) for file, job in places.items()]
     return found
+
+
+def tell_missing(suite: Suite, jobs: Sequence[Job], base: Path) -> None:
+    """An InputWarning for each `[[external]]` that has no file at all: said before the runs, not after a night."""
+    for table in suite.external:
+        files = list(dict.fromkeys(base / table.file(job.sequence, job.seed) for job in jobs))
+        if files and not any(map(_is_file, files)):
+            more = f", nor any other of {len(files)}" if len(files) > 1 else ""
+            text = f"no trajectory of `{table.name}` is there: no `{files[0]}`{more}"
+            warnings.warn(text, InputWarning, stacklevel=2)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
 
 
 def _row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -> Row:
@@ -39,7 +58,7 @@ def _row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -
         truth = _truth(job, runs)
         if truth is None:
             return {**row, "status": "error", "message": "there is no truth to compare with"}
-        errors, _ = trajectory_errors(Trajectory.load_tum(file), truth, table.metric)
+        errors, _ = trajectory_errors(load_trajectory(file, truth), truth, table.metric)
     except InputError as error:
         return {**row, "status": "error", "message": str(error)}
     return {**row, **errors}

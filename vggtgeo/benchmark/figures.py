@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from vggtgeo.benchmark import cells
 from vggtgeo.benchmark.statistics import Summary, select, values
 from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.suite import Suite
+from vggtgeo.datasets.trajectory_files import load_trajectory
 from vggtgeo.evaluation import align, associate
 from vggtgeo.figures.plots import NotebookFigure, view_axes
 from vggtgeo.geometry.trajectory import Trajectory
@@ -22,9 +24,13 @@ from vggtgeo.report.figures import calm
 
 _FULL, _OTHER, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
 LINES = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8e5fb0", "#b0413e", "#7a7a2a", "#3b9aa5", "#a05a2c")
-_ROW, _MARGIN = 0.32, 0.9
+_ROW, _LINE, _MARGIN = 0.3, 0.15, 0.9
 """Inches."""
+_LABEL, _TITLE, _ENTRY = 30, 60, 44
+"""Letters of a line of a label beside an axis, of a title, of an entry of a legend: with longer ones axes collapse."""
 _MOST_LINES = 8
+LEAST_POSES = 3
+"""Of a path that is drawn: fewer cannot be aligned."""
 
 
 def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
@@ -36,7 +42,8 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
         for name in cells.sequences_of(suite, good)
     }
     panels = {name: keys for name, keys in panels.items() if keys}
-    heights = [_ROW * len(keys) + _MARGIN for keys in panels.values()]
+    rows_of = {name: [_wrapped(suite.title_of(key), _LABEL) for key in keys] for name, keys in panels.items()}
+    heights = [_height(labels) + _MARGIN for labels in rows_of.values()]
     figure = NotebookFigure(figsize=(width, sum(heights) + 0.5 if panels else 1.5), layout="constrained")
     FigureCanvasAgg(figure)
     if not panels:
@@ -44,9 +51,20 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
     drawn = figure.subplots(len(panels), 1, height_ratios=heights, squeeze=False)[:, 0]
     for axes, (name, keys) in zip(drawn, panels.items(), strict=True):
         _draw_panel(axes, suite, [_errors(good, name, key, column) for key in keys], keys)
-        axes.set_title(name, loc="left", fontsize=10, color=_INK)
+        axes.set_yticks(range(len(keys)), rows_of[name])
+        axes.set_title(_wrapped(name, _TITLE), loc="left", fontsize=10, color=_INK)
     drawn[-1].set_xlabel(f"{column.head}; dots: runs, bars: means with 95 % intervals", fontsize=9, color=_INK)
     return figure
+
+
+def _wrapped(text: str, width: int, most: int = 3) -> str:
+    """In lines of at most `width` letters, at most `most` of them."""
+    return "\n".join(wrap(text.replace("`", ""), width, max_lines=most, placeholder=" ..."))
+
+
+def _height(labels: Sequence[str]) -> float:
+    """Inches of as many rows, all as high as the one whose label has most lines."""
+    return (_ROW + _LINE * max((label.count("\n") for label in labels), default=0)) * len(labels)
 
 
 def headline(rows: Sequence[Row]) -> cells.Column:
@@ -75,7 +93,6 @@ def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Seq
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_yticks(range(len(keys)), [suite.title_of(key).replace("`", "") for key in keys])
     axes.set_ylim(len(keys) - 0.4, -0.6)
     axes.grid(axis="x", color=_GRID, lw=0.7, which="both")
     axes.set_axisbelow(True)
@@ -96,19 +113,26 @@ class Path3:
 
 
 def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[Path3]:
-    """The first run of each setting on a sequence that left its trajectory and the truth."""
+    """The first run of each setting on a sequence that left a trajectory that can be aligned with the truth."""
     found = []
     for setting in cells.settings_of(suite, rows):
-        for row in select(rows, sequence, setting)[:1]:
-            place = folder / "runs" / f"{sequence}.{setting}.{row['seed']}"
-            estimate = Path(str(row["external"])) if row.get("external") else place / "estimate.txt"
-            truth = _truth_file(place, folder, sequence, row["seed"])
-            try:
-                pair = Trajectory.load_tum(estimate), Trajectory.load_tum(truth)
-                found.append(Path3(suite.title_of(setting).replace("`", ""), *pair, row.get("metric") is False))
-            except InputError:
-                continue
+        drawn = (_path(suite, row, folder) for row in select(rows, sequence, setting))
+        found += [one for one in [next((one for one in drawn if one is not None), None)] if one is not None]
     return found[:_MOST_LINES]
+
+
+def _path(suite: Suite, row: Row, folder: Path) -> Path3 | None:
+    """That of a run; None where it left none, or where too few of its poses have a truth to be aligned."""
+    place = folder / "runs" / f"{row['sequence']}.{row['setting']}.{row['seed']}"
+    title = suite.title_of(str(row["setting"])).replace("`", "")
+    try:
+        truth = Trajectory.load_tum(_truth_file(place, folder, str(row["sequence"]), row["seed"]))
+        external = row.get("external")
+        estimate = load_trajectory(str(external), truth) if external else Trajectory.load_tum(place / "estimate.txt")
+        one = Path3(title, estimate, truth, row.get("metric") is False)
+    except InputError:
+        return None
+    return one if len(one.errors) >= LEAST_POSES else None
 
 
 def _truth_file(place: Path, folder: Path, sequence: str, seed: object) -> Path:
@@ -126,7 +150,7 @@ def paths_figure(given: Sequence[Path3], width: float = 5.0) -> NotebookFigure:
     above.plot(*flat(given[0].truth), color="#333333", lw=1.0, ls="--", label="truth")
     for number, one in enumerate(given):
         colour = LINES[number % len(LINES)]
-        above.plot(*flat(one.estimate), color=colour, lw=1.2, label=one.title)
+        above.plot(*flat(one.estimate), color=colour, lw=1.2, label=_wrapped(one.title, _ENTRY))
         along.plot(one.estimate.timestamps - one.truth.timestamps[0], 100 * one.errors, color=colour, lw=1.0)
     above.set_aspect("equal", adjustable="datalim")
     above.set_xlabel("m")
@@ -147,7 +171,7 @@ _STAGES_LEFT_OUT = frozenset({"seconds_all", "seconds_wall", "seconds_process"})
 def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
     """Seconds of each stage, and the peak memory, means over runs; a row a sequence and setting."""
     groups = [
-        (f"{sequence}, {suite.title_of(setting)}".replace("`", ""), own)
+        (_wrapped(f"{sequence}, {suite.title_of(setting)}", _LABEL), own)
         for sequence in cells.sequences_of(suite, rows)
         for setting in cells.settings_of(suite, rows)
         if (own := [row for row in select(rows, sequence, setting) if not row.get("external")])
@@ -157,7 +181,7 @@ def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> Notebo
     stages = [
         name for name in sorted(names, key=lambda name: -totals[name]) if totals[name] > 0.01 * sum(totals.values())
     ]
-    figure = NotebookFigure(figsize=(width, 0.28 * len(groups) + 1.6), layout="constrained")
+    figure = NotebookFigure(figsize=(width, _height([name for name, _ in groups]) + 1.6), layout="constrained")
     FigureCanvasAgg(figure)
     time, memory = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
     left = np.zeros(len(groups))

@@ -52,14 +52,21 @@ def find_sequences(path: str, folders: Iterable[Path]) -> list[Path]:
     """All of `folder / path` that are there, also with one or two folders in between, the one to take first."""
     wanted = Path(path).expanduser()
     if wanted.is_absolute():
-        return [wanted.resolve()] if wanted.exists() else []
+        return [wanted.resolve()] if _is_there(wanted) else []
     parents = (
         parent
         for folder in folders
         for level in _LEVELS
         for parent in ([folder] if not level else sorted(folder.glob(level)))
     )
-    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if (parent / wanted).exists()))
+    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if _is_there(parent / wanted)))
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that is too long
+        return False
 
 
 @dataclass(frozen=True, eq=False)

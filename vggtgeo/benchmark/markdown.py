@@ -14,14 +14,15 @@ from vggtgeo.benchmark.suite import Suite
 
 def page(suite: Suite, rows: Sequence[Row]) -> str:
     """All of them."""
-    good = [row for row in rows if row["status"] == "ok"]
-    parts = [f"# {suite.title}", *([suite.about.strip()] if suite.about else []), notice(suite, rows)]
+    good = cells.finished(rows)
+    there = [row for row in rows if row["status"] != "absent"]
+    parts = [f"# {' '.join(suite.title.split())}", *([suite.about.strip()] if suite.about else []), notice(suite, rows)]
     if good:
-        parts += ["## Accuracy", "ATE RMSE after SE(3) alignment, cm.", accuracy(suite, good, cells.SE3)]
-        parts += ["ATE RMSE after Sim(3) alignment, cm.", accuracy(suite, good, cells.SIM3)]
+        parts += ["## Accuracy", "ATE RMSE after SE(3) alignment, cm.", accuracy(suite, there, cells.SE3)]
+        parts += ["ATE RMSE after Sim(3) alignment, cm.", accuracy(suite, there, cells.SIM3)]
         if cells.differences(suite, good):
             parts += [f"## Against {suite.title_of(suite.base)}", _DIFFERENCES, differences(suite, good)]
-        parts += ["## Each sequence and setting", details(suite, good)]
+        parts += ["## Each sequence and setting", details(suite, there)]
     if any(row.get("warnings") for row in good):
         parts += ["## Warnings", doubts(good)]
     if len(good) < len(rows):
@@ -79,18 +80,18 @@ def differences(suite: Suite, rows: Sequence[Row]) -> str:
 
 
 def details(suite: Suite, rows: Sequence[Row]) -> str:
-    """Every number of each sequence and setting; columns that no run has are left out."""
+    """Every number of each sequence and setting that has a result; columns that no run has are left out."""
     groups = [
         (sequence, setting, own)
         for sequence in cells.sequences_of(suite, rows)
         for setting in cells.settings_of(suite, rows)
-        if (own := select(rows, sequence, setting))
+        if cells.finished(own := select(rows, sequence, setting))
     ]
     shown = [column for column in (*cells.DETAILS, *_references(rows)) if any(_has(own, column) for *_, own in groups)]
     lines = [
         [
-            *(sequence, suite.title_of(setting), str(len(own)), cells.tracked(own)),
-            *(cells.text_of(own, column) for column in shown),
+            *(sequence, suite.title_of(setting), cells.runs_text(own), cells.tracked(own)),
+            *(cells.text_of(cells.finished(own), column) for column in shown),
             cells.verdicts(own),
         ]
         for sequence, setting, own in groups
@@ -123,7 +124,7 @@ def failures(rows: Sequence[Row]) -> str:
 def published_table(given: PublishedTable) -> str:
     """Figures of others, apart from the suite's own."""
     note = " `*`: not given the intrinsics." if given.uncalibrated else ""
-    note += " `-`: not published." if any(None in numbers for numbers in given.rows.values()) else ""
+    note += " `-`: not published." if given.has_gaps else ""
     return (
         f"## Published by others: {given.title}\n\nNot measured here; {given.unit}. Source: {given.source}. Protocol: "
         f"{given.protocol}.{note}\n\n{table(['system', *given.columns, 'paper'], given.lines())}"

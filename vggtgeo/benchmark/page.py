@@ -19,19 +19,20 @@ from vggtgeo.report.page import style, template
 
 def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> None:
     """Writes the page, atomically. folder: of the runs, whose pages are linked where they are there."""
-    good = [row for row in rows if row["status"] == "ok"]
+    good = cells.finished(rows)
+    there = [row for row in rows if row["status"] != "absent"]
     text = template("vggtgeo.benchmark", "page.html.j2").render(
         style=style(),
         title=suite.title,
         about=suite.about.strip().replace("`", ""),
         notice=markdown.notice(suite, rows).replace("`", ""),
-        facts=_facts(suite, rows),
-        tables=_accuracy_tables(suite, good),
+        facts=_facts(suite, there),
+        tables=_accuracy_tables(suite, there),
         base=suite.title_of(suite.base),
         compared=[column.head for column in cells.COMPARED],
         differences=cells.differences(suite, good),
         ablations=svg(figures.ablation_figure(suite, good, 7.5)) if _has_error(good) else None,
-        sequences=[_sequence(suite, good, name, folder) for name in cells.sequences_of(suite, good)],
+        sequences=[_sequence(suite, there, name, folder) for name in cells.sequences_of(suite, good)],
         cost=svg(figures.cost_figure(suite, good, 7.5)) if any("frames" in row for row in good) else None,
         runs=[_run(suite, row, folder) for row in rows],
         broken=[row for row in rows if row["status"] not in ("ok", "absent")],
@@ -43,7 +44,7 @@ def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> N
 
 
 def _facts(suite: Suite, rows: Sequence[Row]) -> list[tuple[str, str]]:
-    good = [row for row in rows if row["status"] == "ok"]
+    good = cells.finished(rows)
     levels = [row.get("verdict") for row in good]
     seconds = sum(float(row.get("seconds_wall") or 0.0) for row in rows)
     return [
@@ -65,7 +66,7 @@ def _accuracy_tables(suite: Suite, rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _sequence(suite: Suite, rows: Sequence[Row], name: str, folder: Path) -> dict[str, Any]:
-    given = figures.paths(suite, rows, name, folder)
+    given = figures.paths(suite, cells.finished(rows), name, folder)
     return {
         "name": name,
         "figure": svg(figures.paths_figure(given)) if given else None,
@@ -74,14 +75,20 @@ def _sequence(suite: Suite, rows: Sequence[Row], name: str, folder: Path) -> dic
 
 
 def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> dict[str, Any]:
-    settings = cells.settings_of(suite, select(rows, sequence))
+    settings = cells.settings_of(suite, select(cells.finished(rows), sequence))
     groups = [select(rows, sequence, setting) for setting in settings]
     shown = [one for one in cells.DETAILS if any(cells.summary_of(own, one).count for own in groups)]
-    by_column = [cells.ranked(groups, column) for column in shown]
+    by_column = [cells.ranked(groups, column, beside_count=True) for column in shown]
     return {
         "heads": [column.head for column in shown],
         "lines": [
-            (suite.title_of(setting), cells.tracked(own), [line[row] for line in by_column], cells.verdicts(own))
+            {
+                "title": suite.title_of(setting),
+                "runs": cells.runs_text(own),
+                "tracked": cells.tracked(own),
+                "cells": [line[row] for line in by_column],
+                "verdict": cells.verdicts(own),
+            }
             for row, (setting, own) in enumerate(zip(settings, groups, strict=True))
         ],
     }

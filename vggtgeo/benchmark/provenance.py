@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -80,8 +81,10 @@ def input_hash(path: Path) -> str:
     digest = hashlib.sha256()
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     for file in files:
-        size = file.stat().st_size
-        digest.update(f"{file.relative_to(path.parent).as_posix()} {size}\n".encode())
-        if file.suffix.lower() in _TEXT and size < 2**22:
-            digest.update(file.read_bytes())
+        name = file.relative_to(path.parent).as_posix()
+        with contextlib.suppress(OSError):  # gone meanwhile, or not to be read: the run will say so
+            size = file.stat().st_size
+            digest.update(f"{name} {size}\n".encode(errors="surrogateescape"))  # names need not be UTF-8
+            if file.suffix.lower() in _TEXT and size < 2**22:
+                digest.update(file.read_bytes())
     return digest.hexdigest()[:16]

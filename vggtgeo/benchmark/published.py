@@ -6,11 +6,28 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
+from importlib.resources.abc import Traversable
+from typing import Any, Self
 
 from vggtgeo.io.errors import InputError
 
 LOST = "lost"
+
+
+class Printed(float):
+    """A number that is shown with the digits that its source prints: 0.050 is no 0.05."""
+
+    def __new__(cls, text: object) -> Self:
+        made = super().__new__(cls, str(text))
+        made.text = str(text)
+        return made
+
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
 Figure = float | str | None
 
 
@@ -31,6 +48,11 @@ class PublishedTable:
     papers: Mapping[str, str]
     uncalibrated: tuple[str, ...] = ()
 
+    @property
+    def has_gaps(self) -> bool:
+        """Whether a figure is not published."""
+        return any(None in numbers for numbers in self.rows.values())
+
     def lines(self) -> list[list[str]]:
         """A row of texts a system: its name, with a star where it was not given the intrinsics, numbers, and paper."""
         return [
@@ -41,19 +63,27 @@ class PublishedTable:
 
 def figure_text(figure: Figure) -> str:
     """As it stands in a table."""
-    return "-" if figure is None else figure if isinstance(figure, str) else f"{figure:g}"
+    return "-" if figure is None else str(figure)
+
+
+def _folder() -> Traversable:
+    return files("vggtgeo.benchmark") / "published"
+
+
+def check_published(name: str) -> None:
+    """InputError where there is no published table of that name."""
+    there = sorted(entry.name[:-5] for entry in _folder().iterdir() if entry.name.endswith(".toml"))
+    if name not in there:
+        raise InputError(f"there is no published table `{name}`; there are {', '.join(there)}")
 
 
 def published(name: str) -> PublishedTable:
     """The table of a file in `vggtgeo/benchmark/published`; InputError where there is none of that name."""
-    folder = files("vggtgeo.benchmark") / "published"
-    there = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
-    if name not in there:
-        raise InputError(f"there is no published table `{name}`; there are {', '.join(there)}")
-    values = tomllib.loads((folder / f"{name}.toml").read_text("utf-8"))
+    check_published(name)
+    values = tomllib.loads((_folder() / f"{name}.toml").read_text("utf-8"), parse_float=Printed)
     columns = tuple(values.pop("columns"))
     rows = {
-        system: tuple(None if number == "" else LOST if number == LOST else float(number) for number in numbers)
+        system: tuple(None if number == "" else LOST if number == LOST else Printed(number) for number in numbers)
         for system, numbers in values.pop("rows").items()
     }
     if any(len(numbers) != len(columns) for numbers in rows.values()):

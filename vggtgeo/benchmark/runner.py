@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark import markdown
 from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
-from vggtgeo.benchmark.external import external_rows
+from vggtgeo.benchmark.external import external_rows, tell_missing
 from vggtgeo.benchmark.figures import ablation_figure
 from vggtgeo.benchmark.inputs import data_folders
 from vggtgeo.benchmark.jobs import Job, jobs_of
@@ -26,9 +26,11 @@ from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
+from vggtgeo.io.locks import LockedError, locked
 
 OUTPUTS = ("report.html", "tables.md", "runs.csv", "runs.parquet")
 """What a suite leaves in its folder; the last where PyArrow is there."""
+_LOCK = ".bench.lock"
 Progress = Callable[[int, int, Row], None]
 """Called after each run with the number of those that are done, the number of all, and the row."""
 
@@ -132,21 +134,46 @@ def bench(
     """
     chosen = suite if isinstance(suite, Suite) else load_suite(Path(suite))
     chosen = limited(chosen, _names(sequences), _names(settings), seeds, first_seed, frames)
-    chosen = replace(chosen, recordings=chosen.recordings if recordings is None else recordings)
+    chosen = replace(
+        chosen,
+        recordings=chosen.recordings if recordings is None else recordings,
+        timeout_minutes=chosen.timeout_minutes if timeout_minutes is None else timeout_minutes,
+        memory_gb=chosen.memory_gb if memory_gb is None else memory_gb,
+    )
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
     if workers < 1:
         raise InputError(f"`workers` is {workers}; it must be at least 1")
-    minutes, memory = timeout_minutes or chosen.timeout_minutes, memory_gb or chosen.memory_gb
     jobs = jobs_of(chosen, data_folders(data))
-    store = Store(folder, chosen.name, source_digest())
-    rows = all_rows(jobs, store, Limits(60 * minutes, memory), workers, retry, progress, cluster)
     base = Path(suite).parent if not isinstance(suite, Suite) else Path()
-    rows += external_rows(chosen, jobs, folder / "runs", base)
-    report = BenchReport(chosen, tuple(rows), folder)
-    report.write(folder)
+    tell_missing(chosen, jobs, base)
+    with _held(folder):
+        store = Store(folder, chosen.name, source_digest())
+        limits = Limits(60 * chosen.timeout_minutes, chosen.memory_gb)
+        rows = all_rows(jobs, store, limits, workers, retry, progress, cluster)
+        rows += external_rows(chosen, jobs, folder / "runs", base)
+        report = BenchReport(chosen, tuple(rows), folder)
+        report.write(folder)
     return report
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """`folder`, made where it is not there, for one batch at a time: two would take each other's runs away."""
+    with ExitStack() as holding:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            holding.enter_context(locked(folder / _LOCK))
+        except LockedError as error:
+            raise InputError(
+                f"`{folder}` is in use by another batch ({error}); give another folder with `-o`"
+            ) from None
+        except OSError as error:
+            raise InputError(
+                f"`{folder}` cannot be written: {error.strerror or error}; give another with `-o`"
+            ) from None
+        yield
 
 
 def all_rows(

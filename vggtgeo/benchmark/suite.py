@@ -14,53 +14,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any
 
+from vggtgeo.benchmark.checked_table import CheckedTable
 from vggtgeo.benchmark.protocols import PROTOCOLS
+from vggtgeo.benchmark.published import check_published
+from vggtgeo.datasets.opening import KINDS
 from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.degradations import DEGRADATIONS
+from vggtgeo.simulation.sequence import check_walk
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import Tables, updated
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
-_PLAIN: dict[str, tuple[tuple[type, ...], str]] = {
-    "int": ((int,), "a whole number"),
-    "float": ((int, float), "a number"),
-    "str": ((str,), "a text"),
-    "bool": ((bool,), "true or false"),
-}
-_Table = TypeVar("_Table", bound="CheckedTable")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckedTable:
-    """A table of the file."""
-
-    @classmethod
-    def read(cls, where: str, values: Any) -> Self:
-        """From plain values; InputError naming `where` for a key that is not there, or a value of a wrong type."""
-        known = {entry.name: entry for entry in dataclasses.fields(cls)}
-        if not isinstance(values, Mapping):
-            raise InputError(f"{where} is {values!r}; it must be a table")
-        for key in values:
-            if key not in known:
-                raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
-        lacks = [f"`{name}`" for name, entry in known.items() if name not in values and _is_required(entry)]
-        if lacks:
-            raise InputError(f"{where} lacks {', '.join(lacks)}")
-        for key, value in values.items():
-            expected = _PLAIN.get(str(known[key].type))
-            if expected is not None and type(value) not in expected[0]:
-                raise InputError(f"{where}: `{key}` is {value!r}; it must be {expected[1]}")
-        plain = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-        try:
-            return cls(**plain)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
-
-
-def _is_required(entry: dataclasses.Field[Any]) -> bool:
-    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
+_LONGEST_NAME = 100
+"""Letters: the folder of a run has two names and a seed in its own, which may have 255."""
+_MOST_RUNS = 1_000_000
+_LAST_SEED = 2**31 - 1
+_FIELDS = re.compile(r"\{(sequence|seed)\}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +43,22 @@ class RowTable(CheckedTable):
 
     def __post_init__(self) -> None:
         _check_name(self.name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WalkTable(CheckedTable):
+    """`simulate`: a walk through a rendered world, as `vggtgeo.simulate` takes it; speed: None for the scene's own."""
+
+    scene: str = "office"
+    frames: int = 60
+    size: tuple[int, ...] = (640, 480)
+    rate: float = 30.0
+    speed: float | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.size) != 2:
+            raise InputError(f"`size` is {list(self.size)}; it must be a width and a height")
+        check_walk(self.scene, self.frames, (self.size[0], self.size[1]), self.rate, self.speed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +103,16 @@ class SequenceTable(CheckedTable):
         _one_of("degrade", self.degrade, tuple(DEGRADATIONS))
         if self.path and self.degrade != "base":
             raise InputError(f"`degrade` is {self.degrade!r}; it is for rendered walks")
+        if self.simulate:
+            WalkTable.read("`simulate`", self.simulate)
+        if self.kind is not None:
+            _one_of("kind", self.kind, KINDS)
+        if self.start < 0:
+            raise InputError(f"`start` is {self.start}; it must be at least 0")
+        if self.end is not None and self.end <= self.start:
+            raise InputError(f"`end` is {self.end}; it must be above `start`, {self.start}")
+        if self.key_points < 1:
+            raise InputError(f"`key_points` is {self.key_points}; it must be at least 1")
         if self.simulate and self.exact_depth:
             raise InputError("`exact_depth` is for recordings; that of a rendered walk is known to be so")
         _check_protocol(self.protocol)
@@ -160,6 +157,8 @@ class SettingTable(RowTable):
             raise InputError("`start_of_pose` is 'window', which simulated roles have; networks start so by themselves")
         if self.seeds is not None and self.seeds < 1:
             raise InputError(f"`seeds` is {self.seeds}; it must be at least 1")
+        if not 0.0 <= self.depth_errors < math.inf:
+            raise InputError(f"`depth_errors` is {self.depth_errors}; it must be a factor of at least 0")
         updated(SlamSettings(), self.set)
 
 
@@ -171,6 +170,15 @@ class ExternalTable(RowTable):
 
     files: str
     metric: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if unknown := re.findall(r"\{[^{}]*\}?|\}", _FIELDS.sub("", self.files)):
+            raise InputError(f"`files` has `{unknown[0]}`; it may have `{{sequence}}` and `{{seed}}`")
+
+    def file(self, sequence: str, seed: int) -> Path:
+        """Where the trajectory of a run lies, relative to the suite's folder."""
+        return Path(self.files.replace("{sequence}", sequence).replace("{seed}", str(seed)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,6 +222,13 @@ class Suite(CheckedTable):
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
         if self.first_seed < 0:
             raise InputError(f"`first_seed` is {self.first_seed}; it must be at least 0")
+        most = max((self.seeds, *(table.seeds or 0 for table in self.setting)))
+        if self.first_seed + most > _LAST_SEED:
+            raise InputError(f"seeds go to {self.first_seed + most - 1}; the last that may be is {_LAST_SEED - 1}")
+        if (runs := len(self.sequence) * sum(table.seeds or self.seeds for table in self.setting)) > _MOST_RUNS:
+            raise InputError(f"sequences x settings x seeds are {runs:,} runs; at most {_MOST_RUNS:,} can be")
+        for name in self.published:
+            check_published(name)
         for key in ("sequence", "setting"):
             if not getattr(self, key):
                 raise InputError(f"there is no `[[{key}]]`; give at least one")
@@ -252,7 +267,7 @@ def load_suite(name: str | Path) -> Suite:
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         try:
-            text = path.read_text(encoding="utf-8")
+            text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(
                 f"`{path}` cannot be read: {error}; give a TOML file or one of {_shipped_text()}"
@@ -341,6 +356,8 @@ def _chosen(what: str, wanted: tuple[str, ...], tables: tuple[Any, ...]) -> tupl
 def _check_name(name: object) -> None:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InputError(f"`name` is {name!r}; it must be of letters, digits, `-`, `_` and `+`")
+    if len(name) > _LONGEST_NAME:
+        raise InputError(f"`name` is of {len(name)} letters, {name[:20]}...; it must be of at most {_LONGEST_NAME}")
 
 
 def _check_protocol(name: str) -> None:

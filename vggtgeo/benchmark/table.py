@@ -48,16 +48,21 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         import pyarrow.parquet
     except ImportError:
         raise InputError(f"a Parquet table needs PyArrow; {install_hint('bench')}") from None
-    values = {name: [row.get(name) for row in rows] for name in columns(rows)}
+    values = {name: [_printable(row.get(name)) for row in rows] for name in columns(rows)}
     table = pyarrow.table({name: pyarrow.array(_alike(column)) for name, column in values.items()})
-    with atomic_path(path) as temporary:
-        pyarrow.parquet.write_table(table, temporary)
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:  # of a path, PyArrow takes UTF-8 alone
+        pyarrow.parquet.write_table(table, stream)
 
 
 def number(row: Row, column: str) -> float:
     """A value as a number; NaN where the run has none."""
     value = row.get(column)
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else math.nan
+
+
+def _printable(value: Any) -> Any:
+    """A text in UTF-8: the name of a file need not be, and no column of Parquet takes another."""
+    return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace") if isinstance(value, str) else value
 
 
 def _alike(column: list[Any]) -> list[Any]:

@@ -23,8 +23,8 @@ MAX_TIME_DIFFERENCE = 0.01
 
 
 def evaluate(
-    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM format), or a run's output folder.")],
-    truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM format), or a dataset folder.")],
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM, KITTI), or a run's folder.")],
+    truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM, KITTI, EuRoC), or a dataset folder.")],
     max_dt: Annotated[float, typer.Option(min=0, help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
     delta: Annotated[float, typer.Option(min=0, help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0,
     unit: Annotated[
@@ -42,7 +42,8 @@ def evaluate(
     from vggtgeo.evaluation import evaluate_trajectory
     from vggtgeo.evaluation.resemblance import warn_of_strangers
 
-    found, true, scale = load_estimate(estimate), load_truth(truth), load_scale(estimate)
+    true = load_truth(truth)
+    found, scale = load_estimate(estimate, true), load_scale(estimate)
     report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit)
     meaningless = warn_of_strangers(found, true, max_dt)
     if as_json:
@@ -54,15 +55,17 @@ def evaluate(
         raise typer.Exit(EXIT_FAILED)
 
 
-def load_estimate(path: Path) -> Trajectory:
-    """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`."""
-    from vggtgeo.geometry.trajectory import Trajectory
+def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
+    """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`. truth: whose times poses have
+    that are written without any.
+    """
+    from vggtgeo.datasets.trajectory_files import load_trajectory
     from vggtgeo.results.run_folder import check_finished
 
     unfinished = check_finished(path)
     if unfinished:
         warnings.warn(unfinished, InputWarning, stacklevel=2)
-    return Trajectory.load_tum(path / "trajectory.txt" if path.is_dir() else path)
+    return load_trajectory(path / "trajectory.txt" if path.is_dir() else path, truth)
 
 
 def load_scale(path: Path) -> str | None:
@@ -76,10 +79,10 @@ def load_scale(path: Path) -> str | None:
 def load_truth(path: Path) -> Trajectory:
     """The trajectory in the file `path`, or the truth of the dataset in the folder `path`."""
     from vggtgeo.datasets import open_sequence
-    from vggtgeo.geometry.trajectory import Trajectory
+    from vggtgeo.datasets.trajectory_files import load_trajectory
 
     if not path.is_dir():
-        return Trajectory.load_tum(path)
+        return load_trajectory(path)
     truth = open_sequence(path).ground_truth()
     if truth is None:
         raise InputError(f"`{path}` has no truth; give a trajectory in the TUM format")

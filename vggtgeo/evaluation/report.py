@@ -144,7 +144,8 @@ def evaluate_trajectory(
 
 
 def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGEST_GAP) -> float:
-    """Share of the truth's duration that lies between two poses of the estimate at most `longest_gap` seconds apart.
+    """Share of the truth's duration that lies between two poses of the estimate at most `longest_gap` seconds apart, or
+    two steps of a truth whose own poses are farther apart (a picture every few seconds).
 
     NaN for a truth without duration.
     """
@@ -152,7 +153,8 @@ def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGE
         return float("nan")
     begin, end = truth.timestamps[[0, -1]]
     times = np.clip(estimate.timestamps, begin, end)
-    followed = np.diff(estimate.timestamps) <= longest_gap
+    usual = float(np.median(np.diff(truth.timestamps)))
+    followed = np.diff(estimate.timestamps) <= max(longest_gap, 2.0 * usual)
     return float(np.diff(times)[followed].sum() / (end - begin))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.datasets import Sequence, open_sequence
+from vggtgeo.datasets.trajectory_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -40,7 +41,7 @@ def evaluate(
     """ATE after SE(3) and Sim(3) alignment, and RPE, of an estimate against the truth.
 
     Args:
-        estimate: a trajectory, a result, or where one lies: a file in the TUM format or a run's folder.
+        estimate: a trajectory, a result, or where one lies: a file (TUM, KITTI, EuRoC) or a run's folder.
         truth: a trajectory, a sequence with truth, or where one lies.
         options: `max_dt`, `delta`, `all_pairs` of `vggtgeo.evaluate_trajectory`.
 
@@ -54,16 +55,17 @@ def evaluate(
         30 poses: ATE 0.000 m after SE(3), 0.000 m after Sim(3) (scale 1.0000); RPE over 1 pose: 0.000 m, 0.000 deg
 
     """
-    return evaluate_trajectory(_estimate(estimate), _truth(truth), **options)
+    true = _truth(truth)
+    return evaluate_trajectory(_estimate(estimate, true), true, **options)
 
 
-def _estimate(given: Any) -> Trajectory:
+def _estimate(given: Any, truth: Trajectory) -> Trajectory:
     if isinstance(given, Trajectory):
         return given
     if isinstance(given, Result):
         return given.trajectory
     place = Path(given)
-    return Trajectory.load_tum(place / "trajectory.txt" if place.is_dir() else place)
+    return load_trajectory(place / "trajectory.txt" if place.is_dir() else place, truth)
 
 
 def _truth(given: Any) -> Trajectory:
@@ -71,7 +73,7 @@ def _truth(given: Any) -> Trajectory:
         return given
     if isinstance(given, str | os.PathLike):
         if Path(given).is_file():
-            return Trajectory.load_tum(given)
+            return load_trajectory(given)
         given = open_sequence(given)
     found: Trajectory | None = given.ground_truth()
     if found is None:

@@ -132,6 +132,16 @@ def simulate(
         ((120, 160, 3), 10)
 
     """
+    check_walk(scene, frames, size, rate, speed)
+    build, walk = WORLDS[scene]
+    motion = HandheldMotion.along(walk, seed)
+    if speed is not None:
+        motion = motion.at_speed(speed)
+    return SyntheticSequence(build(seed), motion, camera_of(size), sensor or Sensor(), frames, rate, seed)
+
+
+def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, speed: float | None) -> None:
+    """InputError for what `simulate` cannot take."""
     if scene not in WORLDS:
         raise InputError(f"`scene` is {scene!r}; it must be one of {', '.join(WORLDS)}")
     for name, value in (
@@ -145,11 +155,6 @@ def simulate(
     for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
         if not _LEAST <= value <= _MOST:  # times or places that are the same, or none
             raise InputError(f"`{name}` is {value}; it must be from {_LEAST:g} to {_MOST:g}")
-    build, walk = WORLDS[scene]
-    motion = HandheldMotion.along(walk, seed)
-    if speed is not None:
-        motion = motion.at_speed(speed)
-    return SyntheticSequence(build(seed), motion, camera_of(size), sensor or Sensor(), frames, rate, seed)
 
 
 def camera_of(size: tuple[int, int]) -> Camera:
