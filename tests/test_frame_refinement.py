@@ -11,7 +11,7 @@ from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.frame_refinement import refine_frames
+from vggtgeo.slam.frame_refinement import _agree, refine_frames
 from vggtgeo.slam.settings import Roles
 from vggtgeo.slam.state import Slam
 
@@ -66,13 +66,15 @@ def test_frames_that_stand_aside_come_back(run: RecordedRun) -> None:
         np.testing.assert_allclose(found.pose(found.frames[row]), wrong.pose(wrong.frames[row]), atol=1e-12)
 
 
-def test_a_pose_that_is_contradicted_stays(run: RecordedRun) -> None:
-    """Frames that are said to be known to two millimetres, and are 3 cm aside, stay: what contradicts a track is not
-    averaged with it, but left to what else the tracking saw. Oracle: where they were.
+def test_poses_that_contradict_each_other_are_told_by_what_both_know() -> None:
+    """Two poses agree up to the chi-square quantile of 0.9999 of their distance, in the noise of both together; one of
+    which nothing is known agrees with any. Oracle: the quantile, 27.86 with six degrees of freedom.
     """
-    wrong = moved(run.slam, 3 * AWAY, 0.002)
-    found = refine_frames(wrong, run.sequence.frames(), run.sequence.camera, Roles())
-    np.testing.assert_allclose(off(run, found), off(run, wrong), atol=1e-6)
+    first, second = np.eye(6) / 0.003**2, np.eye(6) / 0.004**2  # together 5 mm
+    for squared, agree in ((27.0, True), (29.0, False)):
+        off = np.array([1.0, -1, 0, 0, 1, 0]) / np.sqrt(3) * 0.005 * np.sqrt(squared)
+        assert _agree(off, first, second) is agree
+        assert _agree(100 * off, np.zeros((6, 6)), second)
 
 
 def test_frames_that_do_not_come_again_are_carried_along_as_before(run: RecordedRun) -> None:
