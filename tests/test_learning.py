@@ -86,6 +86,7 @@ def test_a_recording_tells_where_matches_belong() -> None:
     np.testing.assert_array_equal(shown, [True, False, False, True])
 
 
+@pytest.mark.long
 def test_windows_of_a_recording_are_right_where_the_truth_is_exact() -> None:
     """A rendered recording gives windows whose poses are the true ones, and whose right matches, solved for, bring the
     poses back from 3 cm; oracle: the renderer's poses.
