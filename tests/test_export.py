@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -25,7 +26,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.mapping.tracks import make_tracks
-from vggtgeo.results.scene import Scene
+from vggtgeo.results.scene import Scene, write_scene
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe
 
@@ -221,6 +222,44 @@ def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) ->
     assert {path.name for path in target.iterdir()} == {path.relative_to(target).parts[0] for path in before}
     with pytest.raises(vg.InputError, match="is the folder of the run itself"):
         export(copy, "colmap", copy)
+
+
+def test_targets_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None:
+    # Proves that an export does not write among the run's own pictures nor below a file, and leaves no empty folder
+    # where it fails. Oracle: sentences, and the files before.
+    copy = _changed(folder, tmp_path)
+    before = sorted(copy.rglob("*"))
+    with pytest.raises(vg.InputError, match="which is the run's own; give another"):
+        export(copy, "colmap", copy / "images/model")
+    file = tmp_path / "file"
+    file.write_text("somebody's")
+    for target in (file, file / "below"):
+        with pytest.raises(vg.InputError, match=r"/file` is no folder; give a new one for the export with `-o`"):
+            export(copy, "tum", target)
+    (copy / "map.ply").unlink()
+    with pytest.raises(vg.InputError, match=r"map.ply` is not there; give a folder that `vggtgeo run` wrote"):
+        export(copy, "las")
+    assert sorted(copy.rglob("*")) == [path for path in before if path.name != "map.ply"]
+
+
+def test_pieces_that_nothing_ties_to_the_map_are_left_out(tmp_path: Path) -> None:
+    # Proves that keyframes of another piece of the map, which stand anywhere, are in no COLMAP model, with their
+    # pictures and what they saw. Oracle: the run whole, and with its last keyframe cut off.
+    slam = recorded_run().slam
+    last = slam.keyframes[-1].number
+    cut = replace(
+        slam,
+        pairs=tuple(pair for pair in slam.pairs if last not in pair.key),
+        factors=tuple(factor for factor in slam.factors if last not in factor.keyframes),
+    )
+    whole, left = Scene.of(slam), Scene.of(cut)
+    assert list(left.frames) == list(whole.frames[:-1])
+    assert left.tracks.view.max() < len(left.frames)
+    assert 0 < len(left.tracks.point) < len(whole.tracks.point)
+    write_scene(tmp_path, cut)
+    assert {path.name for path in (tmp_path / "images").iterdir()} == {
+        left.image_name(k) for k in range(len(left.frames))
+    }
 
 
 def test_clouds_that_a_format_cannot_hold_are_named(folder: Path, tmp_path: Path) -> None:

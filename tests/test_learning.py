@@ -10,16 +10,21 @@ import numpy as np
 import pytest
 
 import vggtgeo as vg
+from vggtgeo.datasets import Frame, without_depth
+from vggtgeo.geometry import rigid
+from vggtgeo.io.errors import InputError
 from vggtgeo.learning import (
     Batch,
     ConfidenceNetwork,
     TrackedWindow,
     compare,
     error_and_gradient,
+    recorded_windows,
     stack,
     tracked_windows,
 )
 from vggtgeo.learning.network import LEAST
+from vggtgeo.learning.recorded_windows import RecordedTruth
 from vggtgeo.learning.tracked_windows import FEATURES, INLIER
 
 
@@ -59,6 +64,54 @@ def test_every_match_is_stored_with_its_own_features(windows: list[TrackedWindow
     target = np.asarray(again.problem.points.target[0, edge[0], point[0]])
     np.testing.assert_allclose(target, windows[0].observations.point_target[7])
     assert int(batch.present.sum()) == sum(len(window.error) for window in windows)
+
+
+def test_a_recording_tells_where_matches_belong() -> None:
+    """Corners are carried from frame to frame by measured depth and true poses, and are hidden behind what is nearer;
+    oracle: a wall two metres away that a camera moves along, and a board before it in the second frame.
+    """
+    wall = np.full((40, 60), 2.0)
+    wall[:, 50:] = np.nan
+    behind = wall.copy()
+    behind[:20] = 1.0  # a board
+    image = np.zeros((40, 60, 3), np.uint8)
+    frames = tuple(Frame(k, float(k), image, depth, f"{k}") for k, depth in enumerate((wall, behind)))
+    moved = np.eye(4)
+    moved[0, 3] = -0.2  # 0.2 m to the right: 5 px at 50 px and 2 m
+    known = RecordedTruth(frames, np.array([np.eye(4), moved]), np.array([50.0, 50.0, 30.0, 20.0]))
+    pixels = np.array([[40.0, 30.0], [40.0, 10.0], [55.0, 30.0], [2.0, 30.0]])
+    target, shown = known.correspond(0, 1, pixels)
+    np.testing.assert_allclose(target[[0, 1, 3]], pixels[[0, 1, 3]] - [5.0, 0.0], atol=1e-9)
+    assert np.isnan(target[2]).all(), "no depth there"
+    np.testing.assert_array_equal(shown, [True, False, False, True])
+
+
+@pytest.mark.long
+def test_windows_of_a_recording_are_right_where_the_truth_is_exact() -> None:
+    """A rendered recording gives windows whose poses are the true ones, and whose right matches, solved for, bring the
+    poses back from 3 cm; oracle: the renderer's poses.
+    """
+    sequence = vg.simulate("room", 30, 101, (160, 120), rate=10.0)
+    (window,) = recorded_windows(sequence, 1, keyframes=3, points=24, spacing=4, seed=1)
+    truth = sequence.ground_truth()
+    centres = rigid.invert(rigid.to_matrix(window.poses))[:, :3, 3]
+    away = np.linalg.norm(truth.positions[:, None] - centres, axis=-1).min(0)
+    assert away.max() < 1e-9, away
+    assert np.mean(window.right) > 0.5, window.error
+    batch = stack([window])
+    chosen = batch.select(0)
+    error, _ = error_and_gradient(chosen, jnp.where(chosen.right, 1.0, LEAST))
+    start = np.linalg.norm(window.start[1:, 4:] - window.poses[1:, 4:], axis=1)
+    assert float(error) < 0.5 * start.max(), (float(error), start)
+
+
+def test_recordings_without_depth_or_truth_are_refused() -> None:
+    """What lacks is named; oracle: the sentences."""
+    sequence = vg.simulate("room", 30, 101, (160, 120))
+    with pytest.raises(InputError, match="has no depth"):
+        next(recorded_windows(without_depth(sequence), 1))
+    with pytest.raises(InputError, match="30 frames; a window spans 37"):
+        next(recorded_windows(sequence, 1, spacing=12))
 
 
 @pytest.mark.long

@@ -65,6 +65,7 @@ WRONG = {
     "refinement.global_rounds": (0,),
     "refinement.global_neighbours": (0,),
     "refinement.rolling_shutter": ("yes",),
+    "refinement.frames": ("yes",),
     "refinement.loop_candidates": (-1, 1.5),
 }
 OTHER = {bool: lambda value: not value, int: lambda value: 2 * value + 2, float: lambda value: 0.5 * value}

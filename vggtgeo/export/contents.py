@@ -15,9 +15,12 @@ class EmptyRunError(InputError):
 
 def cloud_of(source: Path) -> PointCloud:
     """The cloud of the run in `source`; EmptyRunError where it has no points."""
-    cloud = PointCloud.load_ply(source / "map.ply")
+    file = source / "map.ply"
+    if not file.is_file():
+        raise InputError(f"`{file}` is not there; give a folder that `vggtgeo run` wrote")
+    cloud = PointCloud.load_ply(file)
     if not len(cloud):
-        raise EmptyRunError(f"`{source / 'map.ply'}` has no points: there is nothing to export")
+        raise EmptyRunError(f"`{file}` has no points: there is nothing to export")
     return cloud
 
 

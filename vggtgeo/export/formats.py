@@ -55,11 +55,10 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     if not (place / "summary.json").is_file():
         raise InputError(f"`{place}` holds no run (no `summary.json`); give a folder that `vggtgeo run` wrote")
     output = Path(target) if target is not None else place / "export" / to
-    if output.resolve() == place.resolve():
-        raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
+    _check_target(output, place)
     verdict = read_summary(place)[1]
     failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""
-    made = not output.exists()
+    made = [folder for folder in (output, *output.parents) if not folder.exists()]
     output.mkdir(parents=True, exist_ok=True)
     stage = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=output))
     try:  # what is there already stays until all is written
@@ -73,11 +72,24 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
         raise InputError(f"{error} ({failed})" if failed else str(error)) from None
     finally:
         shutil.rmtree(stage, ignore_errors=True)
-        if made and not any(output.iterdir()):
-            output.rmdir()
+        for folder in made:  # innermost first
+            if not any(folder.iterdir()):
+                folder.rmdir()
     if failed:
         warnings.warn(f"`{place}`: {failed}", InputWarning, stacklevel=2)
     return written
+
+
+def _check_target(output: Path, run: Path) -> None:
+    """InputError where the files of an export would lie among those of the run, or in no folder."""
+    if output.resolve() == run.resolve():
+        raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
+    for name in ("images", "depth"):
+        if output.resolve().is_relative_to((run / name).resolve()):
+            raise InputError(f"`{output}` is in `{run / name}`, which is the run's own; give another for the export")
+    for folder in (output, *output.parents):
+        if os.path.lexists(folder) and not folder.is_dir():
+            raise InputError(f"`{folder}` is no folder; give a new one for the export with `-o`")
 
 
 def _claim(output: Path, names: list[str], ours: bool) -> None:

@@ -7,9 +7,10 @@ renderer then tells how far each match is off.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import permutations
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -101,14 +102,63 @@ def tracked_windows(
     span = spacing * (keyframes - 1) + 1
     for number in range(count):
         first = int(rng.integers(0, len(sequence) - span))
-        frames = list(range(first, first + span, spacing))
-        yield _window(oracle, f"{sequence.name}, window {number}", frames, points, rng)
+        frames = range(first, first + span, spacing)
+        name = f"{sequence.name}, window {number}"
+        yield track_window(_Simulated(oracle), name, frames, points, rng, (_DEPTH_NOISE, _DEPTH_NOISE))
 
 
-def _window(
-    oracle: SimulatedOracle, name: str, frames: list[int], points: int, rng: np.random.Generator
+@runtime_checkable
+class KnownFrames(Protocol):
+    """Frames of which the truth is known, by number. intrinsics: fx, fy, cx, cy, pixels."""
+
+    @property
+    def intrinsics(self) -> np.ndarray: ...
+
+    def image(self, index: int) -> np.ndarray: ...
+
+    def depth(self, index: int) -> np.ndarray: ...
+
+    def pose(self, index: int) -> np.ndarray: ...
+
+    def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Simulated:
+    """Rendered frames."""
+
+    oracle: SimulatedOracle
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        return self.oracle.intrinsics
+
+    def image(self, index: int) -> np.ndarray:
+        return self.oracle.sequence.frame(index).image
+
+    def depth(self, index: int) -> np.ndarray:
+        return self.oracle.depth(index)
+
+    def pose(self, index: int) -> np.ndarray:
+        return self.oracle.pose(index)
+
+    def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.oracle.correspond(index_i, index_j, pixels)
+
+
+def track_window(
+    oracle: KnownFrames,
+    name: str,
+    numbers: Iterable[int],
+    points: int,
+    rng: np.random.Generator,
+    depth_noise: tuple[float, float],
 ) -> TrackedWindow:
-    images = np.stack([oracle.sequence.frame(k).image for k in frames])
+    """A window of the frames with these numbers. depth_noise: relative standard deviation of what is added to the
+    depth, and of what the prior says of it.
+    """
+    frames = list(numbers)
+    images = np.stack([oracle.image(k) for k in frames])
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     saliency = [StructureTensor().confidence(image) for image in images]
     corners = [_corners(image, points, rng) for image in grey]
@@ -131,7 +181,8 @@ def _window(
             (np.full(len(rows), e), first[i] + rows, found.pixels[rows], features[rows], error[rows], product[rows])
         )
     edge, landmark, target, features, error, product = (np.concatenate(column) for column in zip(*parts, strict=True))
-    prior = 1 / (np.where(np.isfinite(depth), depth, 3.0) * np.exp(_DEPTH_NOISE * rng.normal(size=len(depth))))
+    added, stated = depth_noise
+    prior = 1 / (np.where(np.isfinite(depth), depth, 3.0) * np.exp(added * rng.normal(size=len(depth))))
     observations = Observations(
         edges=edges,
         host=host,
@@ -141,7 +192,7 @@ def _window(
         point_target=target,
         point_weight=np.ones(len(edge)),
         depth_mean=prior,
-        depth_sigma=_DEPTH_NOISE * prior,
+        depth_sigma=stated * prior,
         depth_weight=np.isfinite(depth).astype(float),
     )
     poses = rigid.to_quaternion(np.array([oracle.pose(k) for k in frames]))
@@ -160,6 +211,8 @@ class _Followed:
 
 def _follow(first: np.ndarray, second: np.ndarray, pixels: np.ndarray, guess: np.ndarray) -> _Followed:
     """Track from `first` to `second` and back."""
+    if not len(pixels):  # which OpenCV refuses
+        return _Followed(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, bool))
     here, there = pixels.astype(np.float32)[:, None], guess.astype(np.float32)[:, None]
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     found, status, difference = cv2.calcOpticalFlowPyrLK(first, second, here, there.copy(), flags=flags, **_LK)
@@ -197,7 +250,7 @@ def _features(
             _read(saliency_i, pixels),
             _read(saliency_j, found.pixels),
             np.log(np.maximum(_read(strength, pixels), 0.0) + 1e-6),
-            np.log(found.difference + 0.1),
+            np.log(np.maximum(found.difference, 0.0) + 0.1),
             correlation,
             np.log(found.back + 0.01),
             np.log(np.abs(here.mean(axis=1) - there.mean(axis=1)) + 1.0),

@@ -18,6 +18,8 @@ from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.mapping.tracks import Tracks, make_tracks
+from vggtgeo.slam.connected import pieces_by_size
+from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 
 VERSION = 1
@@ -59,8 +61,12 @@ class Scene:
 
     @classmethod
     def of(cls, slam: Slam) -> Scene:
-        """The scene of a state with at least one keyframe."""
-        keyframes = slam.keyframes
+        """The scene of a state with at least one keyframe: of a map in pieces the one of most frames, as in `map.ply`,
+        for what nothing ties to it stands anywhere.
+        """
+        keyframes = _shown(slam)
+        numbers = {keyframe.number for keyframe in keyframes}
+        pairs = [pair for pair in slam.pairs if numbers.issuperset(pair.key)]
         height, width = keyframes[0].size
         return cls(
             np.array([keyframe.frame for keyframe in keyframes]),
@@ -68,7 +74,7 @@ class Scene:
             np.array([keyframe.pose for keyframe in keyframes]),
             np.asarray(slam.intrinsics, np.float64),
             (width, height),
-            make_tracks(keyframes, slam.pairs, slam.intrinsics),
+            make_tracks(keyframes, pairs, slam.intrinsics),
             slam.metric,
         )
 
@@ -150,10 +156,15 @@ def _check(headers: Mapping[str, ArrayHeader]) -> None:
             raise ValueError(f"its `{name}` is {found.dtype} of shape {found.shape}; expected {words}, {expected}")
 
 
+def _shown(slam: Slam) -> tuple[Keyframe, ...]:
+    """The keyframes of the piece of map that most frames hang on."""
+    return tuple(slam.keyframes[number] for number in pieces_by_size(slam)[0])
+
+
 def write_scene(folder: Path, slam: Slam) -> None:
     """`scene.npz` and a picture of each keyframe in `images/`, undistorted, each written atomically."""
     scene = Scene.of(slam)
-    for view, keyframe in enumerate(slam.keyframes):
+    for view, keyframe in enumerate(_shown(slam)):
         bgr = np.ascontiguousarray(keyframe.image[..., ::-1])
         # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
         with atomic_open(folder / "images" / scene.image_name(view), "wb") as handle:
