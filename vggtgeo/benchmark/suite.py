@@ -18,6 +18,7 @@ from typing import Any, Self, TypeVar
 
 from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.simulation.degradations import DEGRADATIONS
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import Tables, updated
@@ -252,7 +253,7 @@ def load_suite(name: str | Path) -> Suite:
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         try:
-            text = path.read_text(encoding="utf-8")
+            text = whole_text(path, errors="strict")
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(
                 f"`{path}` cannot be read: {error}; give a TOML file or one of {_shipped_text()}"
