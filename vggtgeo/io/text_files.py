@@ -15,11 +15,14 @@ def whole_text(file: Path, encoding: str = "utf-8", errors: str = "replace") -> 
     """The text of a file of at most `MOST_BYTES` bytes.
 
     Raises:
-        InputError: the file has more.
-        OSError: it cannot be read.
+        InputError: the file has more, or may not be read.
+        OSError: it cannot be read for another reason.
 
     """
     size = file.stat().st_size
     if size > MOST_BYTES:
         raise InputError(f"`{file}` has {size} bytes; expected a text of at most {MOST_BYTES}")
-    return file.read_text(encoding=encoding, errors=errors)
+    try:
+        return file.read_text(encoding=encoding, errors=errors)
+    except PermissionError as error:
+        raise InputError(f"`{file}` cannot be read: {error.strerror}; allow it, or take the file away") from None
