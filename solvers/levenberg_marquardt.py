@@ -171,16 +171,15 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Keep an `IterationRecord`, for pictures of the iteration; without it nothing of it is compiled."""
 
     def __check_init__(self) -> None:
-        whole = isinstance(self.max_iterations, numbers.Integral) and not isinstance(self.max_iterations, bool)
-        if not whole or not 0 <= self.max_iterations <= MOST_ITERATIONS:
-            raise ValueError(
-                f"`max_iterations` is {self.max_iterations!r:.60}; expected a whole number from 0 to {MOST_ITERATIONS}"
-            )
+        most: Any = self.max_iterations  # of a caller: annotations promise what nobody has checked
+        whole = isinstance(most, numbers.Integral) and not isinstance(most, bool)
+        if not whole or not 0 <= most <= MOST_ITERATIONS:
+            raise ValueError(f"`max_iterations` is {most!r:.60}; expected a whole number from 0 to {MOST_ITERATIONS}")
         for name in ("rtol", "atol"):
-            given = getattr(self, name)
+            given: Any = getattr(self, name)
             if isinstance(given, jax.Array):  # a traced one has no value to ask
                 continue
-            if not isinstance(given, numbers.Real) or not given >= 0:
+            if not isinstance(given, numbers.Real) or not float(given) >= 0:
                 raise ValueError(f"`{name}` is {given!r:.60}; it must be a number, at least 0")
 
     def init(

@@ -53,13 +53,7 @@ def pack_batch(
     """
     if not windows:
         raise InputError("`windows` is empty; give at least one")
-    for number, window in enumerate(windows):
-        if not isinstance(window, tuple | list) or not 4 <= len(window) <= 5:
-            raise InputError(
-                f"`windows[{number}]` is of the type `{type(window).__name__}`; expected (observations, poses, "
-                "intrinsics, inverse_depth), and its terms where it has some"
-            )
-        check_kind(f"windows[{number}][0]", window[0], Observations, "`vggtgeo.Observations`")
+    _check_windows(windows)
     given = _same_terms([(*terms, *(term for own in window[4:] for term in own)) for window in windows])
     if size is None:
         sizes = [PaddedSize.of(window[0], len(window[1]), own) for window, own in zip(windows, given, strict=True)]
@@ -72,6 +66,16 @@ def pack_batch(
             raise InputError(f"`windows[{number}]`: {error}") from error
     problems, states, indices = zip(*packed, strict=True)
     return stack(problems), stack(states), list(indices)
+
+
+def _check_windows(windows: Sequence[Any]) -> None:
+    for number, window in enumerate(windows):
+        if not isinstance(window, tuple | list) or not 4 <= len(window) <= 5:
+            raise InputError(
+                f"`windows[{number}]` is of the type `{type(window).__name__}`; expected (observations, poses, "
+                "intrinsics, inverse_depth), and its terms where it has some"
+            )
+        check_kind(f"windows[{number}][0]", window[0], Observations, "`vggtgeo.Observations`")
 
 
 def _same_terms(windows: Sequence[Sequence[GivenTerm]]) -> list[list[GivenTerm]]:

@@ -98,11 +98,13 @@ def check_frame(frame: Frame, camera: Camera) -> None:
     """Raises InputError for a frame whose image or depth is none, whose size is not that of the camera's images, or
     whose time is none.
     """
-    image, depth = frame.image, frame.depth
+    given: Any = frame  # of a caller: annotations promise what nobody has checked
+    image, depth, time = given.image, given.depth, given.timestamp
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(f"`{frame.name}` has an image {described(image)}; it must be uint8 [H, W, 3], RGB")
-    if not isinstance(frame.timestamp, numbers.Real) or not math.isfinite(frame.timestamp):
-        raise InputError(f"`{frame.name}` has the time {frame.timestamp!r:.60}; expected a number of seconds")
+    if not isinstance(time, numbers.Real) or not math.isfinite(time):
+        shown = time if isinstance(time, float) else f"{time!r:.60}"
+        raise InputError(f"`{frame.name}` has the time {shown}; expected a number of seconds")
     if depth is not None:
         check_depth(f"the depth of `{frame.name}`", depth, image)
     height, width = image.shape[:2]

@@ -78,8 +78,9 @@ def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
 
 def _frame(item: Any, index: int, rate: float) -> Frame:
     if isinstance(item, Frame):
-        if not isinstance(item.image, np.ndarray) or item.image.ndim != 3:
-            raise InputError(f"`frames[{index}]` has an image {described(item.image)}; it must be uint8 [H, W, 3], RGB")
+        given: Any = item.image
+        if not isinstance(given, np.ndarray) or given.ndim != 3:
+            raise InputError(f"`frames[{index}]` has an image {described(given)}; it must be uint8 [H, W, 3], RGB")
         return item
     image, depth = item if isinstance(item, tuple) and len(item) == 2 else (item, None)
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:

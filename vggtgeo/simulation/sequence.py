@@ -140,8 +140,8 @@ def simulate(
     if len(size) != 2:
         raise InputError(f"`size` has {len(size)} numbers; expected (width, height), in pixels")
     check_whole("seed", seed)
-    for name, value in (("frames", frames), ("size", min(size)), ("size", max(size))):
-        check_whole(name, value, 1)
+    for name, count in (("frames", frames), ("size", min(size)), ("size", max(size))):
+        check_whole(name, count, 1)
     for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
         check_real(name, value)
         if not 0 < value < math.inf:
