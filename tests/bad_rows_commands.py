@@ -110,6 +110,18 @@ def somebodys(name: str, link: bool = False) -> Any:
     return make
 
 
+def into_garbage(made: Path) -> Any:
+    """A run into the folder of one that was killed, whose state is something else."""
+    (made.parent / "out/unfinished").mkdir(parents=True)
+    (made.parent / "out/unfinished/checkpoint.npz").write_text("no state")
+    return run_with("--resume")(made)
+
+
+def verify(made: Path) -> Any:
+    """`vggtgeo models verify`."""
+    return ["models", "verify", made]
+
+
 def result_with_images(folder: Path) -> Path:
     """A run's folder whose pictures are the input of the next."""
     bad.frames(folder / "r/images")
@@ -331,6 +343,7 @@ OUTPUT = rows(
         ("a folder that another run writes", nothing, {"call": locked}),
         ("a folder whose `.lock` is a link to somebody's file", None, output(somebodys(".lock", link=True), "things")),
         ("a folder whose `.lock` is somebody's file", None, output(somebodys(".lock"), "things")),
+        ("a folder with a state of a killed run that is none", good, {"argv": into_garbage}),
         ("a folder with a file that is called `unfinished`", None, output(somebodys("unfinished"), "things")),
         ("a folder with somebody's files in `unfinished`", None, output(somebodys("unfinished/mine.txt"), "things")),
         ("the root of the file system", good, {"argv": lambda made: ["run", made, "-o", "/"]}),
@@ -427,6 +440,7 @@ NETWORKS = rows(
         ("a Git LFS pointer", None, network(b"version https://git-lfs.github.com/spec/v1\n")),
         ("a web page", None, network(b"<!DOCTYPE html><html></html>")),
         ("random bytes", None, network(bytes(range(256)) * 20)),
+        ("20 GB of zeros", lambda folder: bad.lengthened(folder / "net.onnx"), {"argv": verify}),
         ("a network that is none", None, network(b"\x08\x09", "--network", "resnet")),
         ("`models fetch` of a network that is none", nothing, {"argv": line("models", "fetch", "resnet")}),
     ],

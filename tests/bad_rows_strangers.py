@@ -218,6 +218,7 @@ VIDEOS = rows(
         ("no frame", named("c.mp4", lambda path: bad.video(path, 0))),
         ("a pipe", named("c.mp4", os.mkfifo)),
         ("a bag of ROS that is a pipe", named("c.bag", os.mkfifo)),
+        ("a bag of ROS of 20 GB of zeros", lambda folder: bad.lengthened(folder / "c.bag")),
         ("a video that is called .png", named("c.png", bad.video)),
         ("a zip archive", bad.file("clip.mp4", b"PK\x03\x04" + b"\0" * 999)),
     ],
