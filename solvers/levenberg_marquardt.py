@@ -12,6 +12,7 @@ it grows while steps keep their promise and is halved when one does not. `benchm
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -130,6 +131,10 @@ class _Try(eqx.Module):
     record: IterationRecord | None
 
 
+MOST_ITERATIONS = 1_000_000
+"""The energy of each is kept: more would fill the memory before the first."""
+
+
 class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt with Schur elimination of the landmarks.
 
@@ -164,6 +169,18 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Make the inner loop reverse-differentiable (bounded, slower), for unrolled differentiation."""
     record_iterations: bool = False
     """Keep an `IterationRecord`, for pictures of the iteration; without it nothing of it is compiled."""
+
+    def __check_init__(self) -> None:
+        most: Any = self.max_iterations  # of a caller: annotations promise what nobody has checked
+        whole = isinstance(most, numbers.Integral) and not isinstance(most, bool)
+        if not whole or not 0 <= most <= MOST_ITERATIONS:
+            raise ValueError(f"`max_iterations` is {most!r:.60}; expected a whole number from 0 to {MOST_ITERATIONS}")
+        for name in ("rtol", "atol"):
+            given: Any = getattr(self, name)
+            if isinstance(given, jax.Array):  # a traced one has no value to ask
+                continue
+            if not isinstance(given, numbers.Real) or not float(given) >= 0:
+                raise ValueError(f"`{name}` is {given!r:.60}; it must be a number, at least 0")
 
     def init(
         self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, f_struct: Any, aux_struct: Any, tags: Any

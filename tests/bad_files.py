@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 import zipfile
 import zlib
@@ -219,6 +220,14 @@ def file(name: str, content: str | bytes) -> Callable[[Path], Path]:
         return path
 
     return make
+
+
+def lengthened(path: Path, size: int = 20_000_000_000) -> Path:
+    """A file with a hole behind what it holds, so that it is of any size and takes no space."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    os.truncate(path, size)
+    return path
 
 
 def truth(lines: str | bytes) -> Callable[[Path], Path]:

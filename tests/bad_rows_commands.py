@@ -95,6 +95,33 @@ def somebodys_map(folder: Path) -> None:
     (folder / "map.ply").write_text("of the user")
 
 
+def somebodys(name: str, link: bool = False) -> Any:
+    """A folder with a file, or a link to one, where a run puts something of its own."""
+
+    def make(folder: Path) -> None:
+        place = folder / name
+        place.parent.mkdir(parents=True)
+        if link:
+            (folder / "diary.txt").write_text("of the user")
+            place.symlink_to(folder / "diary.txt")
+        else:
+            place.write_text("of the user")
+
+    return make
+
+
+def into_garbage(made: Path) -> Any:
+    """A run into the folder of one that was killed, whose state is something else."""
+    (made.parent / "out/unfinished").mkdir(parents=True)
+    (made.parent / "out/unfinished/checkpoint.npz").write_text("no state")
+    return run_with("--resume")(made)
+
+
+def verify(made: Path) -> Any:
+    """`vggtgeo models verify`."""
+    return ["models", "verify", made]
+
+
 def result_with_images(folder: Path) -> Path:
     """A run's folder whose pictures are the input of the next."""
     bad.frames(folder / "r/images")
@@ -314,7 +341,14 @@ OUTPUT = rows(
             {"argv": lambda made: ["run", made / "images", "-o", made]},
         ),
         ("a folder that another run writes", nothing, {"call": locked}),
+        ("a folder whose `.lock` is a link to somebody's file", None, output(somebodys(".lock", link=True), "things")),
+        ("a folder whose `.lock` is somebody's file", None, output(somebodys(".lock"), "things")),
+        ("a folder with a state of a killed run that is none", good, {"argv": into_garbage}),
+        ("a folder with a file that is called `unfinished`", None, output(somebodys("unfinished"), "things")),
+        ("a folder with somebody's files in `unfinished`", None, output(somebodys("unfinished/mine.txt"), "things")),
+        ("the root of the file system", good, {"argv": lambda made: ["run", made, "-o", "/"]}),
         ("of `solve`: a folder", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made.parent]}),
+        ("of `solve`: a device", bad.problem(), {"argv": lambda made: ["solve", made, "-o", "/dev/full"]}),
         ("of `solve`: the problem", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made]}),
         ("of `simulate`: a folder with files", good, {"argv": lambda made: ["simulate", "room", "-o", made]}),
     ],
@@ -388,6 +422,7 @@ TRAJECTORIES = rows(
         ("a NaN", None, evaluated(write("0 nan 0 0 0 0 0 1\n"), walk())),
         ("a quaternion of length zero", None, evaluated(write("0 0 0 0 0 0 0 0\n"), walk())),
         ("no pose", None, evaluated(write("# nothing\n"), walk())),
+        ("20 GB of zeros", None, evaluated(bad.lengthened, walk())),
         ("binary data", None, evaluated(lambda path: path.write_bytes(bytes(range(256)) * 9), walk())),
         ("times out of order", None, evaluated(backwards, walk())),
         ("each pose twice", None, evaluated(twice, walk())),
@@ -405,6 +440,7 @@ NETWORKS = rows(
         ("a Git LFS pointer", None, network(b"version https://git-lfs.github.com/spec/v1\n")),
         ("a web page", None, network(b"<!DOCTYPE html><html></html>")),
         ("random bytes", None, network(bytes(range(256)) * 20)),
+        ("20 GB of zeros", lambda folder: bad.lengthened(folder / "net.onnx"), {"argv": verify}),
         ("a network that is none", None, network(b"\x08\x09", "--network", "resnet")),
         ("`models fetch` of a network that is none", nothing, {"argv": line("models", "fetch", "resnet")}),
     ],
@@ -415,6 +451,7 @@ RESULTS = rows(
     [
         ("without a summary", nothing, {}),
         ("a summary that is no JSON", folder_of_run("{"), {}),
+        ("a summary of 20 GB", lambda folder: bad.lengthened(folder / "summary.json").parent, {}),
         ("a summary that is a list", folder_of_run("[1, 2]"), {}),
         ("a summary that lacks the intrinsics", folder_of_run(summary_of("good")), {}),
         ("ten thousand brackets", folder_of_run("[" * 10_000), {}),

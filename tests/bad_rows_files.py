@@ -235,6 +235,7 @@ CLOUDS = rows(
         ),
         ("a mesh whose header declares 10^15 faces", bad.ply(FACES, NUL), {"call": Mesh.load_ply}),
         ("a point that is NaN", bad.ply("format ascii 1.0\nelement vertex 1" + XYZ, b"nan 2 3\n")),
+        ("20 GB of zeros", lambda folder: bad.lengthened(folder / "map.ply")),
         ("not there", lambda folder: folder / "map.ply"),
     ],
     call=PointCloud.load_ply,

@@ -9,15 +9,21 @@ warning is told and the rest goes on. What is used is used without a word, becau
 
 from __future__ import annotations
 
+import json
 import re
 import resource
+import subprocess
+import sys
 import time
 import warnings
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import bad_rows_python
 import pytest
 from bad_input_rows import ROWS, Row
+from bad_rows_python import PYTHON
 from conftest import ROOT
 from typer.testing import CliRunner
 
@@ -71,6 +77,25 @@ def pattern(sentence: str) -> str:
     return ".*".join(re.escape(part) for part in sentence.split("..."))
 
 
+@cache
+def seen_by_a_script() -> dict[str, tuple[str, list[str], float]]:
+    """What every call of `bad_rows_python.py` came to, in a process without the checks of these tests."""
+    done = subprocess.run([sys.executable, bad_rows_python.__file__], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-1000:]
+    told: dict[str, tuple[str, list[str], float]] = json.loads(done.stdout)
+    return told
+
+
+@pytest.mark.parametrize("row", PYTHON, ids=lambda row: row.given.replace(" ", "-"))
+def test_what_a_script_sees(row: Row) -> None:
+    """The page's sentence for a call of the library, and the way it ends; oracle: the page."""
+    ends, sees = TABLE[row.group, row.given]
+    end, said, seconds = seen_by_a_script()[row.given]
+    assert end == ("error" if ends == "error" else "used"), said
+    assert any(re.search(pattern(sees), " ".join(line.split())) for line in said), said
+    assert seconds < SECONDS * row.slack, f"{seconds:.2f} s"
+
+
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.group}: {row.given}".replace(" ", "-"))
 def test_what_the_user_sees(row: Row, tmp_path: Path) -> None:
     """The page's sentence for the row, and the way it ends."""
@@ -91,7 +116,8 @@ def test_what_the_user_sees(row: Row, tmp_path: Path) -> None:
 
 def test_the_page_has_every_row_and_no_other() -> None:
     """Page and rows are of the same inputs, at least 120 of them, each told in a sentence of its own."""
-    assert [(row.group, row.given) for row in ROWS if (row.group, row.given) not in TABLE] == []
-    assert set(TABLE) == {(row.group, row.given) for row in ROWS}
-    assert len(ROWS) == len(TABLE) >= 120
+    rows = [(row.group, row.given) for row in (*ROWS, *PYTHON)]
+    assert [row for row in rows if row not in TABLE] == []
+    assert set(TABLE) == set(rows)
+    assert len(rows) == len(TABLE) >= 120
     assert [given for given, (ends, sees) in TABLE.items() if (ends == "used") != (not sees)] == []

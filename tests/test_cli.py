@@ -252,6 +252,16 @@ def test_a_device_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest
     assert result.stderr == "error: JAX finds no device for JAX_PLATFORMS=cuda; unset it, or use cpu\n"
 
 
+def test_a_solve_without_compilation_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`JAX_DISABLE_JIT=1` was an internal error after all the work; oracle: the line, and that nothing is written."""
+    monkeypatch.setenv("JAX_DISABLE_JIT", "1")
+    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
+    assert result.exit_code == 2
+    assert result.stderr == "error: the environment variable `JAX_DISABLE_JIT` is set; `solve` is compiled: unset it\n"
+    assert not (tmp_path / "solution.npz").exists()
+    assert invoke("data", "list").exit_code == 0
+
+
 def test_a_switch_of_jax_that_is_none_is_named(tmp_path: Path) -> None:
     """`JAX_ENABLE_X64=maybe` was an internal error: JAX refuses it where it is imported; oracle: the line."""
     command = [

@@ -267,4 +267,6 @@ def test_what_the_sparse_way_refuses(sparse: Observe, loop: tuple[Problem, State
     with pytest.raises(ValueError, match=r"a `state` in float32, whose rounding errors .* expected float64"):
         sparse(*packed(WELL, at_truth=True, dtype=np.float32))
     with pytest.raises(ValueError, match=r"NaN or infinite; expected finite poses"):
+        sparse(eqx.tree_at(lambda p: p.pixels, loop[0], jnp.full_like(loop[0].pixels, jnp.nan)), loop[1])
+    with pytest.raises(ValueError, match=r"`state.intrinsics` has a NaN or an infinity"):
         sparse(loop[0], eqx.tree_at(lambda s: s.intrinsics, loop[1], jnp.full(4, jnp.nan)))

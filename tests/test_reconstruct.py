@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
+from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.settings_table import changed
 
@@ -147,6 +149,21 @@ def test_any_iterable_of_frames_will_do() -> None:
     assert expected.record.truth is not None
     with pytest.raises(vg.InputError, match="`frames` is empty"):
         vg.reconstruct([])
+
+
+def test_a_clock_that_stands_costs_the_frame_and_not_the_run() -> None:
+    """Of frames of one time the first is used and the others are counted; the trajectory, which has a pose for a time,
+    is there at the end, and the verdict knows what was left out. Oracle: the run over the other frames.
+    """
+    sequence = vg.simulate("room", 4, 0, (160, 120))
+    given = list(sequence.frames())
+    stuck = [*given[:2], replace(given[2], timestamp=given[1].timestamp), given[3]]
+    with pytest.warns(LeftOutWarning, match="`room-00002` has the time .* is not after .* is skipped"):
+        found = vg.reconstruct(stuck, camera=sequence.camera, settings=SETTINGS)
+    expected = vg.reconstruct([*given[:2], given[3]], camera=sequence.camera, settings=SETTINGS)
+    np.testing.assert_array_equal(found.trajectory.timestamps, expected.trajectory.timestamps)
+    np.testing.assert_array_equal(found.trajectory.poses, expected.trajectory.poses)
+    assert any("1 of 4 frames" in reason for reason in map(str, found.verdict.reasons)), found.verdict.reasons
 
 
 @pytest.mark.parametrize("stop_at", ["frame 1", "finish of the map"])

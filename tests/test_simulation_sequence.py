@@ -10,7 +10,7 @@ from synthetic_room import room
 from vggtgeo.cli.simulate import parse_size
 from vggtgeo.cli.simulate import simulate as simulate_command
 from vggtgeo.datasets import open_sequence
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
 from vggtgeo.simulation.room import build_room
 from vggtgeo.simulation.shade import encode
@@ -171,6 +171,18 @@ def test_tum_folder_reads_back(tmp_path: Path, walk: SyntheticSequence) -> None:
     assert np.abs(read.ground_truth().poses - few.ground_truth().poses).max() < 1e-8
     with pytest.raises(InputError, match="not an empty folder"):
         next(write_tum_folder(few, folder))
+
+
+def test_a_walk_that_was_killed_is_read_in_its_own_unit(tmp_path: Path, walk: SyntheticSequence) -> None:
+    # After one frame of three: times and metres are those of the walk, and the others are told as missing.
+    few = replace(walk, count=3)
+    first = next(write_tum_folder(few, tmp_path / "room"))
+    read = open_sequence(tmp_path / "room")
+    with pytest.warns(InputWarning, match="No such file or directory; the frame is skipped"):
+        frames = list(read.frames())
+    assert [frame.timestamp for frame in frames] == [first.timestamp]
+    assert np.nanmax(np.abs(frames[0].depth - first.depth)) <= 0.51 / 5000
+    assert np.allclose(read.camera.intrinsics, walk.camera.intrinsics, atol=1e-6)
 
 
 def test_the_command_writes_a_folder_and_names_wrong_sizes(tmp_path: Path) -> None:

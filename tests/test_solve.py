@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -259,3 +260,10 @@ def test_float32_is_close_to_float64(solved: Solve) -> None:
     assert bool(single.converged), single.message
     assert float(single.energy) == pytest.approx(float(exact.energy), rel=1e-5)
     assert distance(single.state, exact.state) < 2e-3
+
+
+@pytest.mark.parametrize("given", [{"max_iterations": -1}, {"max_iterations": 10**9}, {"rtol": np.nan}, {"atol": -1.0}])
+def test_an_iteration_that_cannot_be_is_refused_where_it_is_made(given: dict[str, Any]) -> None:
+    """Counts that are none or fill the memory; tolerances that nothing ever meets. Oracle: the argument's name."""
+    with pytest.raises(ValueError, match=f"^`{next(iter(given))}` is {next(iter(given.values()))}"):
+        SchurLevenbergMarquardt(**given)

@@ -49,6 +49,18 @@ def test_a_run_that_cannot_print_is_written_as_a_whole(tmp_path: Path, stream: s
         assert done.stdout.splitlines()[-1] == "verdict: failed"
 
 
+@pytest.mark.parametrize("columns", ["0", "1", "-5", "many"])
+def test_a_terminal_without_columns_still_shows_what_was_found(tmp_path: Path, columns: str) -> None:
+    """`COLUMNS=0` printed blank lines, and ended as if all were well. Oracle: words and numbers of the table."""
+    bad.walk(tmp_path / "mine.txt", 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", columns)
+        done = called("evaluate", tmp_path / "mine.txt", tmp_path / "mine.txt")
+    assert done.returncode == 0, done.stderr
+    assert "60 poses" in " ".join(done.stdout.split())
+    assert done.stdout.count("0.000") > 4, done.stdout
+
+
 def test_a_backend_that_matplotlib_does_not_know_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`MPLBACKEND` of another program; it was asked for when the results were written. Oracle: the files."""
     bad.frames(tmp_path / "frames")

@@ -107,7 +107,8 @@ def _read(path: Path) -> Outputs | None:
         with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
             named = found.pop(_NAMES).tolist()
-            return found if sorted(found) == named else None
+            arrays = all(isinstance(value, np.ndarray) for value in found.values())  # no such member: its raw bytes
+            return found if arrays and sorted(found) == named else None
     except _UNREADABLE:
         return None
 

@@ -35,6 +35,10 @@ _STRANGERS = (
 )
 
 
+_MOST_BYTES = 2**31
+"""What a protocol buffer may have; larger weights are in a file beside it."""
+
+
 def check_looks_like_onnx(path: Path) -> None:
     """Raise `NetworkFileError` for a file that is missing, empty, or something else by its first bytes."""
     if not path.is_file():
@@ -42,6 +46,9 @@ def check_looks_like_onnx(path: Path) -> None:
         raise NetworkFileError(f"`{path}` is {what}, expected an ONNX file; see `vggtgeo models list`")
     with path.open("rb") as file:
         start = file.read(32)
+    size = path.stat().st_size
+    if size > _MOST_BYTES:
+        raise NetworkFileError(f"`{path}` has {size} bytes; an ONNX file has at most {_MOST_BYTES}")
     if not start:
         raise NetworkFileError(f"`{path}` is empty, expected an ONNX file; export or fetch it again")
     for mark, what in _STRANGERS:

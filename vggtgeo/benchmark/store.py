@@ -13,6 +13,7 @@ from vggtgeo.benchmark.jobs import Job
 from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
+from vggtgeo.io.text_files import whole_text
 
 Row = Mapping[str, Any]
 """A line of the table: plain values by the names of the columns."""
@@ -39,7 +40,7 @@ class Store:
         if not path.is_file():
             return None
         try:
-            row = json.loads(path.read_text(encoding="utf-8"))
+            row = json.loads(whole_text(path, errors="strict"))
             same, status = row["fingerprint"] == job.fingerprint(self.source), row["status"]
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"`{path}` is no finished run ({error}); delete it and call again") from None
@@ -55,7 +56,7 @@ class Store:
     def complete(self, job: Job, **columns: Any) -> Row:
         """The row that the run left, or one that says that it left none, with `columns`."""
         path = self.place(job) / ROW
-        row = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else identity(self.described(job))
+        row = json.loads(whole_text(path, errors="strict")) if path.is_file() else identity(self.described(job))
         if "status" in row:
             row = {**{name: value for name, value in columns.items() if name != "message"}, **row}
         else:

@@ -21,6 +21,7 @@ from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.published import check_published
 from vggtgeo.datasets.opening import KINDS
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.simulation.degradations import DEGRADATIONS
 from vggtgeo.simulation.sequence import check_walk
 from vggtgeo.slam.settings import SlamSettings
@@ -267,7 +268,7 @@ def load_suite(name: str | Path) -> Suite:
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         try:
-            text = path.read_text(encoding="utf-8-sig")
+            text = whole_text(path, "utf-8-sig", "strict")
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(
                 f"`{path}` cannot be read: {error}; give a TOML file or one of {_shipped_text()}"

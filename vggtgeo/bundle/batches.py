@@ -14,9 +14,11 @@ from jax.sharding import PartitionSpec
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex
+from vggtgeo.bundle.pair_checks import check_kinds
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 Window = (
@@ -51,6 +53,7 @@ def pack_batch(
     """
     if not windows:
         raise InputError("`windows` is empty; give at least one")
+    _check_windows(windows)
     given = _same_terms([(*terms, *(term for own in window[4:] for term in own)) for window in windows])
     if size is None:
         sizes = [PaddedSize.of(window[0], len(window[1]), own) for window, own in zip(windows, given, strict=True)]
@@ -63,6 +66,16 @@ def pack_batch(
             raise InputError(f"`windows[{number}]`: {error}") from error
     problems, states, indices = zip(*packed, strict=True)
     return stack(problems), stack(states), list(indices)
+
+
+def _check_windows(windows: Sequence[Any]) -> None:
+    for number, window in enumerate(windows):
+        if not isinstance(window, tuple | list) or not 4 <= len(window) <= 5:
+            raise InputError(
+                f"`windows[{number}]` is of the type `{type(window).__name__}`; expected (observations, poses, "
+                "intrinsics, inverse_depth), and its terms where it has some"
+            )
+        check_kind(f"windows[{number}][0]", window[0], Observations, "`vggtgeo.Observations`")
 
 
 def _same_terms(windows: Sequence[Sequence[GivenTerm]]) -> list[list[GivenTerm]]:
@@ -117,6 +130,11 @@ def solve_batch(
         (2,)
 
     """
+    check_kinds(problems, initials, "initials")
+    if jnp.ndim(initials.inverse_depth) != 3:
+        raise InputError(
+            "`initials` has no axis of windows; give what `vggtgeo.pack_batch` makes, or use `vggtgeo.solve`"
+        )
     count = len(initials.intrinsics)
     if devices is not None and count % len(devices):
         raise InputError(

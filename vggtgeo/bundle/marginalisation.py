@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
+from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
@@ -29,6 +30,8 @@ from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_whole
 from vggtgeo.solvers.arrow import reduce
 
 _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
@@ -67,6 +70,9 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> Marg
         (28, 28)
 
     """
+    check_pair(problem, state)
+    if not isinstance(leaving, jax.core.Tracer):
+        check_whole("leaving", np.asarray(leaving).item(), 0, problem.num_keyframes - 1)
     prior = next((term for term in problem.terms if isinstance(term, MarginalPrior)), None)
     if prior is None:
         raise ValueError(
@@ -93,7 +99,15 @@ def reorder(prior: MarginalPrior, order: np.ndarray) -> MarginalPrior:
         (22, 22)
 
     """
-    order = np.asarray(order)
+    order, count = np.asarray(order), len(prior.poses.wxyz_xyz)
+    inside = order[order >= 0]
+    if (
+        order.dtype.kind not in "iu"
+        or order.ndim != 1
+        or len(np.unique(inside)) < len(inside)
+        or (order >= count).any()
+    ):
+        raise InputError(f"`order` is {order.tolist()}; it must have whole numbers below {count}, each once, or -1")
     known, tail = order >= 0, len(prior.intrinsics)
     columns = (lie.TANGENT * np.maximum(order, 0)[:, None] + np.arange(lie.TANGENT)).reshape(-1)
     shared = prior.root.shape[1] - tail + np.arange(tail)

@@ -13,6 +13,7 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from vggtgeo.bundle.fast import pinhole
+from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
 from vggtgeo.bundle.terms.node import node_residuals
@@ -33,6 +34,7 @@ def energy(problem: Problem, state: State) -> Float[Array, ""]:
         True
 
     """
+    check_pair(problem, state)
     return _energy_jit(problem, state)
 
 
@@ -50,6 +52,7 @@ def energy_terms(problem: Problem, state: State) -> dict[str, Float[Array, ""]]:
         True
 
     """
+    check_pair(problem, state)
     return _energy_terms_jit(problem, state)
 
 

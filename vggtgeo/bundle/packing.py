@@ -21,8 +21,8 @@ from jaxtyping import Array
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.packing_checks import (
-    as_numbers,
     as_poses,
+    check_dtype,
     check_fixed,
     check_intrinsics,
     check_intrinsics_prior,
@@ -43,6 +43,7 @@ from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
 from vggtgeo.geometry.line_segments import fractions, straightened
+from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 POSITIVE = ("depth_mean", "depth_sigma", "inverse_depth", "kernel.delta")
@@ -104,10 +105,12 @@ def pack(
 
     """
     dtype = jnp.result_type(float) if dtype is None else dtype
+    check_dtype(dtype)
+    check_kind("observations", observations, Observations, "`vggtgeo.Observations`")
     observations, poses = _as_arrays(observations), as_poses(poses)
-    intrinsics, inverse_depth = as_numbers("intrinsics", intrinsics), as_numbers("inverse_depth", inverse_depth)
-    mean = intrinsics if intrinsics_mean is None else as_numbers("intrinsics_mean", intrinsics_mean)
-    camera_of = None if camera_of is None else as_numbers("camera_of", camera_of)
+    intrinsics, inverse_depth = real_numbers("intrinsics", intrinsics), real_numbers("inverse_depth", inverse_depth)
+    mean = intrinsics if intrinsics_mean is None else real_numbers("intrinsics_mean", intrinsics_mean)
+    camera_of = None if camera_of is None else real_numbers("camera_of", camera_of)
     check_kernel("kernel", kernel)
     check_observations(observations, poses)
     check_positive("inverse_depth", inverse_depth, len(observations.host))
@@ -151,12 +154,13 @@ def _as_arrays(observations: Observations) -> Observations:
     """The same observations, lists turned into arrays."""
     names = [field.name for field in fields(observations) if field.name != "alpha"]
     given = {name: getattr(observations, name) for name in names}
-    arrays: dict[str, Any] = {name: as_numbers(name, v) for name, v in given.items() if v is not None}
+    arrays: dict[str, Any] = {name: real_numbers(name, v) for name, v in given.items() if v is not None}
     return replace(observations, **arrays)
 
 
 def _layout(observations: Observations, keyframes: int, size: PaddedSize | None) -> tuple[PaddedSize, Edges, SlotIndex]:
     """The padded size, the graph, and where each landmark and edge lies in them."""
+    check_kind("size", size, PaddedSize | None, "a `vggtgeo.PaddedSize`")
     slots = assign_slots(observations, keyframes, size.samples if size else None)
     edges, order, degree = sort_edges(observations.edges, keyframes)
     needed = PaddedSize(keyframes, slots.points, slots.lines, degree, len(edges), slots.samples)

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.geometry.cameras import AbstractCamera
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_real, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel
-
-if TYPE_CHECKING:
-    from vggtgeo.bundle.observations import Observations
-    from vggtgeo.bundle.padding import PaddedSize
 
 UNIT = 1e-3
 """How far a quaternion's length and a line's normal may be from 1: what single precision and text files leave."""
@@ -25,7 +24,7 @@ def as_poses(poses: Any) -> np.ndarray:
     """`[n, 7]` from an array, nested lists, or `jaxlie.SE3`."""
     if isinstance(poses, jaxlie.SE3):
         poses = poses.wxyz_xyz
-    found = as_numbers("poses", poses)
+    found = real_numbers("poses", poses)
     if found.ndim != 2 or found.shape[1] != len("wxyzxyz"):
         raise InputError(
             f"`poses` has shape {found.shape}; expected (n, 7): qw, qx, qy, qz, tx, ty, tz of each, world -> camera"
@@ -33,15 +32,14 @@ def as_poses(poses: Any) -> np.ndarray:
     return found
 
 
-def as_numbers(name: str, given: Any) -> np.ndarray:
-    """An array of numbers from whatever was given."""
+def check_dtype(dtype: Any) -> None:
+    """One of the two precisions that all of the solver has: there is no linear algebra of half precision."""
     try:
-        found = np.asarray(given)
-    except ValueError as error:
-        raise InputError(f"`{name}` cannot be read as an array: {error}") from error
-    if not (np.issubdtype(found.dtype, np.number) or found.dtype == bool):
-        raise InputError(f"`{name}` is {given!r:.60}; expected numbers")
-    return found
+        known = np.dtype(dtype) in (np.float32, np.float64)
+    except TypeError:
+        known = False
+    if not known:
+        raise InputError(f"`dtype` is {dtype!r:.60}; it must be float32 or float64")
 
 
 def check_kernel(name: str, kernel: Any) -> None:
@@ -85,6 +83,7 @@ def _check_values(observations: Observations) -> None:
         weight = getattr(observations, name)
         if weight is not None:
             check_weight(name, weight)
+    check_real("alpha", observations.alpha, "finite and not negative")
     if not (np.isfinite(observations.alpha) and observations.alpha >= 0):
         raise InputError(f"`alpha` is {observations.alpha}; it must be finite and not negative")
     used = lambda weight: np.asarray(weight) > 0
@@ -224,7 +223,7 @@ def check_intrinsics_prior(mean: np.ndarray, sigma: Any, shape: tuple[int, ...])
         raise InputError(f"`intrinsics_mean` is {mean}; expected {' x '.join(map(str, shape))} finite numbers")
     if sigma is None:
         return
-    if not np.all(np.asarray(sigma) > 0):
+    if not np.all(real_numbers("intrinsics_sigma", sigma) > 0):
         raise InputError(f"`intrinsics_sigma` is {sigma}; it must be positive (None = no prior)")
     if np.shape(sigma) not in ((), shape[-1:], shape):
         raise InputError(f"`intrinsics_sigma` has shape {np.shape(sigma)}; expected one number, or {shape}")

@@ -14,8 +14,10 @@ from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.linearise import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.observed import check_observed
+from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solver_choice import default_solver
+from vggtgeo.io.given import check_kind
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.adjoint import ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import (
@@ -122,8 +124,8 @@ def solve(
             `history` and `iterations` are those of the last kernel, the one of `problem`.
 
     Raises:
-        InputError: nothing is observed (where weights have values to look at; as the argument of a jitted function such
-            a problem converges where it starts).
+        InputError: `initial` is of another size or precision; or nothing is observed (where weights have values to look
+            at; as the argument of a jitted function such a problem converges where it starts).
 
     Example:
         >>> import jax, vggtgeo as vg
@@ -133,6 +135,8 @@ def solve(
         (True, True)
 
     """
+    check_pair(problem, initial, "initial")
+    check_kind("solver", solver, SchurLevenbergMarquardt | None, "a `vggtgeo.SchurLevenbergMarquardt`")
     check_observed(problem)
     solver = default_solver(problem) if solver is None else solver
     return _solve_jit(problem, initial, solver, ArrowAdjoint() if adjoint is None else adjoint, graduation)

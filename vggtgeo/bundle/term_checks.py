@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
-from vggtgeo.bundle.packing_checks import as_numbers, check_kernel, check_matches, check_weight
+from vggtgeo.bundle.packing_checks import check_kernel, check_matches, check_weight
 from vggtgeo.bundle.padding import COUNTED
 from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
@@ -20,6 +20,7 @@ from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind, real_numbers
 
 _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsPrior))
 """Names of the terms that `pack` makes of its other arguments."""
@@ -27,6 +28,7 @@ _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsP
 
 def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int) -> None:
     """Terms of different names, with weights that are weights and indices that exist."""
+    check_kind("terms", terms, (list, tuple), "a list of terms, as `[vggtgeo.RelativePose(...)]`")
     names = list(_OWN)
     for term in terms:
         if not isinstance(term, AbstractTerm | FlatTerm):
@@ -81,7 +83,7 @@ def _check_touched(term: PoseTerm | PairTerm, keyframes: int) -> None:
 
 
 def _check_range(name: str, given: Any, limit: int, what: str) -> np.ndarray:
-    values = as_numbers(name, given)
+    values = real_numbers(name, given)
     if not np.issubdtype(values.dtype, np.integer):
         raise InputError(f"`{name}` holds {values.dtype}; expected whole numbers")
     if values.size and (values.min() < 0 or values.max() >= limit):

@@ -11,6 +11,7 @@ import typer
 
 from vggtgeo.cli.options import EXIT_FAILED, JsonOption
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.text_files import whole_text
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -71,7 +72,7 @@ def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
 def load_scale(path: Path) -> str | None:
     """What the summary of a run says of its scale; None for a file, whose scale nobody knows."""
     try:
-        return str(json.loads((path / "summary.json").read_text(encoding="utf-8"))["scale"])
+        return str(json.loads(whole_text(path / "summary.json", errors="strict"))["scale"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

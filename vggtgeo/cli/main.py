@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import logging
 import os
 import re
 import sys
@@ -15,9 +16,9 @@ import typer
 from typer.core import TyperGroup
 
 from vggtgeo.cli.address_space import check_address_space
-from vggtgeo.cli.jax_flags import set_jax_flags
+from vggtgeo.cli.jax_flags import check_jit, set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
-from vggtgeo.cli.streams import exit_code, use_lasting_streams
+from vggtgeo.cli.streams import exit_code, use_lasting_streams, use_readable_width
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.interruption import end_on_signals
 from vggtgeo.io.one_line import one_line
@@ -157,6 +158,7 @@ class _LazyGroup(TyperGroup):
         entry = next((entry for entry in COMMANDS if entry.name == name), None)
         if entry is not None and not set(ctx.help_option_names) & set(rest):
             check_address_space(entry.name)
+            check_jit(entry.name)
         return name, load_command(entry) if entry else stand_in, rest
 
     def invoke(self, ctx: Any) -> Any:
@@ -203,6 +205,11 @@ def _leave(error: BaseException) -> NoReturn:
         message, code = "interrupted", EXIT_INTERRUPTED
     elif isinstance(error, OSError) and error.filename is not None:
         message, code = f"error: `{error.filename}`: {error.strerror}", EXIT_INPUT
+    elif isinstance(error, FileNotFoundError) and _lacks_folder():
+        message, code = (
+            "error: the folder that this command was started in is gone; change to another (`cd`)",
+            EXIT_INPUT,
+        )
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
     elif _is_short_of_memory(error):
@@ -220,6 +227,15 @@ def _leave(error: BaseException) -> NoReturn:
         code = EXIT_INTERNAL
     typer.echo(one_line(message), err=True)
     raise typer.Exit(code) from None
+
+
+def _lacks_folder() -> bool:
+    """Whether the working folder was removed, so that a relative path leads nowhere."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
@@ -294,6 +310,8 @@ def main() -> None:
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; a name that Matplotlib does not know would end a run
     end_on_signals()
     use_lasting_streams()
+    use_readable_width()
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where it may keep its cache is no matter of a command
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
     try:
         make_app()(prog_name="vggtgeo")

@@ -15,6 +15,10 @@ from typing import Any
 _LINE = "error: standard output cannot be written ({}): what is printed there is lost, files are written all the same"
 
 
+LEAST_WIDTH = 40
+"""Columns in which the tables can still be read."""
+
+
 class _Lasting(io.FileIO):
     """A file whose errors are noted. Fields: lost, the first."""
 
@@ -44,6 +48,15 @@ def use_lasting_streams() -> None:
             lines = stream.line_buffering or stream.write_through
             buffer = io.BufferedWriter(_Lasting(number, "w", closefd=False))
             setattr(sys, name, io.TextIOWrapper(buffer, stream.encoding, "replace", line_buffering=lines))
+
+
+def use_readable_width() -> None:
+    """Some terminals and schedulers say that they have no columns, or one: what is printed there would be blank."""
+    told = os.environ.get("COLUMNS", "")
+    if not told.isdecimal() or not int(told):
+        os.environ.pop("COLUMNS", None)
+    elif int(told) < LEAST_WIDTH:
+        os.environ["COLUMNS"] = str(LEAST_WIDTH)
 
 
 def exit_code(code: Any, failed: int) -> Any:

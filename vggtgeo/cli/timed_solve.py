@@ -47,6 +47,10 @@ def check_output(problem: Path, output: Path) -> None:
     """InputError for an output that is a folder or the problem itself, before anything is computed."""
     if output.is_dir():
         raise InputError(f"`{output}` is a folder; give the name of a file for the solution with `-o`")
+    if output.exists() and not output.is_file():
+        raise InputError(
+            f"`{output}` is a device, a pipe or a socket; give the name of a file for the solution with `-o`"
+        )
     if output.exists() and problem.exists() and output.samefile(problem):
         raise InputError(f"`{output}` is the problem itself; give another name for the solution with `-o`")
     above = next(folder for folder in output.resolve().parents if folder.exists())

@@ -39,6 +39,9 @@ _COLOUR = {
 }
 
 
+_BEGINS = b"#ROSBAG V"
+
+
 def is_bag(path: Path) -> bool:
     """Whether `path` is a ROS 1 bag (a file `.bag`) or a ROS 2 bag (a folder with `metadata.yaml`, `.db3`, `.mcap`)."""
     return path.suffix in (".bag", ".db3", ".mcap") or (path / "metadata.yaml").is_file()
@@ -132,6 +135,10 @@ def _reader(path: Path) -> Iterator[Any]:
         raise InputError(f"bags of ROS need the package rosbags; {install_hint('bags')}") from None
     if not path.is_dir() and not path.is_file():  # a pipe has no end
         raise InputError(f"`{path}` is no regular file; give a bag of ROS")
+    if path.suffix == ".bag" and path.is_file():  # else all of it is read in the search of a line's end
+        with path.open("rb") as file:
+            if not file.read(len(_BEGINS)) == _BEGINS:
+                raise InputError(f"`{path}` is no bag of ROS: it does not begin with `{_BEGINS.decode()}`")
     place = path.parent if path.suffix in (".db3", ".mcap") else path
     try:
         with AnyReader([place], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

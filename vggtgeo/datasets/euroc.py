@@ -17,6 +17,7 @@ from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of, 
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.text_files import whole_text
 
 _MOST_DIGITS = 20
 """Of a time in nanoseconds, with room; Python refuses to read numbers of thousands."""
@@ -74,7 +75,7 @@ def _base(folder: Path) -> Path | None:
 
 def _images(file: Path) -> list[tuple[float, str]]:
     entries = []
-    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(whole_text(file).splitlines(), start=1):
         text = line.split("#", 1)[0].strip()
         if not text:
             continue
@@ -86,5 +87,5 @@ def _images(file: Path) -> list[tuple[float, str]]:
 
 
 def _numbers(file: Path) -> np.ndarray:
-    lines = [line for line in file.read_text(encoding="utf-8", errors="replace").splitlines() if line[:1].isdigit()]
+    lines = [line for line in whole_text(file).splitlines() if line[:1].isdigit()]
     return read_matrices(file, lines[0].count(",") + 1) if lines else np.zeros((0, 17))

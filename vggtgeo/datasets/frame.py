@@ -1,9 +1,10 @@
 """What every reader gives: frames one after another, the camera, and the truth where there is one."""
 
 import math
+import numbers
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,6 +12,7 @@ from jaxtyping import Float, UInt8
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +84,8 @@ class Sequence(Protocol):
 
 def check_selection(name: str, count: int, start: int, end: int | None, stride: int) -> None:
     """Raises InputError unless `start`, `end`, `stride` select at least one of `count` frames of sequence `name`."""
+    for argument, given in (("start", start), ("stride", stride), ("end", 0 if end is None else end)):
+        check_kind(argument, given, numbers.Integral, "a whole number")
     if stride < 1:
         raise InputError(f"`stride` is {stride}; it must be at least 1")
     if start < 0 or (end is not None and end <= start):
@@ -91,12 +95,36 @@ def check_selection(name: str, count: int, start: int, end: int | None, stride: 
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:
-    """Raises InputError for a frame whose size is not that of the camera's images, or whose time is none."""
-    if not math.isfinite(frame.timestamp):
-        raise InputError(f"`{frame.name}` has the time {frame.timestamp}; expected a number of seconds")
-    height, width = frame.image.shape[:2]
+    """Raises InputError for a frame whose image or depth is none, whose size is not that of the camera's images, or
+    whose time is none.
+    """
+    given: Any = frame  # of a caller: annotations promise what nobody has checked
+    image, depth, time = given.image, given.depth, given.timestamp
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise InputError(f"`{frame.name}` has an image {described(image)}; it must be uint8 [H, W, 3], RGB")
+    if not isinstance(time, numbers.Real) or not math.isfinite(time):
+        shown = time if isinstance(time, float) else f"{time!r:.60}"
+        raise InputError(f"`{frame.name}` has the time {shown}; expected a number of seconds")
+    if depth is not None:
+        check_depth(f"the depth of `{frame.name}`", depth, image)
+    height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise InputError(
             f"`{frame.name}` is {width} x {height} pixels; the camera's images are {camera.width} x {camera.height}: "
             "all frames of a run must have one size"
         )
+
+
+def check_depth(name: str, depth: Any, image: np.ndarray) -> None:
+    """Raises InputError for depth that is no array of metres of the size of its image."""
+    if isinstance(depth, np.ma.MaskedArray):
+        raise InputError(f"{name} is masked; give an array with NaN where there is none: `depth.filled(np.nan)`")
+    if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f":
+        raise InputError(f"{name} is {described(depth)}; it must be float, in metres (millimetres: divide by 1000.0)")
+    if depth.shape != image.shape[:2]:
+        raise InputError(f"{name} has the shape {depth.shape}, its image {image.shape[:2]}; make them equal")
+
+
+def described(given: Any) -> str:
+    """Type and shape of an array, the type of anything else."""
+    return f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else f"of the type `{type(given).__name__}`"

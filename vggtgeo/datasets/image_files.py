@@ -87,11 +87,18 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     return depth
 
 
+MOST_BYTES = 700_000_000
+"""Of an image's file: all that is decoded, a hundred million pixels, unpacked, of 16 bits in three channels."""
+
+
 def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
     """The file's bytes, and the image in them."""
     try:
         if path.exists() and not path.is_file():  # a list may name a pipe, which has no end
             raise InputError(f"`{path}` is no regular file")
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise InputError(f"`{path}` has {size} bytes, more than {MOST_BYTES}: not decoded")
         content = path.read_bytes()
     except (OSError, ValueError) as error:  # a name from a list may be none that a file system takes
         raise InputError(f"`{path}` cannot be read: {getattr(error, 'strerror', None) or error}") from None

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import itertools
+import sys
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.frame import Frame, check_depth, check_selection, described
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +26,7 @@ class FrameStream:
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
         """Every `stride`-th frame from `start` to before `end`."""
+        check_selection("frames", sys.maxsize, start, end, stride)
         return itertools.islice(self.source, start, end, stride)
 
 
@@ -40,26 +43,51 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: floa
         InputError: there is no frame, or one is nothing of these.
 
     """
+    if not isinstance(frames, Iterable):
+        raise InputError(f"`frames` is {described(frames)}; give a folder, a video file, or images one after another")
     counted = (_frame(item, index, rate) for index, item in enumerate(frames))
     first = next(counted, None)
     if first is None:
         raise InputError("`frames` is empty; give at least one frame")
     height, width = first.image.shape[:2]
-    source = itertools.chain([first], counted)
+    source = _of_one_kind(first, counted)
     return FrameStream(camera or Camera.guess(width, height), first.depth is not None, source)
+
+
+def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
+    """All frames, with indices that grow; depth that comes after a frame without is told, since it is not used."""
+    last, told = first, first.depth is not None
+    yield first
+    for frame in others:
+        if frame.index <= last.index:
+            raise InputError(
+                f"`{frame.name}` has the index {frame.index} after {last.index}; number the frames from 0 on, as "
+                "`enumerate` does"
+            )
+        if frame.depth is not None and not told:
+            warnings.warn(
+                f"`{frame.name}` has depth, and `{first.name}` had none: depth is used where the first frame has it, "
+                "all NaN if need be; reading the images only",
+                InputWarning,
+                stacklevel=2,
+            )
+            told = True
+        yield frame
+        last = frame
 
 
 def _frame(item: Any, index: int, rate: float) -> Frame:
     if isinstance(item, Frame):
+        given: Any = item.image
+        if not isinstance(given, np.ndarray) or given.ndim != 3:
+            raise InputError(f"`frames[{index}]` has an image {described(given)}; it must be uint8 [H, W, 3], RGB")
         return item
     image, depth = item if isinstance(item, tuple) and len(item) == 2 else (item, None)
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-        found = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-        raise InputError(f"`frames[{index}]` is {found}; it must be a `Frame`, uint8 [H, W, 3], or (image, depth)")
+        raise InputError(
+            f"`frames[{index}]` is {described(image)}; it must be a `Frame`, uint8 [H, W, 3], or (image, depth)"
+        )
     if depth is not None:
-        depth = np.asarray(depth, np.float32)
-        if depth.shape != image.shape[:2]:
-            raise InputError(
-                f"`frames[{index}]` has depth {depth.shape} for an image {image.shape[:2]}; make them equal"
-            )
+        check_depth(f"the depth of `frames[{index}]`", depth, image)
+        depth = depth.astype(np.float32)
     return Frame(index, index / rate, image, depth, f"frame {index}")

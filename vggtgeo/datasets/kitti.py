@@ -20,6 +20,7 @@ from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.text_files import whole_text
 
 RATE = 10.0
 _FOLDERS = ("image_2", "image_0", "image_02/data", "image_00/data")
@@ -87,7 +88,7 @@ def _times(folder: Path, place: Path, count: int) -> list[float]:
 
 def _moments(file: Path) -> list[float]:
     """Seconds since the first line's time."""
-    text = file.read_text(encoding="utf-8", errors="replace")
+    text = whole_text(file)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     try:
         moments = [datetime.fromisoformat(line[:26]) for line in lines]
@@ -117,7 +118,7 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
 
 def _calibration(file: Path) -> dict[str, str]:
     """Its lines `KEY: VALUES`."""
-    lines = file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
+    lines = whole_text(file).splitlines() if file.is_file() else []
     parts = [line.partition(":") for line in lines]
     return {key.strip(): rest for key, _, rest in parts}
 

@@ -31,6 +31,7 @@ from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.text_files import whole_text
 
 LARGEST = 960
 """Pixels of the longer side: the depth has 256, and 1920 pixels of image cost four times as much."""
@@ -163,7 +164,7 @@ def enlarged(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def _odometry(folder: Path) -> np.ndarray:
     """Rows: time, frame, x, y, z, qx, qy, qz, qw."""
     file = folder / "odometry.csv"
-    text = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    text = whole_text(file).splitlines()
     header = text[0].split(",") if text else []
     rows = read_matrices(file, len(header), skip="t") if header else np.zeros((0, 9))
     if rows.shape[1] < 9 or not len(rows):

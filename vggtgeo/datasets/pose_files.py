@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.text_files import whole_text
 
 _MOST_STRETCH = 0.1
 """Of the axes of a pose in a file: few digits, or a scale of a per cent, are mended."""
@@ -108,7 +109,7 @@ def read_text(file: Path) -> str:
     try:
         if file.exists() and not file.is_file():  # a pipe has no end
             raise InputError(f"`{file}` is no regular file")
-        return file.read_text(encoding="utf-8-sig", errors="replace")
+        return whole_text(file, "utf-8-sig")
     except OSError as error:
         raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None
 

@@ -24,6 +24,7 @@ from vggtgeo.datasets.registration import registered_depth
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.text_files import whole_text
 
 FRAMES_PER_SECOND = 30.0
 COLOUR_TRUTH = "groundtruth-colour.txt"
@@ -137,7 +138,9 @@ def _published_camera(folder: Path, width: int, height: int) -> Camera:
 
 def _read_pose(file: Path) -> np.ndarray | None:
     try:
-        pose = np.array(file.read_text(encoding="utf-8-sig").replace(",", " ").split(), np.float64).reshape(4, 4)
+        pose = np.array(whole_text(file, "utf-8-sig", errors="strict").replace(",", " ").split(), np.float64).reshape(
+            4, 4
+        )
     except ValueError:
         raise InputError(f"`{file}`: expected a 4 x 4 matrix of numbers, camera to world") from None
     if np.isfinite(pose).all() and not np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), atol=1e-3):

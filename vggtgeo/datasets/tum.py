@@ -21,6 +21,7 @@ from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.io.text_files import whole_text
 
 MAX_DEPTH_DELAY = 0.02
 """Seconds between an image and its depth."""
@@ -100,7 +101,7 @@ def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
     """
     expected = f"expected `{time} rgb/{time}.png {time} depth/{time}.png`"
     pairs = []
-    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(whole_text(file).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
         if not words:
             continue
@@ -120,7 +121,7 @@ def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
     if not file.is_file():
         raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
     entries = []
-    for number, line in enumerate(file.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(whole_text(file, "utf-8-sig").splitlines(), start=1):
         text = line.split("#", 1)[0].strip()
         if text:
             entries.append(_parse_entry(file, number, text))

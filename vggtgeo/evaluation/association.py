@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_real
 
 MAX_TIME_DIFFERENCE = 0.01
 """Seconds between two poses that may still be compared; evo's default."""
@@ -38,6 +39,7 @@ def associate(
     those of the shorter, so that they name the pairs. InputError where `max_dt` is negative or nothing
     matches.
     """
+    check_real("max_dt", max_dt)
     if not max_dt >= 0:
         raise InputError(f"`max_dt` is {max_dt}; it must be at least 0 seconds")
     if len(truth) < len(estimate):

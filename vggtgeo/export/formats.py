@@ -15,6 +15,7 @@ from vggtgeo.export.nerfstudio import write_nerfstudio
 from vggtgeo.export.paths import write_kitti, write_tum
 from vggtgeo.export.surfaces import write_glb, write_las, write_ply
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.summary_file import read_summary
 
 FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
@@ -99,7 +100,7 @@ def _claim(output: Path, names: list[str], ours: bool) -> None:
     """
     record = output / _RECORD
     try:
-        known = set(record.read_text(encoding="utf-8").splitlines())
+        known = set(whole_text(record, errors="strict").splitlines())
     except (OSError, UnicodeDecodeError):
         known = set()
     strange = [name for name in names if name not in known and os.path.lexists(output / name)]

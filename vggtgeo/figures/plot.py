@@ -16,6 +16,7 @@ from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.figures.plots import NotebookFigure, energy_figure, errors_figure, trajectory_figure
 from vggtgeo.figures.uncertainty import covariance_figure, observability_figure
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.given import check_kind
 
 
 @singledispatch
@@ -51,6 +52,7 @@ def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
 
 @plot.register(Trajectory)
 def _trajectory(value: Trajectory, truth: Trajectory | None = None, *, with_scale: bool = False) -> NotebookFigure:
+    check_kind("truth", truth, Trajectory | None, "a `vggtgeo.Trajectory`")
     return trajectory_figure(value, truth, with_scale=with_scale)
 
 

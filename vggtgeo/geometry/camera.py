@@ -12,8 +12,9 @@ with pixel (0, 0) at the centre of the top-left pixel. The geometry of the libra
 """
 
 import math
+import numbers
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -61,12 +62,12 @@ class Camera:
         fx, fy, cx, cy = check_intrinsics(self.intrinsics)
         object.__setattr__(self, "intrinsics", (fx, fy, cx, cy))
         object.__setattr__(self, "distortion", check_distortion(self.distortion))
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"image size is {self.width} x {self.height}; both must be at least 1 pixel")
+        check_sides(self.width, self.height)
 
     @classmethod
     def guess(cls, width: int, height: int) -> Self:
         """A starting guess for an unknown lens: 60 degrees across the longer side, centred, square pixels."""
+        check_sides(width, height)
         focal = 0.5 * max(width, height) / math.tan(0.5 * GUESSED_FIELD_OF_VIEW)
         centre = 0.5 * (width - 1), 0.5 * (height - 1)
         return cls((focal, focal, *centre), width, height, known=False)
@@ -170,6 +171,13 @@ class Undistorter:
                 f"`image` is {width} x {height} pixels; the camera's images are "
                 f"{self.camera.width} x {self.camera.height}: give images of the calibrated size"
             )
+
+
+def check_sides(width: Any, height: Any) -> None:
+    """InputError unless both are whole numbers of pixels."""
+    whole = isinstance(width, numbers.Integral) and isinstance(height, numbers.Integral)
+    if not whole or width < 1 or height < 1:
+        raise InputError(f"image size is {width} x {height}; both must be at least 1 pixel, whole numbers")
 
 
 def check_intrinsics(values: object) -> tuple[float, float, float, float]:

@@ -282,7 +282,7 @@ def _inverted_jvp(
     return x, _divided(along[1] - moved, jax.jacfwd(function, 1)(camera, x))
 
 
-def _divided(vector: Float[Array, "*d"], matrix: Float[Array, "*d *d"]) -> Float[Array, "*d"]:
+def _divided(vector: Float[Array, "*d"], matrix: Float[Array, "*dd"]) -> Float[Array, "*d"]:
     """`matrix^-1 vector`, written out: a factorisation for each of many thousand pixels takes many times as long."""
     if vector.ndim == 0:
         return vector / matrix

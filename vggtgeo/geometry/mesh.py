@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from vggtgeo.geometry.point_cloud import UNREADABLE
+from vggtgeo.geometry.point_cloud import UNREADABLE, check_head
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
-
-_LONGEST_HEAD = 65_536
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +67,7 @@ class Mesh:
 
 def _check_counts(path: str | os.PathLike[str]) -> None:
     """ValueError where the head declares more than a byte each could hold: space is taken before faces are read."""
-    with open(path, "rb") as handle:
-        head = handle.read(_LONGEST_HEAD).partition(b"end_header")[0]
+    head = check_head(path)
     declared = sum(int(count) for count in re.findall(rb"^element\s+\S+\s+(\d{1,18})\s*$", head, re.MULTILINE))
     size = os.path.getsize(path)
     if declared > size:

@@ -10,6 +10,7 @@ from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 
+LONGEST_HEAD = 65_536
 UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyHeaderParseError, PlyParseError)
 """What the parser raises for files that are none, or that declare more than they hold."""
 
@@ -58,6 +59,10 @@ class PointCloud:
         if self.normals is not None:
             fields += [(name, "<f4") for name in _NORMAL]
             columns += [*self.normals.T]
+        if np.abs(self.points).max(initial=0.0) > np.finfo(np.float32).max:
+            raise InputError(
+                f"`points` has coordinates that the float32 of `{path}` cannot hold; leave such points out"
+            )
         vertices = np.empty(len(self), dtype=fields)
         for (name, _), column in zip(fields, columns, strict=True):
             vertices[name] = column
@@ -70,6 +75,7 @@ class PointCloud:
         any file that holds no such points.
         """
         try:
+            check_head(path)
             vertices = PlyData.read(os.fspath(path))["vertex"].data
             names = vertices.dtype.names or ()
             points = np.column_stack([vertices[name] for name in "xyz"])
@@ -81,3 +87,12 @@ class PointCloud:
             return cls(points, colours, confidence, normals)
         except UNREADABLE as error:
             raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY point cloud: {error}") from None
+
+
+def check_head(path: str | os.PathLike[str]) -> bytes:
+    """The header of a PLY file; ValueError for a long file without one, which would be read to its end as one line."""
+    with open(path, "rb") as handle:
+        head, end, _ = handle.read(LONGEST_HEAD).partition(b"end_header")
+    if not end and os.path.getsize(path) > LONGEST_HEAD:
+        raise ValueError(f"its first {LONGEST_HEAD} bytes have no `end_header`")
+    return head

@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
+from vggtgeo.io.given import real_numbers
+from vggtgeo.io.text_files import whole_text
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
 _FARTHEST, _LATEST = 1e15, 1e20
@@ -45,8 +47,8 @@ class Trajectory:
     poses: Float[np.ndarray, "n 4 4"]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "timestamps", np.asarray(self.timestamps, np.float64))
-        object.__setattr__(self, "poses", np.asarray(self.poses, np.float64))
+        object.__setattr__(self, "timestamps", np.asarray(real_numbers("timestamps", self.timestamps), np.float64))
+        object.__setattr__(self, "poses", np.asarray(real_numbers("poses", self.poses), np.float64))
         _check(self.timestamps, self.poses)
 
     def __len__(self) -> int:
@@ -108,7 +110,7 @@ class Trajectory:
 
 
 def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
-    count = len(timestamps)
+    count = timestamps.size
     if timestamps.ndim != 1 or poses.shape != (count, 4, 4):
         raise InputError(
             f"`timestamps` has shape {timestamps.shape}, `poses` {poses.shape}; expected [n] and [n, 4, 4]"
@@ -135,7 +137,7 @@ def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:
     if not file.is_file():
         raise InputError(f"`{file}` is not there or is no file; give a trajectory in the TUM format")
     rows = []
-    for number, line in enumerate(file.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(whole_text(file, "utf-8-sig").splitlines(), start=1):
         text = line.split("#", 1)[0].replace(",", " ").strip()
         if text:
             rows.append(_parse_row(f"`{file}`, line {number}", text))

@@ -10,6 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+_MARK = "process "
+_LONGEST = 200
+"""Characters that are read of a lock: a stranger's file under its name may be of any size."""
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # a link would have what it leads to emptied
 _TAKEN = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 
@@ -23,26 +27,31 @@ def locked(path: Path) -> Iterator[None]:
 
     Raises:
         LockedError: another process holds it; the message is what that process left there.
-        OSError: the file cannot be made.
+        OSError: the file cannot be made, or is somebody's own: a link, or a file of another content.
 
     """
     while True:
-        handle = path.open("a+", encoding="utf-8")
+        handle = os.fdopen(
+            os.open(path, os.O_RDWR | os.O_CREAT | _NO_LINK, 0o666), "r+", encoding="utf-8", errors="replace"
+        )
         try:
             _lock(handle)
         except OSError as error:
             if error.errno not in _TAKEN:
                 break  # a file system without locks: better no lock than no run
-            handle.seek(0)
-            said = handle.read().strip()
+            said = _said(handle)
             handle.close()
             raise LockedError(said or "another process") from None
         if _is_at(handle, path):
             break
         handle.close()  # its last holder took the file away between opening and locking
+    if (said := _said(handle)) and not said.startswith(_MARK):
+        handle.close()
+        raise OSError(errno.EEXIST, f"`{path.name}` in it is a file of something else")
     try:
+        handle.seek(0)
         handle.truncate(0)
-        handle.write(f"process {os.getpid()}\n")
+        handle.write(f"{_MARK}{os.getpid()}\n")
         handle.flush()
         yield
     finally:
@@ -52,6 +61,12 @@ def locked(path: Path) -> Iterator[None]:
         else:
             path.unlink(missing_ok=True)
             handle.close()
+
+
+def _said(handle: IO[str]) -> str:
+    """What the holder of the lock left in it."""
+    handle.seek(0)
+    return handle.read(_LONGEST).strip()
 
 
 def _is_at(handle: IO[str], path: Path) -> bool:

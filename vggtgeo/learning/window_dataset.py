@@ -24,6 +24,7 @@ from vggtgeo.bundle.problem_file import load_problem, save_problem
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open, write_json
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 
@@ -148,7 +149,7 @@ class WindowDataset:
         """Reads the index that `WindowWriter` left; InputError where there is none, as a writer did not end."""
         place = Path(folder)
         try:
-            index = json.loads((place / _INDEX).read_text(encoding="utf-8"))
+            index = json.loads(whole_text(place / _INDEX, errors="strict"))
             return cls(place, int(index["windows"]), tuple(terms))
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             raise InputError(f"`{place}` is no complete folder of windows; write one first") from None

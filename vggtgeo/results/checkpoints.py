@@ -159,7 +159,10 @@ def resumed(asked: Checkpoints | None, wanted: Mapping[str, str]) -> RunSoFar | 
 
 def _facts(path: Path) -> dict[str, Any]:
     """What the header says of a run, before its data are read."""
-    found = CHECKPOINT.facts(path)
+    try:
+        found = CHECKPOINT.facts(path)
+    except InputError as error:
+        raise InputError(f"{error}; begin anew with `--no-resume`") from None
     if found.keys() != {"identity", "frames", "last", "digest"} or not isinstance(found["identity"], dict):
         raise InputError(f"`{path}` holds no run; begin anew with `--no-resume`")
     return found

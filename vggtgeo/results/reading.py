@@ -11,6 +11,7 @@ from vggtgeo.datasets.trajectory_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind
 from vggtgeo.results.result import Result
 
 
@@ -64,6 +65,7 @@ def _estimate(given: Any, truth: Trajectory) -> Trajectory:
         return given
     if isinstance(given, Result):
         return given.trajectory
+    check_kind("estimate", given, str | os.PathLike, "a trajectory, a result, or where one of them lies")
     place = Path(given)
     return load_trajectory(place / "trajectory.txt" if place.is_dir() else place, truth)
 
@@ -75,6 +77,7 @@ def _truth(given: Any) -> Trajectory:
         if Path(given).is_file():
             return load_trajectory(given)
         given = open_sequence(given)
+    check_kind("truth", given, Sequence, "a trajectory, a sequence with truth, or where one of them lies")
     found: Trajectory | None = given.ground_truth()
     if found is None:
         raise InputError(f"`truth` is `{given.name}`, which has no truth; give a trajectory in the TUM format")

@@ -16,6 +16,7 @@ from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.given import check_kind, check_plain, check_whole
 from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.warned import collected_warnings
 from vggtgeo.mapping.dense import check_dense, dense_map
@@ -42,7 +43,7 @@ from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.presets import Perception
-from vggtgeo.slam.run import default_roles, finish, run_frames
+from vggtgeo.slam.run import check_run_arguments, default_roles, finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import changed
 from vggtgeo.slam.state import Slam
@@ -115,6 +116,7 @@ def reconstruct(
 
     """
     clock, began = Clock(), time.perf_counter()
+    _check_arguments(roles, settings, camera, known_map, callbacks, facts, checkpoints, title, seed)
     settings = settings or SlamSettings()
     with interruption() as stop, collected_warnings() as collected:
         source = opened(frames, camera, settings)
@@ -161,6 +163,26 @@ def reconstruct(
             slam, source.truth, report, notices, perception.refusals, title or source.name, known, clock, began, dense
         )
         return _concluded(ending, settings, hooks, windows.records, evidence)
+
+
+def _check_arguments(
+    roles: Any,
+    settings: Any,
+    camera: Any,
+    known_map: Any,
+    callbacks: Any,
+    facts: Any,
+    checkpoints: Any,
+    title: Any,
+    seed: Any,
+) -> None:
+    """What is no argument of `reconstruct` is refused before the first frame, not where it is used: at the end, say."""
+    check_run_arguments(roles.roles if isinstance(roles, Perception) else roles, settings, camera, known_map)
+    check_kind("callbacks", callbacks, Iterable, "a list of `vggtgeo.Callback`")
+    check_kind("checkpoints", checkpoints, Checkpoints | None, "`vggtgeo.Checkpoints`, or None")
+    check_kind("title", title, str | None, "a text")
+    check_plain("facts", {} if facts is None else facts)
+    check_whole("seed", seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,6 +313,10 @@ class _Callbacks:
     members: tuple[Callback, ...]
     clock: Clock
 
+    def __post_init__(self) -> None:
+        for member in self.members:
+            check_kind("callbacks", member, Callback, "objects of `vggtgeo.Callback` in it")
+
     def warm_up(self, settings: SlamSettings, roles: Roles) -> None:
         """Compile what every window needs, and what the callbacks make of windows."""
         self.each("on_stage", "compiling")
@@ -366,6 +392,8 @@ class _Loop:
             roles, clock = self.perception.roles, self.hooks.clock
             for slam in run_frames(frames, self.source.camera, roles, self.settings, clock, known):
                 frame = given.pop(slam.frames[-1].frame)
+                for skipped in [index for index in given if index < frame.index]:
+                    del given[skipped]
                 self.hooks.each("on_frame", slam, frame)
                 if keeper is not None:
                     keeper.on_frame(slam, frame)

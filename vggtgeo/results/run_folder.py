@@ -28,6 +28,7 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import LockedError, locked
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.checkpoints import frames_kept
 
 UNFINISHED = "unfinished"
@@ -153,6 +154,7 @@ def taken(
     """
     place = Path(folder)
     _refuse_input(place, source)
+    _refuse_strange(RunFolder(place).stage)
     made = _missing(place)
     try:
         with ExitStack() as holding:
@@ -269,6 +271,24 @@ def _refuse_input(place: Path, source: Path | None) -> None:
                 )
 
 
+def _refuse_strange(stage: Path) -> None:
+    """InputError for an `unfinished` that no run left there: a run takes away what it finds in its place. The root of
+    the file system is nobody's folder for results.
+    """
+    if stage.parent.resolve() == Path(stage.resolve().anchor):
+        raise InputError(f"`{stage.parent}` is the root of the file system; give a folder for the results with `-o`")
+    if stage.is_symlink() or not stage.exists():
+        return
+    if not stage.is_dir():
+        raise InputError(f"`{stage}` is a file, and a run makes a folder of this name; give another folder with `-o`")
+    for path in sorted(stage.iterdir()):
+        if not (_is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, _NOTE)):
+            raise InputError(
+                f"`{stage}` holds `{path.name}`, which no run left there, and a run would take it away; give another "
+                "folder with `-o`"
+            )
+
+
 def _inside(place: Path, source: Path) -> str | None:
     """The first part of the way from `place` to `source`; None where it does not lie in it."""
     try:
@@ -295,7 +315,7 @@ def _not_written(place: Path, error: OSError, reserve: int = 0) -> InputError:
 def _old_recording(folder: Path) -> list[str]:
     """The recording that an earlier run into `folder` made there, by its settings."""
     try:
-        target = tomllib.loads((folder / "settings.toml").read_text(encoding="utf-8")).get("rerun")
+        target = tomllib.loads(whole_text(folder / "settings.toml", errors="strict")).get("rerun")
     except (OSError, ValueError, RecursionError):
         return []
     path = Path(str(target))

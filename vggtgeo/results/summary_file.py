@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.trust.finding import Verdict
 
 
 def read_summary(folder: Path) -> tuple[dict[str, Any], Verdict]:
     """The summary of the run in `folder`, and its verdict; InputError where the file is missing or no summary."""
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = json.loads(whole_text(folder / "summary.json", errors="strict"))
         return summary, Verdict.from_dict(summary["verdict"], summary["scale"] == "metric")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise unusable(folder, error) from None

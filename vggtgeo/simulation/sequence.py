@@ -12,6 +12,7 @@ from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind, check_real, check_whole
 from vggtgeo.simulation.render import Picture, render
 from vggtgeo.simulation.scene import Scene
 from vggtgeo.simulation.sensor import Sensor
@@ -133,6 +134,8 @@ def simulate(
 
     """
     check_walk(scene, frames, size, rate, speed)
+    check_kind("sensor", sensor, Sensor | None, "a `vggtgeo.simulation.Sensor`")
+    check_whole("seed", seed)
     build, walk = WORLDS[scene]
     motion = HandheldMotion.along(walk, seed)
     if speed is not None:
@@ -142,17 +145,17 @@ def simulate(
 
 def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, speed: float | None) -> None:
     """InputError for what `simulate` cannot take."""
-    if scene not in WORLDS:
+    if scene not in tuple(WORLDS):
         raise InputError(f"`scene` is {scene!r}; it must be one of {', '.join(WORLDS)}")
-    for name, value in (
-        ("frames", frames),
-        ("size", min(size)),
-        ("rate", rate),
-        ("speed", 1.0 if speed is None else speed),
-    ):
+    check_kind("size", size, tuple | list | np.ndarray, "(width, height), in pixels")
+    if len(size) != 2:
+        raise InputError(f"`size` has {len(size)} numbers; expected (width, height), in pixels")
+    for name, count in (("frames", frames), ("size", min(size)), ("size", max(size))):
+        check_whole(name, count, 1)
+    for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
+        check_real(name, value)
         if not 0 < value < math.inf:
             raise InputError(f"`{name}` is {value}; it must be positive")
-    for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
         if not _LEAST <= value <= _MOST:  # times or places that are the same, or none
             raise InputError(f"`{name}` is {value}; it must be from {_LEAST:g} to {_MOST:g}")
 

@@ -5,6 +5,7 @@ For examples, notebooks and tests: it is made in milliseconds, and every number 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
@@ -18,6 +19,7 @@ from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_real, check_whole
 
 SIZE = (320, 240)
 """Width and height of the images that are not there, pixels."""
@@ -125,8 +127,16 @@ def simulate_window(
 
     """
     for name, value, least in (("keyframes", keyframes, 2), ("points", points, 0), ("lines", lines, 0)):
-        if value < least:
-            raise InputError(f"`{name}` is {value}; it must be at least {least}")
+        check_whole(name, value, least)
+    check_whole("seed", seed)
+    errors = {"noise": noise, "outliers": outliers, "depth_error": depth_error, "start_error": start_error}
+    for name, share in errors.items():
+        most = 1.0 if name == "outliers" else math.inf
+        check_real(name, share)
+        if not (0 <= share <= most and math.isfinite(share)):
+            raise InputError(
+                f"`{name}` is {share}; it must be at least 0, and {'at most 1' if most == 1 else 'finite'}"
+            )
     rng = np.random.default_rng(seed)
     poses = _arc(keyframes)
     host = np.repeat(np.arange(keyframes), points)

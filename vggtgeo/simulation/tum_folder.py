@@ -29,20 +29,25 @@ def write_tum_folder(sequence: SyntheticSequence, folder: str | os.PathLike[str]
     check_new(target)
     for part in ("rgb", "depth"):
         (target / part).mkdir(parents=True, exist_ok=True)
-    names = []
-    for frame in sequence.frames():
-        name = f"{frame.timestamp:.6f}.png"
-        _write(target / "rgb" / name, np.ascontiguousarray(frame.image[..., ::-1]))
-        if frame.depth is not None:
-            _write(target / "depth" / name, _depth_code(frame.depth))
-        names.append((frame.timestamp, name))
-        yield frame
+    # First what the codes of depth and the times are read by: without it a walk that was killed is a folder of images
+    # and depth of another unit.
     fx, fy, cx, cy = sequence.camera.intrinsics
     write_text(target / "calibration.txt", f"{fx:.9g} {fy:.9g} {cx:.9g} {cy:.9g}\n")
     sequence.ground_truth().save_tum(target / "groundtruth.txt")
+    times = [sequence.timestamp(index) for index in range(len(sequence))]
     for part in ("rgb", "depth") if sequence.has_depth else ("rgb",):
-        lines = "".join(f"{time:.6f} {part}/{name}\n" for time, name in names)
+        lines = "".join(f"{time:.6f} {part}/{_name(time)}\n" for time in times)
         write_text(target / f"{part}.txt", f"# {sequence.name} (simulated)\n# timestamp filename\n{lines}")
+    for frame in sequence.frames():
+        name = _name(frame.timestamp)
+        _write(target / "rgb" / name, np.ascontiguousarray(frame.image[..., ::-1]))
+        if frame.depth is not None:
+            _write(target / "depth" / name, _depth_code(frame.depth))
+        yield frame
+
+
+def _name(time: float) -> str:
+    return f"{time:.6f}.png"
 
 
 def check_new(folder: Path) -> None:

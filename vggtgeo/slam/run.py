@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,6 +18,8 @@ from vggtgeo.datasets.reduced import reduced
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import LeftOutWarning
+from vggtgeo.io.given import check_kind
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
@@ -73,6 +77,7 @@ def run(
         Slam(1 frame, 1 keyframe, tracking)
 
     """
+    check_run_arguments(roles, settings, camera, known_map)
     source: Sequence | FrameStream = frames if isinstance(frames, Sequence) else frame_stream(frames, camera)
     roles = roles or default_roles(source.has_depth)
     settings, clock = settings or SlamSettings(), clock or Clock()
@@ -80,6 +85,16 @@ def run(
     selected = source.frames(start, end, stride)
     known = None if known_map is None else entered(known_map, source.camera)
     yield from run_frames(selected, source.camera, roles, settings, clock, known)
+
+
+def check_run_arguments(roles: Any, settings: Any, camera: Any, known_map: Any) -> None:
+    """Raises InputError for one that is something else, a table in the place of settings, say."""
+    check_kind("roles", roles, Roles | None, "`vggtgeo.Roles`, or None for the classical ones")
+    check_kind("settings", settings, SlamSettings | None, "`vggtgeo.SlamSettings`, or None")
+    check_kind(
+        "camera", camera, Camera | None, "a `vggtgeo.Camera`, as `vggtgeo.Camera((fx, fy, cx, cy), width, height)`"
+    )
+    check_kind("known_map", known_map, Slam | None, "what `vggtgeo.load_map` gives")
 
 
 def default_roles(has_depth: bool) -> Roles:
@@ -101,7 +116,8 @@ def run_frames(
     seen_by = slam.lens or camera
     if roles.still_parts is not None:
         roles = replace(roles, still_parts=roles.still_parts.undistorted(seen_by))
-    for frame, description in _described(frames, seen_by, roles, clock):
+    last = slam.frames[-1].timestamp if slam.frames else -math.inf
+    for frame, description in _described(frames, seen_by, roles, clock, last):
         slam = step(slam, frame, description, roles, settings, clock)
         yield slam
 
@@ -124,6 +140,7 @@ def finish(
         Slam(1 frame, 1 keyframe, tracking)
 
     """
+    check_kind("slam", slam, Slam, "the state that `vggtgeo.run` yields")
     slam, roles, settings = settled(slam), roles or default_roles(slam.metric), settings or SlamSettings()
     fixed = settings.keyframes.localise_only or not settings.refinement.global_adjustment
     if fixed or len(slam.keyframes) < 3:
@@ -160,11 +177,28 @@ def keyframe_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
     return Trajectory(np.array([keyframe.timestamp for keyframe in own]), poses)
 
 
+def in_order(frames: Iterable[Frame], camera: Camera, last: float = -math.inf) -> Iterator[Frame]:
+    """The frames that are frames of this camera, and later than those before: a pose is found again by its time."""
+    for frame in frames:
+        check_frame(frame, camera)
+        if frame.timestamp <= last:
+            warnings.warn(
+                LeftOutWarning(
+                    f"`{frame.name}` has the time {frame.timestamp:.6f} s, which is not after {last:.6f} s of the "
+                    "frame before; the frame is skipped"
+                ),
+                stacklevel=2,
+            )
+            continue
+        last = frame.timestamp
+        yield frame
+
+
 def _described(
-    frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock
+    frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock, last: float
 ) -> Iterator[tuple[Frame, Description]]:
     """Undistorted frames, prepared in a thread of their own while earlier ones are tracked; where every frame needs its
-    key points, with them.
+    key points, with them. last: time of the frame before the first.
     """
     undistorter, intrinsics = camera.undistorter(), np.array(camera.intrinsics, np.float64)
 
@@ -174,7 +208,6 @@ def _described(
             return features if roles.still_parts is None else roles.still_parts.without_points(features)
 
     def prepare(frame: Frame) -> tuple[Frame, Description]:
-        check_frame(frame, camera)
         image = undistorter.image(frame.image)
         depth = None if frame.depth is None else undistorter.depth(frame.depth)
         if depth is not None and roles.still_parts is not None:
@@ -193,7 +226,7 @@ def _described(
             frame = next(source, None)
         return None if frame is None else prepare(frame)
 
-    source = iter(frames)
+    source = in_order(frames, camera, last)
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames") as pool:
         queue: deque[Future[tuple[Frame, Description] | None]] = deque(
             pool.submit(read_and_prepare) for _ in range(AHEAD)

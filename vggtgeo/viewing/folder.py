@@ -13,6 +13,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import STAND_IN, flush
@@ -34,7 +35,7 @@ def recording_of(folder: Path) -> Path | None:
     that was killed left no settings: then any recording that is there, the newest of several.
     """
     try:
-        target = tomllib.loads((folder / "settings.toml").read_text(encoding="utf-8")).get("rerun")
+        target = tomllib.loads(whole_text(folder / "settings.toml", errors="strict")).get("rerun")
     except (OSError, ValueError, RecursionError):
         return max(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, default=None)
     if target is None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -20,10 +21,13 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.bundle.analysis.redundancy import changing
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared, prepared_energy
+from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import Pinhole
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import real_numbers
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import covariance
@@ -125,6 +129,7 @@ def covariances(
             of the whole.
 
     Raises:
+        InputError: `state` is of another size or precision, or not finite (where it has values to look at).
         ValueError: too many keyframes for a dense matrix, or for conjugate gradients.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
@@ -133,10 +138,24 @@ def covariances(
         True
 
     """
+    check_pair(problem, state)
+    check_finite(state)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
-    asked = jnp.arange(problem.num_keyframes) if keyframes is None else jnp.asarray(keyframes)
+    asked = jnp.arange(problem.num_keyframes) if keyframes is None else _numbers_of(keyframes, problem.num_keyframes)
     _check_size(solver, problem.num_keyframes, len(asked))
     return _covariances_jit(problem, state, solver, asked)
+
+
+def _numbers_of(keyframes: Any, count: int) -> Int[Array, " h"]:
+    """Indices of keyframes that are there: of others JAX would give the last one."""
+    if isinstance(keyframes, jax.core.Tracer):
+        return keyframes
+    found = real_numbers("keyframes", keyframes)
+    if found.ndim != 1 or found.dtype.kind not in "iu" or not ((found >= 0) & (found < count)).all():
+        raise InputError(
+            f"`keyframes` is {found.tolist()!r:.60}; expected a list of whole numbers from 0 to {count - 1}"
+        )
+    return jnp.asarray(found)
 
 
 @eqx.filter_jit  # one operation after the other, as outside `jit`, would be compiled one by one: for most of a minute

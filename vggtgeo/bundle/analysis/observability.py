@@ -36,6 +36,7 @@ from vggtgeo.bundle.analysis.observability_report import Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
+from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.geometry import lie
@@ -62,6 +63,7 @@ def observability(problem: Problem, state: State) -> Observability:
         state: where to linearise, best a solution.
 
     Raises:
+        InputError: `state` is of another size or precision, or not finite (where it has values to look at).
         ValueError: more than 300 keyframes, and inside `jit` or `vmap`, in single precision, with NaN, or with a term
             that couples all keyframes, as a marginalisation prior does.
 
@@ -71,6 +73,8 @@ def observability(problem: Problem, state: State) -> Observability:
         True
 
     """
+    check_pair(problem, state)
+    check_finite(state)
     if problem.num_keyframes <= DENSE_KEYFRAMES:
         return _observability_jit(problem, state)
     _check_large(problem, state)

@@ -1,0 +1,206 @@
+"""Rows of the table of bad inputs: what a script may give to the functions of the library, wrongly.
+
+The tests check all annotations while they run, so that these calls would not get far there: called as a program, this
+file makes them as a script does, and prints how each of them ended.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import bad_files as bad
+import jax
+import numpy as np
+from bad_row import Row, nothing
+from test_problem_file import SCENE
+
+import vggtgeo as vg
+from vggtgeo.datasets.in_memory import frame_stream
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.slam.run import in_order
+
+WIDTH, HEIGHT = 160, 120
+IMAGES = [bad.picture(row, WIDTH, HEIGHT) for row in range(3)]
+DEPTH = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+EYE = np.eye(4)
+
+
+def pack(seen: dict[str, Any] | None = None, **changes: Any) -> Callable[[Path], Any]:
+    """`vg.pack` of a good problem with some arguments, or observations, of another kind."""
+
+    def call(_: Path) -> Any:
+        given = {"poses": SCENE.start_poses, "intrinsics": SCENE.start_intrinsics, "inverse_depth": SCENE.inverse_depth}
+        observations = replace(SCENE.observations, **(seen or {}))
+        return vg.pack(**{"observations": observations, **given, **changes})
+
+    return call
+
+
+def with_pair(call: Callable[[Any, Any], Any]) -> Callable[[Path], Any]:
+    """A call with a good problem and its state."""
+    return lambda _: call(*SCENE.pack()[:2])
+
+
+def state_of(dtype: type) -> Callable[[Any], Any]:
+    """The state with all its numbers in another precision."""
+    return lambda state: jax.tree.map(lambda leaf: np.asarray(leaf, dtype), state)
+
+
+def not_finite(state: Any) -> Any:
+    """What a solve leaves that failed."""
+    return jax.tree.map(lambda leaf: leaf * np.nan, state)
+
+
+def reconstruct(frames: Any = None, **options: Any) -> Callable[[Path], Any]:
+    """`vg.reconstruct` of three images, or of something else."""
+    return lambda _: vg.reconstruct(IMAGES if frames is None else frames(), **options)
+
+
+def frame(number: int, **changes: Any) -> vg.Frame:
+    """A good frame with other fields."""
+    fields = {"timestamp": number / 30, "image": IMAGES[number], "depth": None, "name": f"frame {number}"}
+    return vg.Frame(**{"index": number, **fields, **changes})
+
+
+def stream(items: Callable[[], Sequence[Any]]) -> Callable[[Path], Any]:
+    """The frames of a stream, one after the other, as a run reads them, without tracking them."""
+
+    def call(_: Path) -> None:
+        found = frame_stream(items())
+        for _ in in_order(found.frames(), found.camera):
+            pass
+
+    return call
+
+
+def trajectory(times: Any, poses: Any) -> Callable[[Path], Any]:
+    """A trajectory of these."""
+    return lambda _: vg.Trajectory(times, poses)
+
+
+def simulated(*given: Any, **options: Any) -> Callable[[Path], Any]:
+    """`vg.simulate`."""
+    return lambda _: vg.simulate(*given, **options)
+
+
+def save_cloud(folder: Path, size: float) -> None:
+    """A cloud of one point, written."""
+    PointCloud(np.full((1, 3), size), np.zeros((1, 3), np.uint8)).save_ply(folder / "cloud.ply")
+
+
+CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
+    ("`pack`: poses of complex numbers", pack(poses=SCENE.start_poses.astype(complex))),
+    ("`pack`: poses with a mask", pack(poses=np.ma.masked_less(SCENE.start_poses, 0.5))),
+    ("`pack`: poses that are dates", pack(poses=np.zeros((3, 7), "M8[s]"))),
+    ("`pack`: observations in a dictionary", pack(observations={"edges": [[0, 1]]})),
+    ("`pack`: `alpha` that is an array", pack(seen={"alpha": np.ones(3)})),
+    ("`pack`: `alpha` that is a text", pack(seen={"alpha": "1"})),
+    ("`pack`: a deviation that is a text", pack(intrinsics_sigma="5")),
+    ("`pack`: a term that is in no list", pack(terms=vg.no_prior(3))),
+    ("`pack`: a size that is a tuple", pack(size=(3, 4))),
+    ("`pack`: complex numbers as `dtype`", pack(dtype=complex)),
+    ("`pack`: half precision as `dtype`", pack(dtype="float16")),
+    ("`pack`: a `dtype` that is none", pack(dtype="float65")),
+    ("`solve`: problem and state swapped", with_pair(lambda p, s: vg.solve(s, p))),
+    ("`solve`: all that `pack` gives", lambda _: vg.solve(SCENE.pack(), None)),
+    (
+        "`solve`: a state of another precision",
+        with_pair(lambda p, s: vg.solve(p, state_of(np.float32)(s))),
+    ),
+    (
+        "`solve`: a state of another problem",
+        with_pair(lambda p, s: vg.solve(p, jax.tree.map(lambda leaf: leaf[:1], s))),
+    ),
+    ("`solve`: a solver's name", with_pair(lambda p, s: vg.solve(p, s, solver="lm"))),
+    ("`energy` of nothing", with_pair(lambda p, s: vg.energy(p, None))),
+    (
+        "`covariances` where a solve failed",
+        with_pair(lambda p, s: vg.covariances(p, not_finite(s))),
+    ),
+    (
+        "`observability` where a solve failed",
+        with_pair(lambda p, s: vg.observability(p, not_finite(s))),
+    ),
+    (
+        "`covariances` of a keyframe that is not there",
+        with_pair(lambda p, s: vg.covariances(p, s, keyframes=[0, 3])),
+    ),
+    (
+        "`marginalise`: a keyframe that is not there",
+        with_pair(lambda p, s: vg.marginalise(p, s, 3)),
+    ),
+    ("`reorder`: a keyframe twice", lambda _: vg.reorder(vg.no_prior(3), [0, 0, 1])),
+    ("`pack_batch` of no windows", lambda _: vg.pack_batch([None])),
+    ("`solve_batch` of one window", with_pair(vg.solve_batch)),
+    ("frames that are a number", reconstruct(lambda: 5)),
+    ("frames that are names of files", reconstruct(lambda: ["0.png", "1.png"])),
+    ("images of numbers from 0 to 1", reconstruct(lambda: [IMAGES[0] / 255.0])),
+    ("frames whose image is none", stream(lambda: [frame(0, image=None)])),
+    ("frames whose image has numbers from 0 to 1", stream(lambda: [frame(0, image=IMAGES[0] / 255)])),
+    ("depth in whole millimetres", stream(lambda: [(IMAGES[0], (DEPTH * 1000).astype(np.uint16))])),
+    ("depth of complex numbers", stream(lambda: [(IMAGES[0], DEPTH.astype(complex))])),
+    ("depth with a mask", stream(lambda: [(IMAGES[0], np.ma.masked_less(DEPTH, 3))])),
+    ("depth of another size than its image", stream(lambda: [(IMAGES[0], DEPTH[:60])])),
+    ("a frame whose depth is whole numbers", stream(lambda: [frame(0, depth=DEPTH.astype(int))])),
+    ("depth that only later frames have", stream(lambda: [IMAGES[0], (IMAGES[1], DEPTH)])),
+    ("two frames of one time", stream(lambda: [frame(0), frame(1, timestamp=0.0), frame(2)])),
+    ("a time that is a text", stream(lambda: [frame(0, timestamp="0.0")])),
+    ("two frames of one index", stream(lambda: [frame(0), frame(1, index=0)])),
+    ("settings in a dictionary", reconstruct(settings={"window": 3})),
+    ("a preset's name as roles", reconstruct(roles="classical")),
+    ("intrinsics as the camera", reconstruct(camera=(100, 100, 80, 60))),
+    ("a folder as checkpoints", reconstruct(checkpoints="out")),
+    ("a function as a callback", reconstruct(callbacks=[print])),
+    ("facts that JSON does not have", reconstruct(facts={"when": object()})),
+    ("a seed that is none", reconstruct(seed=None)),
+    ("a stride of one and a half", reconstruct(stride=1.5)),
+    ("`run`: a stride of 0", lambda _: next(vg.run(IMAGES, stride=0))),
+    ("`finish` of nothing", lambda _: vg.finish(None)),
+    ("a trajectory whose times are dates", trajectory(np.array(["2024"], "M8[ns]"), [EYE])),
+    ("a trajectory of complex numbers", trajectory([0], [EYE * (1 + 1j)])),
+    ("a trajectory of nothing", trajectory(None, None)),
+    ("`evaluate` of two arrays of poses", lambda _: vg.evaluate(EYE[None], EYE[None])),
+    ("a camera of half a pixel", lambda _: vg.Camera((50, 50, 32, 24), 64.5, 48)),
+    ("a cloud that float32 cannot hold", lambda folder: save_cloud(folder, 1e300)),
+    ("`simulate`: frames that are a text", simulated("room", "3")),
+    ("`simulate`: half a frame", simulated("room", 2.5)),
+    ("`simulate`: a seed that is none", simulated("room", 3, None)),
+    ("`simulate`: a size that is a text", simulated("room", 3, size="640x480")),
+    ("`simulate`: a size of half pixels", simulated("room", 3, size=(160.5, 120))),
+    ("`simulate`: a sensor's name", simulated("room", 3, sensor="kinect")),
+    ("`simulate_window`: noise that is NaN", lambda _: vg.simulate_window(noise=np.nan)),
+    ("`simulate_window`: more outliers than matches", lambda _: vg.simulate_window(outliers=2)),
+)
+
+PYTHON = [Row("Calls from Python", given, nothing, call=call, slack=3.0) for given, call in CALLS]
+
+
+def main() -> None:
+    """How each row ends, what is said, and seconds of the processor, as JSON."""
+    jax.config.update("jax_enable_x64", True)
+    told = {}
+    for row in PYTHON:
+        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            began, end, said = time.process_time(), "used", []
+            try:
+                row.call(Path(folder))
+            except InputError as error:
+                end, said = "error", [str(error)]
+            seconds = time.process_time() - began
+            said += [str(entry.message) for entry in caught if issubclass(entry.category, InputWarning)]
+        told[row.given] = (end, said, seconds)
+    sys.stdout.write(json.dumps(told))
+
+
+if __name__ == "__main__":
+    main()

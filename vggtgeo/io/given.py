@@ -1,0 +1,67 @@
+"""What a caller gave, where its kind alone says that it cannot be used: refused in a sentence that names it."""
+
+from __future__ import annotations
+
+import json
+import numbers
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vggtgeo.io.errors import InputError
+
+
+def check_kind(name: str, given: Any, kind: Any, expected: str) -> None:
+    """InputError unless `given` is of this type, or one of these; `expected` says what is, and how to come by one."""
+    if not isinstance(given, kind):
+        raise InputError(f"`{name}` is of the type `{type(given).__name__}`; expected {expected}")
+
+
+def check_whole(name: str, given: Any, least: int = 0, most: int | None = None) -> None:
+    """A whole number, of Python or of numpy; no truth value, which counts as one where it is asked as a number."""
+    whole = isinstance(given, numbers.Integral) and not isinstance(given, bool | np.bool_)
+    if not whole or given < least or (most is not None and given > most):
+        until = "" if most is None else f", at most {most}"
+        raise InputError(f"`{name}` is {given!r:.60}; it must be a whole number, at least {least}{until}")
+
+
+def check_real(name: str, given: Any, must: str = "a number") -> None:
+    """One real number, infinity among them: what Python says of comparing a text or a list is nothing for a user."""
+    found = np.asarray(given)
+    if found.ndim or found.dtype.kind not in "iuf" or np.isnan(found):
+        what = str(given) if found.dtype.kind == "f" and not found.ndim else f"{given!r:.60}"
+        raise InputError(f"`{name}` is {what}; it must be {must}")
+
+
+def real_numbers(name: str, given: Any) -> np.ndarray:
+    """An array of real numbers or truth values from whatever was given.
+
+    Raises:
+        InputError: text, objects, dates, ragged lists; complex numbers, of which NumPy would take the real part; or
+            masked entries, whose mask NumPy would forget.
+
+    """
+    try:
+        found = np.asarray(given)
+    except ValueError as error:
+        raise InputError(f"`{name}` cannot be read as an array: {error}") from error
+    if found.dtype.kind not in "biuf":
+        what = {"c": "complex numbers", "M": "dates", "m": "spans of time"}.get(found.dtype.kind, f"{given!r:.60}")
+        raise InputError(f"`{name}` is {what}; expected real numbers")
+    if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
+        raise InputError(
+            f"`{name}` has masked entries, which have no value; leave them out, or fill them (`.filled(...)`)"
+        )
+    return found
+
+
+def check_plain(name: str, given: Mapping[str, Any]) -> None:
+    """Values that JSON has: what is to be written at the end of hours must be known to be writable before."""
+    check_kind(name, given, Mapping, "a dictionary of plain values")
+    try:
+        json.JSONEncoder(allow_nan=False).encode(given)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"`{name}` cannot be written as JSON: {error}; give plain numbers, texts, lists and dictionaries"
+        ) from None

@@ -1,0 +1,28 @@
+"""Texts of files from anywhere: lists, poses, tables, summaries."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vggtgeo.io.errors import InputError
+
+MOST_BYTES = 64 * 2**20
+"""Of a text: 600,000 poses, five hours of frames. As words and numbers it takes ten times as much memory; what is
+larger is something else, a sparse file of any size, say."""
+
+
+def whole_text(file: Path, encoding: str = "utf-8", errors: str = "replace") -> str:
+    """The text of a file of at most `MOST_BYTES` bytes.
+
+    Raises:
+        InputError: the file has more, or may not be read.
+        OSError: it cannot be read for another reason.
+
+    """
+    size = file.stat().st_size
+    if size > MOST_BYTES:
+        raise InputError(f"`{file}` has {size} bytes; expected a text of at most {MOST_BYTES}")
+    try:
+        return file.read_text(encoding=encoding, errors=errors)
+    except PermissionError as error:
+        raise InputError(f"`{file}` cannot be read: {error.strerror}; allow it, or take the file away") from None
