@@ -260,6 +260,21 @@ def test_rgb_recovers_the_shape(room) -> None:
         assert np.array_equal(poses[keyframe.frame], keyframe.pose)  # the second one began the map with the first
 
 
+@pytest.mark.long
+def test_rgb_starts_behind_a_poor_first_view(room) -> None:
+    """A video without depth whose first frames show a wall, dark frames among them, begins a map where there is
+    something to see; oracle: the renderer's poses, up to scale. The frames before have no pose.
+    """
+    frames, camera, truth = room
+    wall = np.random.default_rng(0).integers(100, 104, (SIZE[1], SIZE[0], 3)).astype(np.uint8)
+    colour = [replace(frame, depth=None) for frame in frames]
+    colour[:4] = [replace(frame, image=wall) for frame in colour[:4]]
+    slam = _run(colour, camera, replace(ROLES, depth=NoDepth()))
+    error = evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse
+    assert [record.tracked for record in slam.frames] == [False] * 4 + [True] * (len(frames) - 4)
+    assert error < 0.03, f"ATE after Sim(3) {error:.4f} m"
+
+
 @dataclass(frozen=True)
 class _Dense:
     """A matcher whose targets are no key points, as MASt3R's are."""

@@ -9,7 +9,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
-from vggtgeo.models.roles import Features, GeometryResult, PoseQuery
+from vggtgeo.models.roles import Features, GeometryResult, PointMatches, PoseQuery, StartGuess
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -19,6 +19,10 @@ from vggtgeo.slam.window import adjust, enter, scale_anchor
 NOMINAL_DEPTH = 2.5
 """Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
 MOST_WAITING = 90
+LEAST_SHARED = 100
+"""Matches that a waiting frame shares with the present one, if it is to begin the map in place of the first keyframe:
+`TwoViewStart` needs 60 of them to agree. The initialiser of ORB-SLAM (Mur-Artal, Montiel, Tardos, 2015) takes another
+reference below as many."""
 
 
 def without_depth(roles: Roles) -> Roles:
@@ -59,10 +63,17 @@ def begin_again_with_depth(
 
 
 def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
-    """Try to start a map of free scale from the first keyframe and this frame; until that works, the frame waits."""
-    first = slam.keyframes[slam.window[-1]]
-    matches = roles.points.match(first.features, features)
-    guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics, (first.image, frame.image))
+    """Try to start a map of free scale from the first keyframe and this frame; until that works, the frame waits.
+
+    A first keyframe that shows nothing of this frame any more gives its place to a frame that does: a video may begin
+    at a wall, or turn away before it has moved.
+    """
+    first, matches, guess = _two_views(slam, frame, features, roles)
+    if guess.result not in (GeometryResult.SUCCESS, GeometryResult.LOW_PARALLAX):
+        later = _later_first(slam, features, roles, settings)
+        if later is not None:
+            slam = later
+            first, matches, guess = _two_views(slam, frame, features, roles)
     if guess.result is not GeometryResult.SUCCESS:
         return _wait(slam, frame, features)
     if slam.metric:
@@ -92,6 +103,45 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
     arrival = (first.number, second.pose @ rigid.invert(first.pose))
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, inliers, arrival=arrival)
     return replace(slam, frames=(*slam.frames, record), waiting=())
+
+
+def _two_views(slam: Slam, frame: Frame, features: Features, roles: Roles) -> tuple[Keyframe, PointMatches, StartGuess]:
+    """The first keyframe, its matches with the frame, and what both say of motion and structure."""
+    first = slam.keyframes[slam.window[-1]]
+    matches = roles.points.match(first.features, features)
+    guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics, (first.image, frame.image))
+    return first, matches, guess
+
+
+def _later_first(slam: Slam, features: Features, roles: Roles, settings: SlamSettings) -> Slam | None:
+    """The state whose map will begin at the oldest waiting frame that shares enough with the present one, as all behind
+    it do; None where the last one does not: the present one may be blurred or dark.
+    """
+    chosen, old = None, slam.keyframes[slam.window[-1]]
+    for waiting in reversed(slam.waiting):
+        if waiting.frame < old.frame or len(roles.points.match(waiting.features, features)) < LEAST_SHARED:
+            break
+        chosen = waiting
+    if chosen is None:
+        return None
+    frame = Frame(chosen.frame, chosen.timestamp, chosen.image, chosen.depth, "")
+    first = make_keyframe(
+        old.number, frame, old.pose, Description.of(chosen.features), roles, settings, slam.intrinsics
+    )
+    began = FramePose(chosen.frame, chosen.timestamp, old.number, np.eye(4), True, len(chosen.features))
+    records = (
+        began
+        if record.frame == chosen.frame
+        else replace(record, tracked=False, inliers=0)
+        if record.frame == old.frame
+        else record
+        for record in slam.frames
+    )
+    others = tuple(waiting for waiting in slam.waiting if waiting.frame != chosen.frame)
+    back = Waiting(old.frame, old.timestamp, old.image, old.features)
+    return replace(
+        slam, keyframes=(*slam.keyframes[:-1], first), frames=tuple(records), waiting=(back, *others)[-MOST_WAITING:]
+    )
 
 
 def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
