@@ -398,6 +398,19 @@ def test_a_wrong_transforms_file_is_told(tmp_path: Path, change: dict[str, objec
         open_sequence(folder)
 
 
+def test_images_that_were_listed_elsewhere_are_found_by_their_names(tmp_path: Path) -> None:
+    # Proves that a list made on another computer, outside its folder, reads the images that lie here. Oracle: the same
+    # recording as it was listed.
+    folder = tiny.nerfstudio(tmp_path / "scene")
+    plain = list(_open(folder).frames())
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["file_path"] = "..\\slides\\" + Path(frame["file_path"]).name
+    (folder / "transforms.json").write_text(json.dumps(content))
+    for one, other in zip(_open(folder).frames(), plain, strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+
+
 def test_transforms_with_a_field_of_view_or_without_a_camera(tmp_path: Path) -> None:
     # Proves focal length by the field of view, and a guess that is told where the file has neither. Oracle: tangent.
     folder = tiny.nerfstudio(tmp_path / "scene")

@@ -85,6 +85,20 @@ def test_depth_of_few_corners_explains_nothing() -> None:
     assert followed_enlargement(pixels, 1.5 * pixels, nearer) == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(("wall", "told"), [(60, False), (250, True)])
+def test_a_step_round_an_object_is_no_lens(wall: int, told: bool) -> None:
+    """Sixty corners of a wall are 1.35 times as large; the rest have moved as points at all depths do when a camera steps
+    round them. Oracle: which corners the similarity explains, beside those that the motion does.
+    """
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-1, -1, 1.0), (1, 1, 4.0), (250, 3))
+    points[:wall, 2] = 2.0
+    step = np.array([0.5, 0.0, 2.0 - 2.0 / 1.35])
+    project = lambda xyz: (150.0 * xyz[:, :2] / xyz[:, 2:] + 160.0).astype(np.float32)
+    found = followed_enlargement(project(points), project(points - step))
+    assert (found == pytest.approx(np.log(1.35), abs=0.02)) if told else found is None
+
+
 def test_what_has_nothing_in_common_says_nothing() -> None:
     """Corners that move at random, pictures of noise, and few corners have no factor."""
     rng = np.random.default_rng(0)

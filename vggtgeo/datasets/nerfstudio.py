@@ -99,7 +99,7 @@ def _listed(value: object, what: str) -> list[Any]:
 
 def _image(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path:
     """The image of a frame; some writers leave its ending out."""
-    path = _inside(folder, file, "file_path", frame.get("file_path"))
+    path = _below(folder, file, "file_path", frame.get("file_path"))
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         endings = (path.with_name(path.name + suffix) for suffix in sorted(IMAGE_SUFFIXES))
         path = next((one for one in endings if one.is_file()), path)
@@ -109,18 +109,23 @@ def _image(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path:
 def _depth(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path | None:
     for key in ("depth_file_path", "depth_path"):
         if frame.get(key) is not None:
-            return _inside(folder, file, key, frame[key])
+            return _below(folder, file, key, frame[key])
     return None
 
 
-def _inside(folder: Path, file: Path, key: str, name: object) -> Path:
-    """A file below the folder: a list from a stranger opens nothing else."""
+def _below(folder: Path, file: Path, key: str, name: object) -> Path:
+    """A file below the folder: a list from a stranger opens nothing else. One that was listed elsewhere, before
+    somebody copied the folder, is searched by its name, here and in `images`.
+    """
     if not isinstance(name, str) or not name or "\0" in name:
         raise InputError(f"`{file}`: `{key}` of a frame is {name!r}; expected the name of a file in the folder")
-    path = Path(name)
-    if path.is_absolute() or ".." in path.parts:
+    path = Path(name.replace("\\", "/"))
+    listed = [] if path.is_absolute() or ".." in path.parts else [path]
+    places = [folder / place for place in (*listed, Path("images") / path.name, Path(path.name))]
+    found = next((place for place in places if place.is_file()), None)
+    if found is None and not listed:
         raise InputError(f"`{file}`: `{key}` is {name!r}; expected a file below the folder of `{FILE}`")
-    return folder / path
+    return found or places[0]
 
 
 def _pose(file: Path, frame: Mapping[str, Any]) -> np.ndarray:
