@@ -87,8 +87,8 @@ def test_depth_of_few_corners_explains_nothing() -> None:
 
 @pytest.mark.parametrize(("wall", "told"), [(60, False), (250, True)])
 def test_a_step_round_an_object_is_no_lens(wall: int, told: bool) -> None:
-    """Sixty corners of a wall are 1.35 times as large; the rest have moved as points at all depths do when a camera steps
-    round them. Oracle: which corners the similarity explains, beside those that the motion does.
+    """Sixty corners of a wall are 1.35 times as large; the rest have moved as points at all depths do when a camera
+    steps round them. Oracle: which corners the similarity explains, beside those that the motion does.
     """
     rng = np.random.default_rng(0)
     points = rng.uniform((-1, -1, 1.0), (1, 1, 4.0), (250, 3))
