@@ -101,7 +101,7 @@ def test_a_fingerprint_changes_with_what_a_result_depends_on(tmp_path: Path) -> 
         (("frames = 4", "frame = 4"), "`simulate` has the key `frame`; it may have scene, frames, size, rate, speed"),
         (("frames = 4", 'frames = "four"'), "`simulate`: `frames` is 'four'; it must be a whole number"),
         (("frames = 4", "size = [320]"), r"`size` is \[320\]; it must be a width and a height"),
-        (("frames = 4", "size = [0, 240]"), "`size` is 0; it must be positive"),
+        (("frames = 4", "size = [0, 240]"), "`size` is 0; it must be a whole number, at least 1"),
         (('{ scene = "room", frames = 4 }', '"room"'), "`simulate` is 'room'; it must be a table"),
         (('name = "hall"', 'name = "hall"\nstart = -1'), "`start` is -1"),
         (('name = "hall"', 'name = "hall"\nstart = 3\nend = 3'), "`end` is 3; it must be above `start`, 3"),

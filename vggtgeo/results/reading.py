@@ -56,6 +56,8 @@ def evaluate(
         30 poses: ATE 0.000 m after SE(3), 0.000 m after Sim(3) (scale 1.0000); RPE over 1 pose: 0.000 m, 0.000 deg
 
     """
+    known = Trajectory | Result | str | os.PathLike
+    check_kind("estimate", estimate, known, "a trajectory, a result, or where one of them lies")
     true = _truth(truth)
     return evaluate_trajectory(_estimate(estimate, true), true, **options)
 
@@ -65,7 +67,6 @@ def _estimate(given: Any, truth: Trajectory) -> Trajectory:
         return given
     if isinstance(given, Result):
         return given.trajectory
-    check_kind("estimate", given, str | os.PathLike, "a trajectory, a result, or where one of them lies")
     place = Path(given)
     return load_trajectory(place / "trajectory.txt" if place.is_dir() else place, truth)
 
