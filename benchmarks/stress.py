@@ -28,7 +28,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +123,7 @@ def _run(case: Case, options: argparse.Namespace) -> Outcome:
     work = options.out / f"{case.source}.{case.name}"
     shutil.rmtree(work, ignore_errors=True)
     folder, truth = case.make(work)
-    began = time.perf_counter()
+    began, said = time.perf_counter(), ""
     try:
         ended = subprocess.run(
             [options.program, "run", str(folder), "-o", str(work / "run"), "--quiet"],
@@ -133,10 +133,13 @@ def _run(case: Case, options: argparse.Namespace) -> Outcome:
             check=False,
         )
         code: int | None = ended.returncode
-        (work / "log.txt").write_text(ended.stdout + ended.stderr)
+        said = ended.stdout + ended.stderr
+        (work / "log.txt").write_text(said)
     except subprocess.TimeoutExpired:
         code = None
     outcome = _measured(case, folder, truth, work / "run", code, time.perf_counter() - began)
+    if outcome.code not in (0, 3) and said.strip():  # an error, or a crash: its last words are all that is left of it
+        outcome = replace(outcome, reasons=(said.strip().splitlines()[-1],))
     kept.write_text(json.dumps(asdict(outcome)))
     if not options.keep:
         shutil.rmtree(work)
