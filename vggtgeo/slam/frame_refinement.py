@@ -87,11 +87,12 @@ def refine_frames(slam: Slam, frames: Iterable[Frame], camera: Camera, roles: Ro
 def _carried(slam: Slam) -> Slam:
     """The same poses, each said by its keyframe alone: nothing is left to be shared out between keyframes."""
     poses = frame_poses(slam)[1]
+    relative = lambda record, pose: rigid.orthonormal(pose @ rigid.invert(slam.keyframes[record.reference].pose))
     frames = (
-        replace(record, relative=rigid.orthonormal(pose @ rigid.invert(slam.keyframes[record.reference].pose)))
+        replace(record, relative=relative(record, pose), arrival=None)
         for record, pose in zip(slam.frames, poses, strict=True)
     )
-    return replace(slam, frames=tuple(replace(record, arrival=None) for record in frames))
+    return replace(slam, frames=tuple(frames))
 
 
 def _rows(slam: Slam) -> dict[int, int]:
