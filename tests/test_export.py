@@ -20,6 +20,7 @@ from vggtgeo.models.roles import LineMatches, PointMatches
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
+from vggtgeo.datasets import open_sequence
 from vggtgeo.export import FORMATS, export
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
@@ -117,6 +118,10 @@ def test_nerfstudio_s_poses_and_depth_are_those_of_the_run(folder: Path, tmp_pat
     # the run's own pose and depth give. Oracle: the run's folder.
     counts = export(folder, "nerfstudio", tmp_path)
     written, scene = json.loads((tmp_path / "transforms.json").read_text()), Scene.load(folder)
+    read = open_sequence(tmp_path)  # the reader takes back what was written
+    assert (type(read).__name__, len(read), read.has_depth) == ("Nerfstudio", len(scene.frames), True)
+    np.testing.assert_allclose(read.camera.intrinsics, scene.intrinsics, atol=1e-9)
+    np.testing.assert_allclose(read.ground_truth().poses, np.linalg.inv(scene.poses), atol=1e-6)
     assert counts["depth_images"] == len(scene.frames) == len(written["frames"])
     row, column = 120, 200
     for view, frame in enumerate(written["frames"]):
