@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.export.contents import cloud_of
 from vggtgeo.export.pictures import copy_pictures
 from vggtgeo.geometry import rigid
@@ -22,8 +23,6 @@ from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.scene import Scene
 
 MILLI = 1000.0
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenCV's camera axes to OpenGL's."""
 
 
 def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
@@ -32,7 +31,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     A mask is white where the picture has a depth that other views confirm.
     """
     scene, cloud = Scene.load(source), cloud_of(source)
-    poses = rigid.invert(scene.poses) @ FLIP
+    poses = rigid.invert(scene.poses) @ FROM_OPENGL
     copy_pictures(scene, source, target)
     frames, deep = [], 0
     for view in range(len(scene.frames)):
