@@ -6,6 +6,7 @@ keeps the dtype of the first argument. Tangents are left tangents, translation f
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -78,6 +79,9 @@ def log(pose: jaxlie.SE3) -> Float[Array, "*n 6"]:
     return jnp.concatenate([v, w], -1)
 
 
+_log_jit = jax.jit(log)
+
+
 def boxminus(pose: jaxlie.SE3, base: jaxlie.SE3) -> Float[Array, "*n 6"]:
     """`log(T T_base^-1)`: the left tangent that moves `base` to `pose`."""
     return log(cast(pose @ base.inverse(), pose.wxyz_xyz.dtype))
@@ -86,7 +90,7 @@ def boxminus(pose: jaxlie.SE3, base: jaxlie.SE3) -> Float[Array, "*n 6"]:
 def steps(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """The tangents that move poses [n, 4, 4] to others, float64 [n, 6]: `boxminus` of NumPy's matrices."""
     motions = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(second @ rigid.invert(first))))
-    return np.asarray(log(motions), np.float64)
+    return np.asarray(_log_jit(motions), np.float64)
 
 
 def adjoint(pose: jaxlie.SE3) -> Float[Array, "*n 6 6"]:

@@ -31,6 +31,7 @@ from vggtgeo.results.checkpoints import (
     identity,
     resumed,
 )
+from vggtgeo.results.frames_in_hand import FramesInHand
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.source import Source, as_read, opened
 from vggtgeo.results.summary import compare, summarise
@@ -384,16 +385,13 @@ class _Loop:
         """Ctrl-C ends it after a whole frame, an input error of the sequence without a result."""
         known = self.first if self.before is None else self.before.slam
         slam, frame, interrupted = known, None, False
-        given: dict[int, Frame] = {}
         self.hooks.each("on_begin", self.source.name, self.source.count(*self.selection))
         began = time.perf_counter()
         try:
-            frames = _remembered(self._frames(keeper), given)
+            frames = FramesInHand(self._frames(keeper))
             roles, clock = self.perception.roles, self.hooks.clock
             for slam in run_frames(frames, self.source.camera, roles, self.settings, clock, known):
-                frame = given.pop(slam.frames[-1].frame)
-                for skipped in [index for index in given if index < frame.index]:
-                    del given[skipped]
+                frame = frames.take(slam.frames[-1])
                 self.hooks.each("on_frame", slam, frame)
                 if keeper is not None:
                     keeper.on_frame(slam, frame)
@@ -482,10 +480,3 @@ def _frames_placed(
         why = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
         hooks.each("on_message", f"{why}: frames between keyframes stay as they were tracked")
         return slam
-
-
-def _remembered(frames: Iterable[Frame], given: dict[int, Frame]) -> Iterator[Frame]:
-    """The same frames, each kept in `given` by its index until somebody takes it."""
-    for frame in frames:
-        given[frame.index] = frame
-        yield frame

@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
@@ -13,7 +14,12 @@ from vggtgeo.bundle.residuals import residuals_at
 CHANCE = 1e-3
 """Of taking a camera that is no better."""
 LEAST_HOSTS = 3
-_residuals_jit = eqx.filter_jit(residuals_at)
+
+
+@eqx.filter_jit
+def _energies_jit(problem: Problem, state: State) -> Float[Array, "e p"]:
+    residual = residuals_at(problem, state)["points"]
+    return problem.points.kernel.rho(problem.points.weight * jnp.sum(residual**2, -1)) / 2
 
 
 def gain(
@@ -44,6 +50,4 @@ def gain(
 
 def match_energies(problem: Problem, state: State) -> np.ndarray:
     """Robust energy of each match of key points, float64 [e, p]."""
-    residual = _residuals_jit(problem, state)["points"]
-    weight = problem.points.weight
-    return np.asarray(problem.points.kernel.rho(weight * jnp.sum(residual**2, -1)) / 2, np.float64)
+    return np.asarray(_energies_jit(problem, state), np.float64)
