@@ -35,7 +35,7 @@ def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr("vggtgeo.results.reconstruction.run_frames", interrupted)
+    monkeypatch.setattr("vggtgeo.results.tracking_loop.run_frames", interrupted)
     (tmp_path / "trajectory.txt").write_text("of an earlier run")
     (tmp_path / "summary.json").write_text("{}")
     result = CliRunner().invoke(make_app(), ["demo", "--scene", "room", "--frames", "3", "-o", str(tmp_path), "--json"])

@@ -1,6 +1,7 @@
 """Tiny recordings in the layouts of the benchmarks, as they are downloaded; see `tiny_sequences` for their contents."""
 
 import json
+import warnings
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,6 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from tiny_sequences import HEIGHT, INTRINSICS, WIDTH, depth_codes, image, pose, tum_line, write_image
+
+from vggtgeo import datasets
+from vggtgeo.io.errors import InputWarning
 
 COUNT = 3
 POSES = tuple(pose(number) for number in range(COUNT))
@@ -336,3 +340,10 @@ def matroska(path: Path, milliseconds: tuple[int, ...]) -> Path:
     segment += element("1F43B675", number("E7", 0) + blocks)
     path.write_bytes(element("1A45DFA3", head) + element("18538067", segment))
     return path
+
+
+def quietly_opened(path: Path, kind: str | None = None) -> datasets.Sequence:
+    """The recording, without what its reader warns of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        return datasets.open_sequence(path, kind)

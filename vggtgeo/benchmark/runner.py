@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
-from vggtgeo.io.locks import LockedError, locked
+from vggtgeo.io.locks import locked_folder
 
 OUTPUTS = ("report.html", "tables.md", "runs.csv", "runs.parquet")
 """What a suite leaves in its folder; the last where PyArrow is there."""
@@ -148,7 +148,7 @@ def bench(
     jobs = jobs_of(chosen, data_folders(data))
     base = Path(suite).parent if not isinstance(suite, Suite) else Path()
     tell_missing(chosen, jobs, base)
-    with _held(folder):
+    with locked_folder(folder, _LOCK, "batch"):  # two would take each other's runs away
         store = Store(folder, chosen.name, source_digest())
         limits = Limits(60 * chosen.timeout_minutes, chosen.memory_gb)
         rows = all_rows(jobs, store, limits, workers, retry, progress, cluster)
@@ -156,24 +156,6 @@ def bench(
         report = BenchReport(chosen, tuple(rows), folder)
         report.write(folder)
     return report
-
-
-@contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """`folder`, made where it is not there, for one batch at a time: two would take each other's runs away."""
-    with ExitStack() as holding:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            holding.enter_context(locked(folder / _LOCK))
-        except LockedError as error:
-            raise InputError(
-                f"`{folder}` is in use by another batch ({error}); give another folder with `-o`"
-            ) from None
-        except OSError as error:
-            raise InputError(
-                f"`{folder}` cannot be written: {error.strerror or error}; give another with `-o`"
-            ) from None
-        yield
 
 
 def all_rows(

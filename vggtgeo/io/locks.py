@@ -6,9 +6,11 @@ import errno
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO
+
+from vggtgeo.io.errors import InputError
 
 _MARK = "process "
 _LONGEST = 200
@@ -61,6 +63,33 @@ def locked(path: Path) -> Iterator[None]:
         else:
             path.unlink(missing_ok=True)
             handle.close()
+
+
+@contextmanager
+def locked_folder(folder: Path, name: str, user: str) -> Iterator[None]:
+    """Holds `folder`, made where it is not there, by the lock `name` in it. user: what holds it, "run" say.
+
+    Raises:
+        InputError: another holds it, or it cannot be written.
+
+    """
+    with ExitStack() as holding:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            holding.enter_context(locked(folder / name))
+        except LockedError as error:
+            raise InputError(
+                f"`{folder}` is in use by another {user} ({error}); give another folder with `-o`"
+            ) from None
+        except OSError as error:
+            raise not_written(folder, error) from None
+        yield
+
+
+def not_written(folder: Path, error: OSError, reserve: int = 0) -> InputError:
+    """The error of a folder that cannot be written. reserve: bytes that a run needs there."""
+    room = f"; a run needs {reserve // 2**20} MB" if reserve else ""
+    return InputError(f"`{folder}` cannot be written: {error.strerror or error}{room}: give another folder with `-o`")
 
 
 def _said(handle: IO[str]) -> str:

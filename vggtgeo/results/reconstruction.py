@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from vggtgeo.datasets import Frame, Sequence
+from vggtgeo.datasets import Sequence
 from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -23,28 +22,24 @@ from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.checkpoints import (
     Checkpoints,
-    Keeper,
-    Notice,
-    RunSoFar,
-    check_same_frame,
     digest_of_map,
     identity,
     resumed,
 )
-from vggtgeo.results.frames_in_hand import FramesInHand
 from vggtgeo.results.result import Result, RunRecord
+from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source, as_read, opened
 from vggtgeo.results.summary import compare, summarise
+from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
 from vggtgeo.slam.first_pass import begin_with_found_camera
 from vggtgeo.slam.frame_refinement import can_refine, refine_frames
 from vggtgeo.slam.known_map import entered
-from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.presets import Perception
-from vggtgeo.slam.run import check_run_arguments, default_roles, finish, run_frames
+from vggtgeo.slam.run import check_run_arguments, default_roles, finish
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import changed
 from vggtgeo.slam.state import Slam
@@ -53,7 +48,6 @@ from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.input import check_input, check_refusals
 from vggtgeo.slam.trust.judge import judge
-from vggtgeo.slam.window import warm_up
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
@@ -137,13 +131,13 @@ def reconstruct(
         # The verdict takes the lens of a known map out of these corners, as it does with one that this run finds.
         seen_by = source.camera if first is None or first.lens is None else source.camera.pinhole
         windows, evidence = WindowRecorder(), EvidenceRecorder(seen_by)
-        hooks = _Callbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
+        hooks = RunCallbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles)
         perception = _without_still_parts(perception, source, selection, settings, hooks, evidence, stop)
         if first is None and before is None:
             first = _first_pass(source, selection, perception, settings, hooks, stop)
-        loop = _Loop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
+        loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
         with loop.keeping(checkpoints, wanted) as keeper:
             tracked = loop.track(keeper)
             slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
@@ -203,7 +197,11 @@ class _Ending:
 
 
 def _concluded(
-    run: _Ending, settings: SlamSettings, hooks: _Callbacks, windows: Iterable[WindowRecord], evidence: EvidenceRecorder
+    run: _Ending,
+    settings: SlamSettings,
+    hooks: RunCallbacks,
+    windows: Iterable[WindowRecord],
+    evidence: EvidenceRecorder,
 ) -> Result:
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
@@ -251,7 +249,7 @@ def _first_pass(
     selection: tuple[int, int | None, int],
     perception: Perception,
     settings: SlamSettings,
-    hooks: _Callbacks,
+    hooks: RunCallbacks,
     stop: Interruption,
 ) -> Slam | None:
     """The state before the first frame, where nobody gave the camera and a first pass over the frames finds it. What it
@@ -279,7 +277,7 @@ def _without_still_parts(
     source: Source,
     selection: tuple[int, int | None, int],
     settings: SlamSettings,
-    hooks: _Callbacks,
+    hooks: RunCallbacks,
     evidence: EvidenceRecorder,
     stop: Interruption,
 ) -> Perception:
@@ -307,143 +305,8 @@ def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) ->
     return replace(found, roles=found.roles.seeded(seed)) if seed else found
 
 
-@dataclass(frozen=True, eq=False)
-class _Callbacks:
-    """All callbacks of a run, their time measured apart from that of the run."""
-
-    members: tuple[Callback, ...]
-    clock: Clock
-
-    def __post_init__(self) -> None:
-        for member in self.members:
-            check_kind("callbacks", member, Callback, "objects of `vggtgeo.Callback` in it")
-
-    def warm_up(self, settings: SlamSettings, roles: Roles) -> None:
-        """Compile what every window needs, and what the callbacks make of windows."""
-        self.each("on_stage", "compiling")
-        compiled = warm_up(settings, roles.metric)
-        for member in self.members:
-            member.on_warm_up(*compiled)
-
-    def so_far(self) -> dict[str, Any]:
-        """What those that have something to keep give, by the names of their classes."""
-        found = {type(member).__name__: member.so_far() for member in self.members}
-        return {name: value for name, value in found.items() if value is not None}
-
-    def resume(self, before: RunSoFar) -> None:
-        """Each goes on from what it gave."""
-        for member in self.members:
-            member.on_resume(before.callbacks.get(type(member).__name__), before.slam)
-
-    def each(self, hook: str, *arguments: Any) -> None:
-        """Call one hook of every member."""
-        with self.clock.measure("record and draw"):
-            for member in self.members:
-                getattr(member, hook)(*arguments)
-
-
-@dataclass(frozen=True, eq=False)
-class _Tracked:
-    """The state after the last frame that was tracked."""
-
-    slam: Slam
-    interrupted: bool
-    frames_per_second: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Loop:
-    """The loop over frames. collected: warnings so far. began: of the run, s. before: the run that this one goes on.
-    first: the state before the first frame, where there is a map.
-    """
-
-    source: Source
-    selection: tuple[int, int | None, int]
-    perception: Perception
-    settings: SlamSettings
-    hooks: _Callbacks
-    stop: Interruption
-    collected: list[Warning | str]
-    began: float
-    before: RunSoFar | None
-    first: Slam | None
-
-    @contextmanager
-    def keeping(self, asked: Checkpoints | None, wanted: Mapping[str, str]) -> Iterator[Keeper | None]:
-        """What keeps the state, where it is asked for and could be gone on with; its last file is whole at the end."""
-        if asked is None or self.source.count(*self.selection) is None:
-            yield None
-            return
-        first = time.perf_counter()
-        keeper = Keeper(asked, wanted, lambda slam: self._so_far(slam, first), self._tell)
-        try:
-            yield keeper
-        finally:
-            keeper.close()
-
-    def track(self, keeper: Keeper | None) -> _Tracked:
-        """Ctrl-C ends it after a whole frame, an input error of the sequence without a result."""
-        known = self.first if self.before is None else self.before.slam
-        slam, frame, interrupted = known, None, False
-        self.hooks.each("on_begin", self.source.name, self.source.count(*self.selection))
-        began = time.perf_counter()
-        try:
-            frames = FramesInHand(self._frames(keeper))
-            roles, clock = self.perception.roles, self.hooks.clock
-            for slam in run_frames(frames, self.source.camera, roles, self.settings, clock, known):
-                frame = frames.take(slam.frames[-1])
-                self.hooks.each("on_frame", slam, frame)
-                if keeper is not None:
-                    keeper.on_frame(slam, frame)
-                if self.stop.asked:
-                    break
-        except KeyboardInterrupt:
-            interrupted = True
-        interrupted = interrupted or self.stop.asked
-        if slam is None or not slam.frames:
-            if interrupted:
-                raise KeyboardInterrupt
-            raise InputError(f"`{self.source.name}` gave no frame that could be used; nothing was written")
-        if interrupted:
-            self._tell("interrupted: keeping what there is")
-        elif keeper is not None:
-            keeper.on_end(slam, frame)
-        slam = settled(slam)
-        earlier = 0.0 if self.before is None else self.before.tracking
-        return _Tracked(slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began))
-
-    def _frames(self, keeper: Keeper | None) -> Iterator[Frame]:
-        """The frames of the selection, or what is left of it after the last that was tracked, which is looked at."""
-        start, end, stride = self.selection
-        if self.before is None or keeper is None:
-            return iter(self.source.frames.frames(start, end, stride))
-        frames = iter(self.source.frames.frames(self.before.slam.frames[-1].frame, end, stride))
-        check_same_frame(keeper.asked, next(frames, None))
-        self.before.restore_refusals(self.perception.refusals)
-        for stage, seconds in self.before.seconds.items():
-            self.hooks.clock.seconds[stage] += seconds
-        self.hooks.resume(self.before)
-        return frames
-
-    def _so_far(self, slam: Slam, first: float) -> RunSoFar:
-        now, before = time.perf_counter(), self.before
-        said = self.collected if before is None else before.unsaid(self.collected)
-        return RunSoFar(
-            slam,
-            self.hooks.so_far(),
-            tuple(map(Notice.of, said)),
-            {role: astuple(counts) for role, counts in self.perception.refusals.items()},
-            dict(self.hooks.clock.seconds),
-            now - first + (0.0 if before is None else before.tracking),
-            now - self.began + (0.0 if before is None else before.whole),
-        )
-
-    def _tell(self, text: str) -> None:
-        self.hooks.each("on_message", text)
-
-
 def _adjust(
-    tracked: _Tracked, roles: Roles, settings: SlamSettings, hooks: _Callbacks, stop: Interruption
+    tracked: Tracked, roles: Roles, settings: SlamSettings, hooks: RunCallbacks, stop: Interruption
 ) -> tuple[Slam, bool]:
     """The state after the last adjustment, and whether Ctrl-C ended the run; after Ctrl-C there is none."""
     hooks.each("on_adjust", tracked.slam)
@@ -464,7 +327,7 @@ def _frames_placed(
     selection: tuple[int, int | None, int],
     roles: Roles,
     settings: SlamSettings,
-    hooks: _Callbacks,
+    hooks: RunCallbacks,
     stop: Interruption,
 ) -> Slam:
     """The state with its frames placed against the finished map, where they can be read once more."""

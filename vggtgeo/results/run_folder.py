@@ -18,7 +18,7 @@ import shutil
 import tomllib
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -27,7 +27,7 @@ from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
-from vggtgeo.io.locks import LockedError, locked
+from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.checkpoints import frames_kept
 
@@ -157,16 +157,7 @@ def taken(
     _refuse_strange(RunFolder(place).stage)
     made = _missing(place)
     try:
-        with ExitStack() as holding:
-            try:
-                place.mkdir(parents=True, exist_ok=True)
-                holding.enter_context(locked(place / _LOCK))
-            except LockedError as error:
-                raise InputError(
-                    f"`{place}` is in use by another run ({error}); give another folder with `-o`"
-                ) from None
-            except OSError as error:
-                raise _not_written(place, error) from None
+        with locked_folder(place, _LOCK, "run"):
             try:
                 if resume is None:
                     _refuse_unfinished(RunFolder(place))
@@ -210,7 +201,7 @@ def _begun(run: RunFolder, reserve: int, resume: bool) -> RunFolder:
                 _allocate(file.fileno(), reserve)
     except OSError as error:
         _end(run.stage)
-        raise _not_written(run.folder, error, reserve) from None
+        raise not_written(run.folder, error, reserve) from None
     return run
 
 
@@ -305,11 +296,6 @@ def is_result(folder: Path, file: Path) -> bool:
 
 def _is_known(name: str) -> bool:
     return name.endswith(".rrd") or any(fnmatchcase(name, pattern) for pattern in NAMES)
-
-
-def _not_written(place: Path, error: OSError, reserve: int = 0) -> InputError:
-    room = f"; a run needs {reserve // 2**20} MB" if reserve else ""
-    return InputError(f"`{place}` cannot be written: {error.strerror or error}{room}: give another folder with `-o`")
 
 
 def _old_recording(folder: Path) -> list[str]:

@@ -1,0 +1,48 @@
+"""What is called while a run goes on: its own witnesses, and what the caller gave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from vggtgeo.io.given import check_kind
+from vggtgeo.results.checkpoints import RunSoFar
+from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.window import warm_up
+
+
+@dataclass(frozen=True, eq=False)
+class RunCallbacks:
+    """All callbacks of a run, their time measured apart from that of the run."""
+
+    members: tuple[Callback, ...]
+    clock: Clock
+
+    def __post_init__(self) -> None:
+        for member in self.members:
+            check_kind("callbacks", member, Callback, "objects of `vggtgeo.Callback` in it")
+
+    def warm_up(self, settings: SlamSettings, roles: Roles) -> None:
+        """Compile what every window needs, and what the callbacks make of windows."""
+        self.each("on_stage", "compiling")
+        compiled = warm_up(settings, roles.metric)
+        for member in self.members:
+            member.on_warm_up(*compiled)
+
+    def so_far(self) -> dict[str, Any]:
+        """What those that have something to keep give, by the names of their classes."""
+        found = {type(member).__name__: member.so_far() for member in self.members}
+        return {name: value for name, value in found.items() if value is not None}
+
+    def resume(self, before: RunSoFar) -> None:
+        """Each goes on from what it gave."""
+        for member in self.members:
+            member.on_resume(before.callbacks.get(type(member).__name__), before.slam)
+
+    def each(self, hook: str, *arguments: Any) -> None:
+        """Call one hook of every member."""
+        with self.clock.measure("record and draw"):
+            for member in self.members:
+                getattr(member, hook)(*arguments)
