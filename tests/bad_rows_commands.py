@@ -215,6 +215,12 @@ def run_without_surfaces(folder: Path) -> Path:
     return folder_of_run(summary_of("good"))(folder)
 
 
+def run_of_a_continent(folder: Path) -> Path:
+    """The folder of a run whose map is 10,000 km across."""
+    PointCloud(np.diag([1e7, 1.0, 1.0]), np.zeros((3, 3), np.uint8)).save_ply(folder / "map.ply")
+    return folder_of_run(summary_of("good"))(folder)
+
+
 def exported_over(folder: Path) -> Path:
     """A run's folder, and one with a trajectory of somebody else."""
     (folder / "run").mkdir()
@@ -373,6 +379,28 @@ OTHERS = rows(
             "`export --to glb` of a run with `--dense none`",
             run_without_surfaces,
             {"argv": lambda made: ["export", made, "--to", "glb"]},
+        ),
+        ("`export` of a folder that is no run", good, {"argv": lambda made: ["export", made, "--to", "ply"]}),
+        ("`export --to` a format that is none", good, {"argv": lambda made: ["export", made, "--to", "xyz"]}),
+        (
+            "`export` into the run itself",
+            run_without_surfaces,
+            {"argv": lambda made: ["export", made, "--to", "tum", "-o", made]},
+        ),
+        (
+            "`export` among the images of the run",
+            run_without_surfaces,
+            {"argv": lambda made: ["export", made, "--to", "tum", "-o", made / "images" / "new"]},
+        ),
+        (
+            "`export` of a run without its poses",
+            run_without_surfaces,
+            {"argv": lambda made: ["export", made, "--to", "tum"]},
+        ),
+        (
+            "`export --to las` of a map of 10,000 km",
+            run_of_a_continent,
+            {"argv": lambda made: ["export", made, "--to", "las"]},
         ),
         ("`demo` of 10^20 frames", nothing, {"argv": line("demo", "--frames", "1" + "0" * 20)}),
         ("`demo --frames many`", nothing, {"argv": line("demo", "--frames", "many")}),
