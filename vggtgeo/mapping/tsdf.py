@@ -42,6 +42,8 @@ GROUP = 32
 """Blocks that one compiled call works on."""
 LEAST_CONFIDENCE = 0.5
 """Of a pixel that takes part, as in the cloud: below it lies a jump of depth, and no surface."""
+FARTHEST = 2**24 // SIDE
+"""Blocks from the origin: float32 tells the voxels apart up to there, 335 km at 2 cm."""
 LEAST_PART = 200
 """Faces of the smallest separate piece of surface that is kept: smaller ones are false depths."""
 
@@ -77,7 +79,8 @@ def blocks_of(view: View, voxel: float) -> list[Block]:
     rays = pinhole.rays(pixels, view.intrinsics)
     reach = TRUNCATION * voxel
     local = np.concatenate([rays * (z + offset)[:, None] for offset in (-reach, 0.0, reach)])
-    cells = np.floor((local - view.pose[:3, 3]) @ view.pose[:3, :3] / (SIDE * voxel)).astype(int)
+    places = np.floor((local - view.pose[:3, 3]) @ view.pose[:3, :3] / (SIDE * voxel))
+    cells = places[(np.abs(places) < FARTHEST).all(1)].astype(int)
     _, first = np.unique(cell_numbers(cells), return_index=True)
     return list(map(tuple, cells[first].tolist()))
 
