@@ -16,8 +16,12 @@ from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation.degradations import Degradation, Recording
 
 
-def degraded_clips(folder: Path, count: int, changes: Mapping[str, Degradation]) -> Iterator[tuple[str, SequenceView]]:
-    """The first frames of a clip with each of these things done to them, with depth where there is some and without."""
+def degraded_clips(
+    folder: Path, count: int, changes: Mapping[str, Degradation], depth_alone: bool = False
+) -> Iterator[tuple[str, SequenceView]]:
+    """The first frames of a clip with each of these things done to them, with depth where there is some and, but for
+    `depth_alone`, without.
+    """
     clip = vg.read(folder)
     truth = clip.ground_truth()
     if truth is None:
@@ -26,7 +30,8 @@ def degraded_clips(folder: Path, count: int, changes: Mapping[str, Degradation])
     for name, change in changes.items():
         changed = change(Recording(frames, clip.camera, truth), np.random.default_rng(0))
         walk = DegradedWalk(clip.name, changed)
-        for has_depth in (True, False) if clip.has_depth else (False,):
+        inputs = (True,) if depth_alone else (True, False) if clip.has_depth else (False,)
+        for has_depth in inputs:
             yield name, SequenceView(walk, clip.camera, has_depth)
 
 
@@ -45,8 +50,9 @@ def print_table(
     changes: Mapping[str, Degradation],
     columns: tuple[str, ...],
     cells: Callable[[SequenceView], Iterable[str]],
+    depth_alone: bool = False,
 ) -> None:
-    """A row for each clip of the command line, with depth and without, and each thing done to it.
+    """A row for each clip of the command line, with depth and, but for `depth_alone`, without, and each thing done.
 
     text: docstring of the benchmark. columns: heads of what `cells` gives of a sequence.
     """
@@ -56,6 +62,6 @@ def print_table(
     options = parser.parse_args()
     print(f"| {' | '.join(('clip', 'input', 'change', *columns))} |\n" + "|---" * (3 + len(columns)) + "|")
     for folder in options.clips:
-        for name, sequence in degraded_clips(folder, options.frames, changes):
+        for name, sequence in degraded_clips(folder, options.frames, changes, depth_alone):
             kind = "RGB-D" if sequence.has_depth else "RGB"
             print(f"| {' | '.join((sequence.name, kind, name, *cells(sequence)))} |", flush=True)
