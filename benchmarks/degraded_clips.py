@@ -26,6 +26,8 @@ def degraded_clips(
     truth = clip.ground_truth()
     if truth is None:
         raise SystemExit(f"`{folder}` has no truth to compare with")
+    if depth_alone and not clip.has_depth:
+        raise SystemExit(f"`{folder}` has no depth to change")
     frames = list(clip.frames(0, min(count, len(clip))))
     for name, change in changes.items():
         changed = change(Recording(frames, clip.camera, truth), np.random.default_rng(0))

@@ -12,7 +12,6 @@ offset, a power. ATE after SE(3) and Sim(3), cm. Oracle: what was done. No image
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -20,14 +19,14 @@ from degraded_clips import judged, print_table
 
 from vggtgeo.datasets import Frame
 from vggtgeo.datasets.views import SequenceView
-from vggtgeo.simulation.degradations import Degradation, Recording, as_it_is
+from vggtgeo.simulation.degradations import Degradation, Recording, as_it_is, with_depths
 
 COLUMNS = ("SE(3) cm", "Sim(3) cm", "verdict", "reasons")
 
 
 def of_depth(change: Callable[[np.ndarray], np.ndarray]) -> Degradation:
     """Each depth image, float32 [H, W], metres, NaN = none, changed by itself."""
-    return of_frames(lambda frames, camera, rng: [change(frame.depth) for frame in frames])
+    return lambda recording, rng: with_depths(recording, lambda depth, row: change(depth))
 
 
 def of_frames(
@@ -37,11 +36,7 @@ def of_frames(
 
     def changed(recording: Recording, rng: np.random.Generator) -> Recording:
         depths = change(recording.frames, recording.camera.intrinsics, rng)
-        frames = [
-            replace(frame, depth=np.ascontiguousarray(depth, np.float32))
-            for frame, depth in zip(recording.frames, depths, strict=True)
-        ]
-        return replace(recording, frames=frames)
+        return with_depths(recording, lambda depth, row: depths[row])
 
     return changed
 

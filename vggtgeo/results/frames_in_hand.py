@@ -13,7 +13,7 @@ class FramesInHand:
     """Frames on their way through the reading thread; the loop takes each, as it was read, once it is tracked.
 
     Appending to a deque and taking from it need no lock. (A dict, which the loop went through while a frame was put in,
-    ended one run in some hundreds.)
+    ended a run now and then.)
     """
 
     def __init__(self, frames: Iterable[Frame]) -> None:

@@ -20,12 +20,7 @@ from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.warned import collected_warnings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.checkpoints import (
-    Checkpoints,
-    digest_of_map,
-    identity,
-    resumed,
-)
+from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, identity, resumed
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source, as_read, opened

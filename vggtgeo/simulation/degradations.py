@@ -81,7 +81,7 @@ def board(recording: Recording, rng: np.random.Generator) -> Recording:
     top = round(0.7 * height)
     below = np.arange(height)[:, None] >= top
     painted = _images(recording, lambda image, row: np.where(below[..., None], pattern, image))
-    return _depths(painted, lambda depth, row: np.where(below, 0.45, depth))
+    return with_depths(painted, lambda depth, row: np.where(below, 0.45, depth))
 
 
 def person(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -103,7 +103,7 @@ def person(recording: Recording, rng: np.random.Generator) -> Recording:
         depth[height // 5 :, place(row)] = 1.2
         return depth
 
-    return _depths(_images(recording, paint), near)
+    return with_depths(_images(recording, paint), near)
 
 
 def dark(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -115,14 +115,14 @@ def dark(recording: Recording, rng: np.random.Generator) -> Recording:
 def centimetres(recording: Recording, rng: np.random.Generator) -> Recording:
     """Depth read in a unit ten times too small."""
     del rng
-    return _depths(recording, lambda depth, row: 0.1 * depth)
+    return with_depths(recording, lambda depth, row: 0.1 * depth)
 
 
 def growing_depth(recording: Recording, rng: np.random.Generator) -> Recording:
     """A depth camera that warms up: its scale grows by 40 % over the recording."""
     del rng
     count = len(recording.frames)
-    return _depths(recording, lambda depth, row: depth * (1 + 0.4 * row / count))
+    return with_depths(recording, lambda depth, row: depth * (1 + 0.4 * row / count))
 
 
 def other_depth(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -151,7 +151,7 @@ def barrel(recording: Recording, rng: np.random.Generator) -> Recording:
     u, v = np.asarray(source, np.float32).reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
     bent = _images(recording, lambda image, row: cv2.remap(image, u, v, cv2.INTER_LINEAR))
     nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
-    return _depths(bent, lambda depth, row: cv2.remap(depth, u, v, cv2.INTER_NEAREST, **nothing))
+    return with_depths(bent, lambda depth, row: cv2.remap(depth, u, v, cv2.INTER_NEAREST, **nothing))
 
 
 def zooming(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -190,7 +190,7 @@ def covered(recording: Recording, rng: np.random.Generator) -> Recording:
     noise = lambda image: rng.normal(12, 2.0, image.shape).clip(0, 255).astype(np.uint8)
     inside = lambda row: middle <= row < middle + 10
     blind = _images(recording, lambda image, row: noise(image) if inside(row) else image)
-    return _depths(blind, lambda depth, row: np.full_like(depth, np.nan) if inside(row) else depth)
+    return with_depths(blind, lambda depth, row: np.full_like(depth, np.nan) if inside(row) else depth)
 
 
 def without_depth(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -221,7 +221,7 @@ def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recor
         return cv2.warpAffine(depth, grown(row), depth.shape[::-1], flags=cv2.INTER_NEAREST, **nothing)
 
     seen = _images(recording, lambda image, row: cv2.warpAffine(image, grown(row), image.shape[1::-1]))
-    return _depths(seen, depth_through)
+    return with_depths(seen, depth_through)
 
 
 def _images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
@@ -229,7 +229,8 @@ def _images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray
     return replace(recording, frames=frames)
 
 
-def _depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
+def with_depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
+    """The recording with each depth image, float32 [H, W], changed, given its row too."""
     frames = [
         frame if frame.depth is None else replace(frame, depth=change(frame.depth, row).astype(np.float32))
         for row, frame in enumerate(recording.frames)

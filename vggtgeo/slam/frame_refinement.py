@@ -58,11 +58,9 @@ def can_refine(slam: Slam, roles: Roles) -> bool:
 def refine_frames(slam: Slam, frames: Iterable[Frame], camera: Camera, roles: Roles) -> Slam:
     """The state with its frames, but for the keyframes, placed against the finished map.
 
-    slam: after the last adjustment. frames: those of the run, as they are read, in any order; one that does not come
-    stays where it is. camera: of `frames`.
+    slam: after the last adjustment, and `can_refine`. frames: those of the run, as they are read, in any order; one
+    that does not come stays where it is. camera: of `frames`.
     """
-    if not can_refine(slam, roles):
-        return slam
     slam = _carried(slam)
     undistorter = (slam.lens or camera).undistorter()
     row_of = _rows(slam)
