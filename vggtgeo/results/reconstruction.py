@@ -17,6 +17,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_kind, check_plain, check_whole
 from vggtgeo.io.interruption import Interruption, interruption
+from vggtgeo.io.process_settings import program_settings
 from vggtgeo.io.warned import collected_warnings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
@@ -75,6 +76,10 @@ def reconstruct(
     Ctrl-C (in a notebook: the stop button) ends the run early with the result of the frames so far, whose `summary`
     says `interrupted`: after the frame at hand, or in place of the last adjustment. A second one ends it at once.
 
+    Compiled code is kept in the user's cache folder, as by the program: the first call takes half a minute longer than
+    those of later processes. A folder that JAX was given (`jax_compilation_cache_dir`) is taken in its place, and with
+    JAX's `JAX_ENABLE_COMPILATION_CACHE=0` nothing is kept.
+
     Args:
         frames: a folder or a video file, a sequence (`vggtgeo.read`, `vggtgeo.simulate`), or any iterable of `Frame`,
             of images uint8 [H, W, 3] RGB, or of pairs of an image and depth (float [H, W], metres, NaN = none).
@@ -108,7 +113,7 @@ def reconstruct(
     clock, began = Clock(), time.perf_counter()
     _check_arguments(roles, settings, camera, known_map, callbacks, facts, checkpoints, title, seed)
     settings = settings or SlamSettings()
-    with interruption() as stop, collected_warnings() as collected:
+    with program_settings(), interruption() as stop, collected_warnings() as collected:
         source = opened(frames, camera, settings)
         source.check(start, end, stride)
         perception = _perception(roles, source.has_depth, seed)
