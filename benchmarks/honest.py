@@ -13,7 +13,9 @@ own (`../shared/data/README.md`): that of icl-office alone is exact.
 
 runs whole clips, and simulated scenes by name, to their end, and compares what `uncertainty.txt` states of every frame
 with its error: against the first pose, whose own error in the truth then counts in every frame, and after alignment of
-the whole: of places by SE(3), of rotations by the best single rotation.
+the whole: of places by SE(3), of rotations by the best single rotation. The last two columns are the NEES against the
+first pose, as in `vggtgeo bench`. With `--rgb-only` lengths are taken by the scale of the best Sim(3); `--start` and
+`--end` run a part of each clip.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ from scipy.stats import chi2 as chi_square
 from short_runs import Piece
 
 import vggtgeo as vg
+from vggtgeo.datasets import open_sequence, without_depth
+from vggtgeo.evaluation.consistency import pose_consistency
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.evidence import tangent
 from vggtgeo.slam.state import Slam
@@ -39,7 +43,7 @@ HEADER = (
 WHOLE = (
     "| source | frames | stated, mm | error, mm: aligned | to the first pose | stated, deg | error, deg: aligned "
     "| to the first pose | within 3 sigma: place, aligned | to the first pose "
-    "| rotation, aligned | to the first pose |\n" + "|---" * 12 + "|"
+    "| rotation, aligned | to the first pose | NEES: place | rotation |\n" + "|---" * 14 + "|"
 )
 
 
@@ -49,12 +53,14 @@ def main() -> None:
     if options.whole:
         print(WHOLE)
         for path in options.clips:
-            source = path if path.exists() else vg.simulate(path.name, 80, rate=6.0)
-            result = vg.reconstruct(source)
+            source = open_sequence(path) if path.exists() else vg.simulate(path.name, 80, rate=6.0)
+            source = without_depth(source) if options.rgb_only else source
+            result = vg.reconstruct(source, start=options.start, end=options.end, dense="none")
             assert result.record is not None
             truth = vg.Trajectory.load_tum(options.truth) if options.truth else result.record.truth
             assert truth is not None, f"{path} has no truth"
-            print(_whole_row(path.name, result, truth), flush=True)
+            scale = 1.0 if result.metric else vg.evaluate_trajectory(result.trajectory, truth).sim3.alignment.scale
+            print(_whole_row(path.name, result, truth, scale), flush=True)
         return
     print(HEADER)
     for path in options.clips:
@@ -94,11 +100,12 @@ def _row(name: str, slam: Slam, true: np.ndarray, row_of: dict[int, int]) -> str
     return "| " + " | ".join((name, str(len(moved)), *cells)) + " |"
 
 
-def _whole_row(name: str, result: vg.Result, truth: vg.Trajectory) -> str:
+def _whole_row(name: str, result: vg.Result, truth: vg.Trajectory, scale: float) -> str:
     stated = result.uncertainty
     assert stated is not None
     rows = [int(np.argmin(np.abs(truth.timestamps - time))) for time in result.trajectory.timestamps]
-    found, true = result.trajectory.poses, truth.poses[rows]
+    found, true = result.trajectory.poses.copy(), truth.poses[rows]
+    found[:, :3, 3] *= scale
     against_first = [rigid.invert(poses[0])[None] @ poses for poses in (found, true)]
     off = np.array([tangent(rigid.invert(one) @ other) for one, other in zip(*against_first, strict=True)])
     first = np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)
@@ -107,12 +114,15 @@ def _whole_row(name: str, result: vg.Result, truth: vg.Trajectory) -> str:
     aligned = np.linalg.norm(turn.apply(places) - targets, axis=1)
     each, goals = (Rotation.from_matrix(poses[:, :3, :3]) for poses in (found, true))
     turned_off = (goals.inv() * (goals * each.inv()).mean() * each).magnitude()
-    moved, turned = stated.translation, stated.rotation
+    moved, turned = scale * stated.translation, stated.rotation
+    consistency = pose_consistency(result.trajectory, truth, moved, turned, scale)
+    nees = [f"{one.mean / one.degrees:.2f}" for one in consistency]
     compared = ((aligned, moved), (first[0], moved), (turned_off, turned), (first[1], turned))
-    within = [f"{100 * np.mean(error <= 3 * sigma):.0f} %" for error, sigma in compared]
-    cells = [f"{1e3 * np.median(values):.1f}" for values in (moved, aligned, first[0])]
-    angles = [f"{np.rad2deg(np.median(values)):.3f}" for values in (turned, turned_off, first[1])]
-    return "| " + " | ".join((name, str(len(moved)), *cells, *angles, *within)) + " |"
+    known = np.isfinite(moved)
+    within = [f"{100 * np.mean(error[known] <= 3 * sigma[known]):.0f} %" for error, sigma in compared]
+    cells = [f"{1e3 * np.nanmedian(values):.1f}" for values in (moved, aligned, first[0])]
+    angles = [f"{np.rad2deg(np.nanmedian(values)):.3f}" for values in (turned, turned_off, first[1])]
+    return "| " + " | ".join((name, str(len(moved)), *cells, *angles, *within, *nees)) + " |"
 
 
 def _error(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -125,6 +135,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--whole", action="store_true")
+    parser.add_argument("--rgb-only", action="store_true")
+    parser.add_argument("--start", type=int, default=0)
+    parser.add_argument("--end", type=int)
     parser.add_argument("--truth", type=Path, help="poses to compare one clip with, TUM's layout")
     options = parser.parse_args()
     if options.truth and not (options.whole and len(options.clips) == 1):

@@ -277,6 +277,7 @@ class GeometryResult(IntEnum):
     LOW_PARALLAX = 3
     DEGENERATE = 4
     NO_PREDICTION = 5
+    AMBIGUOUS = 6
 
     @property
     def message(self) -> str:
@@ -289,6 +290,7 @@ _MESSAGES = {
     GeometryResult.TOO_FEW_INLIERS: "too few matches agree on one motion; treat tracking as lost here",
     GeometryResult.LOW_PARALLAX: "the camera turned without moving enough; wait for a frame farther away",
     GeometryResult.DEGENERATE: "the matches do not determine the motion; use a frame with more spread points",
+    GeometryResult.AMBIGUOUS: "two motions explain the matches, which show a plane; wait for a frame that shows more",
     GeometryResult.NO_PREDICTION: "there is neither a match nor a predicted pose; give at least one of them",
 }
 

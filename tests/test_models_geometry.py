@@ -6,7 +6,7 @@ import numpy as np
 import plane_views as views
 import pytest
 from scipy.linalg import expm
-from vggtgeo.models import roles
+from vggtgeo.models import pinhole, roles
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry, TwoViewStart
 from vggtgeo.models.classical.pose_refinement import refine_pose
 from vggtgeo.models.rigid_motion import exponential
@@ -168,6 +168,23 @@ def test_no_start_without_parallax(motion: np.ndarray) -> None:
     first, second, _, _ = _matches(motion)
     guess = TwoViewStart().start(first, second, views.INTRINSICS)
     assert guess.result is GeometryResult.LOW_PARALLAX
+
+
+@pytest.mark.parametrize("beside", [0, 80])
+def test_a_wall_alone_is_no_start(beside: int) -> None:
+    # Proves that a plane, which two motions explain, has to wait, and that points beside it decide. Oracle: how many of
+    # the 200 points stand off the wall, by up to a metre, and the motion that the matches were made with.
+    generator = np.random.default_rng(3)
+    pixels = generator.uniform((20, 20), np.array(views.SIZE) - 20, (200, 2))
+    rays = pinhole.rays(pixels, views.INTRINSICS)
+    points = rays * (2.5 / (rays @ np.array([0.35, 0.1, 1.0])))[:, None]
+    points[:beside] *= generator.uniform(0.6, 1.0, (beside, 1))
+    motion = views.pose((1.0, 4.0, 0.5), (0.35, 0.05, 0.1))
+    first, second = (views.project(points, pose) + generator.normal(0, 0.3, (200, 2)) for pose in (np.eye(4), motion))
+    guess = TwoViewStart().start(first, second, views.INTRINSICS)
+    assert guess.result is (GeometryResult.SUCCESS if beside else GeometryResult.AMBIGUOUS)
+    if beside:
+        assert _apart(guess.pose, motion)[1] < 0.5
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,15 @@ CALIBRATION = 0.01
 """Of the angle that the camera has turned since the first pose: standard deviation of the focal length, relative, by
 which every turn that is seen is too large or too small. Makers and calibration tools reach it (`slam/calibration.py`);
 two runs with one camera refined it to 482.6 and 488.4 px."""
+SHARED_ERRORS = 6.0
+"""Matches that count as one in a map without measured depth: each is in the adjustment from either side, those of a
+point share the error of its host, and all share what the camera's model leaves. With every match for itself, the
+squared errors of places were 14 (icl-office), 6 (corridor-office) and 2.8 (building-walk) times what was stated.
+Surfaces have the like: `RgbdAlignment.surface_spread`."""
+FREE_SCALE = 0.02
+"""Of the distance, standard deviation: a unit that is handed on from part to part is not the same everywhere. After the
+best similarity, places were 1.5 to 2.9 % of their distance from the first one off (redkitchen against COLMAP,
+corridor-office, building-walk, medians)."""
 SPREAD = 64
 """Keyframes, evenly spread, that stand for the others where no band serves: six solves with a sparse factor each."""
 
@@ -74,8 +83,10 @@ def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
     times = np.array([record.timestamp for record in records])
     poses = np.array([slam.pose(record) for record in records]).reshape(-1, 4, 4)
     places = rigid.invert(poses)[:, :3, 3]
-    if slam.metric:
-        moved = np.hypot(moved, DEPTH_SCALE * np.linalg.norm(places - places[:1], axis=1))
+    if not slam.metric:
+        moved, turned = np.sqrt(SHARED_ERRORS) * moved, np.sqrt(SHARED_ERRORS) * turned
+    scale = DEPTH_SCALE if slam.metric else FREE_SCALE
+    moved = np.hypot(moved, scale * np.linalg.norm(places - places[:1], axis=1))
     speed, rate = _speeds(times, poses, places)
     # What turns while it is read out is sheared and stretched, which looks like a motion at the scene's distance.
     sheared = rate * median_depths(slam)[[record.reference for record in records]]

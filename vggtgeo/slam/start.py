@@ -69,7 +69,7 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
     at a wall, or turn away before it has moved.
     """
     first, matches, guess = _two_views(slam, frame, features, roles)
-    if guess.result not in (GeometryResult.SUCCESS, GeometryResult.LOW_PARALLAX):
+    if guess.result not in (GeometryResult.SUCCESS, GeometryResult.LOW_PARALLAX, GeometryResult.AMBIGUOUS):
         later = _later_first(slam, features, roles, settings)
         if later is not None:
             slam = later

@@ -6,11 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.blind import check_blind, cuts
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
 from vggtgeo.slam.trust.change_of_sides import check_sides
+from vggtgeo.slam.trust.contradicted import check_matches
 from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.enlargement import check_enlargements
@@ -47,6 +49,9 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     found += check_extent(estimate, None if known is None else known.translation)
     if estimate.started and estimate.metric:
         found += check_surfaces(slam.keyframes, estimate.intrinsics)
+    for piece in pieces_by_size(slam) if estimate.started and not estimate.metric else ():
+        own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]
+        found += check_matches(own, estimate.intrinsics)
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
         height, width = slam.keyframes[0].size
         found += _images(estimate, aligned, (width, height))

@@ -1,0 +1,91 @@
+"""Matches of neighbouring keyframes, against poses that are right, wrong from the start, or wrong for a while."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from recorded_run import recorded_run
+from vggtgeo.models import pinhole
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
+from vggtgeo.models.rigid_motion import exponential
+from vggtgeo.models.roles import Features
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.trust.contradicted import APART, check_matches
+
+INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
+STEP = np.array([0.08, 0.01, 0.03, 0.005, 0.02, -0.004])
+"""Of the camera from keyframe to keyframe, metres and radians."""
+
+
+def seen(count: int) -> list[Keyframe]:
+    """Keyframes of a camera that walks past 300 points, each with a descriptor of its own; their poses are true."""
+    generator = np.random.default_rng(5)
+    one = recorded_run().slam.keyframes[0]
+    points = generator.uniform((-2, -1.5, 2), (2 + 0.08 * count, 1.5, 5), (300, 3))
+    vectors = generator.normal(size=(300, 32)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    keyframes, pose = [], np.eye(4)
+    for number in range(count):
+        pixels = pinhole.project(points @ pose[:3, :3].T + pose[:3, 3], INTRINSICS)
+        pixels = pixels + generator.normal(0, 0.3, pixels.shape)
+        inside = np.isfinite(pixels).all(1) & (pixels > 0).all(1) & (pixels < (320, 240)).all(1)
+        described = PixelDescriptors(vectors[inside], np.zeros((240, 320), np.uint8))
+        features = Features(pixels[inside], np.ones(inside.sum()), described)
+        keyframes.append(replace(one, number=number, frame=10 * number, pose=pose, features=features))
+        pose = exponential(-STEP) @ pose
+    return keyframes
+
+
+def bent(keyframes: list[Keyframe], first: int, last: int) -> list[Keyframe]:
+    """The same with a camera that from keyframe `first` to `last` nods by 3 degrees a step more than it did."""
+    nod, poses = exponential(np.array([0, 0, 0, np.deg2rad(3.0), 0, 0])), [keyframes[0].pose]
+    for number in range(1, len(keyframes)):
+        step = keyframes[number].pose @ rigid.invert(keyframes[number - 1].pose)
+        poses.append((nod @ step if first < number <= last else step) @ poses[-1])
+    return [replace(keyframe, pose=pose) for keyframe, pose in zip(keyframes, poses, strict=True)]
+
+
+def test_poses_that_images_contradict_are_told() -> None:
+    """True poses are contradicted by none; a map that bends from its start, as one does that began with the other
+    motion of a plane, is told as a whole. Oracle: how the poses were made.
+    """
+    keyframes = seen(10)
+    assert list(check_matches(keyframes, INTRINSICS)) == []
+    (finding,) = check_matches(bent(keyframes, 0, 10), INTRINSICS)
+    assert (finding.check, finding.level, finding.start, finding.end) == ("matches", "degraded", None, None)
+    assert "contradict the poses" in finding.text
+
+
+def test_a_part_that_is_wrong_is_told_by_its_frames() -> None:
+    """Between keyframes 9 and 17 of 30 the map bends. Oracle: the frames of those keyframes."""
+    (finding,) = check_matches(bent(seen(30), 9, 17), INTRINSICS)
+    assert finding.start is not None
+    assert finding.end is not None
+    assert 90 - 10 * (APART + 3) <= finding.start <= 90
+    assert 120 <= finding.end <= 170 + 10 * (APART + 3)
+
+
+def test_a_whole_map_that_turned_is_the_same_map() -> None:
+    """Where the world begins is nobody's matter. Oracle: the same findings, none."""
+    moved = exponential(np.array([1.0, -2.0, 0.5, 0.4, -1.0, 0.3]))
+    elsewhere = [replace(keyframe, pose=keyframe.pose @ rigid.invert(moved)) for keyframe in seen(10)]
+    assert list(check_matches(elsewhere, INTRINSICS)) == []
+
+
+def test_nothing_is_said_of_few_keyframes_few_matches_or_other_descriptors() -> None:
+    """Oracle: no finding, of poses that would be told."""
+    wrong = bent(seen(10), 0, 10)
+    assert list(check_matches(wrong[:APART], INTRINSICS)) == []
+    others = [replace(k, features=Features(k.features.pixels, k.features.scores, "learned")) for k in wrong]
+    assert list(check_matches(others, INTRINSICS)) == []
+    few = [replace(k, features=_some(k.features, 20)) for k in wrong]
+    assert list(check_matches(few, INTRINSICS)) == []
+
+
+def _some(features: Features, count: int) -> Features:
+    described = features.descriptors
+    vectors = PixelDescriptors(described.vectors[:count], described.gray)
+    return Features(features.pixels[:count], features.scores[:count], vectors)
