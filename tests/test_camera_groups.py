@@ -242,6 +242,7 @@ class EqualFocalLengths(vg.CameraTerm):
         return parameters[0] - parameters[1]
 
 
+@pytest.mark.long
 def test_square_pixels_are_an_exact_tie() -> None:
     # Proves `SquarePinhole`: from 5 % off, the optimum is that of a pinhole with `fx = fy`. Oracle: the pinhole under a
     # stiff term that says so.

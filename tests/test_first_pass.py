@@ -170,6 +170,7 @@ def test_where_there_is_no_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     assert passes.counts == []
 
 
+@pytest.mark.long
 def test_a_resumed_run_seeks_no_camera_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that a run which was killed after its first pass goes on with the camera that it found.
     kept = Checkpoints(tmp_path / "kept", every=0)

@@ -59,6 +59,7 @@ def test_notebook_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out, f"`{path.name}` printed nothing"
 
 
+@pytest.mark.long
 def test_solve_starts_from_a_recording_where_there_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The first two cells take a folder in place of the rendered pair, and find how its camera moved; oracle: truth."""
     for _ in write_tum_folder(simulate("office", 10, 5, (320, 240)), tmp_path):

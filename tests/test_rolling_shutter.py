@@ -220,6 +220,7 @@ def test_a_readout_that_moves_much_is_told(shift: float, columns: bool, told: bo
         assert ("columns" if columns else "rows") in reason
 
 
+@pytest.mark.long
 def test_rows_are_drawn_as_the_simulated_camera_draws_them() -> None:
     """A picture of one moment, drawn again row by row by its depth and the true motion, is the one that the simulated
     camera takes with that readout; oracle: that camera. Most of what the readout changes is there.

@@ -13,7 +13,7 @@ from vggtgeo.models.roles import Features
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.trust.contradicted import APART, check_matches
+from vggtgeo.slam.trust.contradicted import APART, LEAST_PAIRS, check_matches
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
 STEP = np.array([0.08, 0.01, 0.03, 0.005, 0.02, -0.004])
@@ -57,6 +57,8 @@ def test_poses_that_images_contradict_are_told() -> None:
     (finding,) = check_matches(bent(keyframes, 0, 10), INTRINSICS)
     assert (finding.check, finding.level, finding.start, finding.end) == ("matches", "degraded", None, None)
     assert "contradict the poses" in finding.text
+    (finding,) = check_matches(bent(keyframes, 0, 10), INTRINSICS, alone=False)
+    assert (finding.start, finding.end) == (0, 90)
 
 
 def test_a_part_that_is_wrong_is_told_by_its_frames() -> None:
@@ -78,7 +80,7 @@ def test_a_whole_map_that_turned_is_the_same_map() -> None:
 def test_nothing_is_said_of_few_keyframes_few_matches_or_other_descriptors() -> None:
     """Oracle: no finding, of poses that would be told."""
     wrong = bent(seen(10), 0, 10)
-    assert list(check_matches(wrong[:APART], INTRINSICS)) == []
+    assert list(check_matches(wrong[: APART + LEAST_PAIRS - 1], INTRINSICS)) == []
     others = [replace(k, features=Features(k.features.pixels, k.features.scores, "learned")) for k in wrong]
     assert list(check_matches(others, INTRINSICS)) == []
     few = [replace(k, features=_some(k.features, 20)) for k in wrong]

@@ -32,30 +32,31 @@ RATIO = 0.85
 OFF = 3.0
 """Pixels from the epipolar line: the verifier's threshold, and half as much for what the poses are off."""
 LEAST_AGREEING = 0.8
+LEAST_PAIRS = 4
+"""Fewer say nothing of a map."""
 IN_A_ROW = 7
 """Pairs whose median counts, where not the whole run is wrong."""
 
 
-def check_matches(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> Iterator[Finding]:
+def check_matches(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, alone: bool = True) -> Iterator[Finding]:
     """The median pair, of all and of each few in a row. keyframes: of one piece of the map, in the order of time, poses
-    world -> camera. intrinsics: fx, fy, cx, cy, pixels.
+    world -> camera. intrinsics: fx, fy, cx, cy, pixels. alone: whether there is no other piece.
     """
     count = len(keyframes) - APART
     rows = np.unique(np.linspace(0, max(count - 1, 0), MOST_PAIRS).astype(int)) if count > 0 else ()
     pairs = [(keyframes[row], keyframes[row + APART]) for row in rows]
     shares = map_in_threads(lambda pair: agreeing_share(*pair, intrinsics), pairs)
     known = [(*pair, share) for pair, share in zip(pairs, shares, strict=True) if share is not None]
-    if not known:
+    if len(known) < LEAST_PAIRS:
         return
     values = np.array([share for *_, share in known])
     if np.median(values) < LEAST_AGREEING:
-        yield Finding("matches", "degraded", _text(float(np.median(values))))
+        yield _finding(values, *((None, None) if alone else (known[0][0].frame, known[-1][1].frame)))
         return
     low = [np.median(values[row : row + IN_A_ROW]) < LEAST_AGREEING for row in range(len(values) - IN_A_ROW + 1)]
     for first, last in spans(np.array(low, bool), join=IN_A_ROW):
         start, end = known[first][0].frame, known[last + IN_A_ROW - 1][1].frame
-        text = _text(float(np.median(values[first : last + IN_A_ROW])))
-        yield Finding("matches", "degraded", f"frames {start} to {end}: {text}", start, end)
+        yield _finding(values[first : last + IN_A_ROW], start, end)
 
 
 def agreeing_share(first: Keyframe, second: Keyframe, intrinsics: np.ndarray) -> float | None:
@@ -70,9 +71,12 @@ def agreeing_share(first: Keyframe, second: Keyframe, intrinsics: np.ndarray) ->
     return float(np.mean(off < OFF))
 
 
-def _text(share: float) -> str:
-    return (
-        f"the images contradict the poses: of the matches of neighbouring keyframes, which agree with one another, "
-        f"{100 * (1 - share):.0f} % do not agree with how the cameras stand; without depth a map may begin wrongly, of "
-        "a wall above all: begin at another frame (`--start`), or give depth"
+def _finding(shares: np.ndarray, start: int | None, end: int | None) -> Finding:
+    where = "" if start is None else f"frames {start} to {end}: "
+    off = 100 * (1 - float(np.median(shares)))
+    text = (
+        f"{where}the images contradict the poses: of the matches of neighbouring keyframes, which agree with one "
+        f"another, {off:.0f} % do not agree with how the cameras stand; without depth a map may begin wrongly, of a wall "
+        "above all: begin at another frame (`--start`), or give depth"
     )
+    return Finding("matches", "degraded", text, start, end)

@@ -49,9 +49,9 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     found += check_extent(estimate, None if known is None else known.translation)
     if estimate.started and estimate.metric:
         found += check_surfaces(slam.keyframes, estimate.intrinsics)
-    for piece in pieces_by_size(slam) if estimate.started and not estimate.metric else ():
+    for piece in pieces_by_size(slam) if estimate.started and not estimate.metric else ():  # with depth: the surfaces
         own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]
-        found += check_matches(own, estimate.intrinsics)
+        found += check_matches(own, estimate.intrinsics, estimate.pieces == 1)
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
         height, width = slam.keyframes[0].size
         found += _images(estimate, aligned, (width, height))
