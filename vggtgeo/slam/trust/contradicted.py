@@ -76,7 +76,7 @@ def _finding(shares: np.ndarray, start: int | None, end: int | None) -> Finding:
     off = 100 * (1 - float(np.median(shares)))
     text = (
         f"{where}the images contradict the poses: of the matches of neighbouring keyframes, which agree with one "
-        f"another, {off:.0f} % do not agree with how the cameras stand; without depth a map may begin wrongly, of a wall "
-        "above all: begin at another frame (`--start`), or give depth"
+        f"another, {off:.0f} % do not agree with how the cameras stand; without depth a map may begin wrongly, of a "
+        "wall above all: begin at another frame (`--start`), or give depth"
     )
     return Finding("matches", "degraded", text, start, end)

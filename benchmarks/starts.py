@@ -1,0 +1,71 @@
+"""Where does a run begin well? Pieces of clips, each from another frame, by default without depth.
+
+    python benchmarks/starts.py ../shared/data/building-walk ../shared/data/corridor-office ../shared/data/icl-office
+    python benchmarks/starts.py ../shared/data/redkitchen --frames 80 --every 60
+
+A row a piece: its frames, how many were tracked, the ATE after Sim(3) (with `--depth`: SE(3)), the length of the true
+path, the share of matches that agree with the poses (`vggtgeo/slam/trust/contradicted.py`, the median pair of
+keyframes), and the verdict. A stranger's video begins anywhere: at a wall, in a turn, in the middle of a step.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+import vggtgeo as vg
+from vggtgeo.datasets import open_sequence, without_depth
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.slam.trust.contradicted import APART, agreeing_share
+
+HEADER = "| clip | frames | tracked | keyframes | ATE cm | path m | agreeing matches | verdict | reasons |\n" + (
+    "|---" * 9 + "|"
+)
+
+
+def main() -> None:
+    """Run every piece of every clip and print the table."""
+    options = _options()
+    print(HEADER)
+    for path in options.clips:
+        sequence = open_sequence(path)
+        sequence = sequence if options.depth else without_depth(sequence)
+        for start in range(0, len(sequence) - options.frames + 1, options.every):
+            result = vg.reconstruct(sequence, start=start, end=start + options.frames, dense="none")
+            print(_row(path.name, start, options.frames, result), flush=True)
+
+
+def _row(name: str, start: int, frames: int, result: vg.Result) -> str:
+    assert result.record is not None
+    keyframes, intrinsics = result.record.slam.keyframes, result.record.slam.intrinsics
+    pairs = zip(keyframes, keyframes[APART:], strict=False)
+    shares = [share for pair in pairs if (share := agreeing_share(*pair, intrinsics)) is not None]
+    error, length = float("nan"), float("nan")
+    if result.record.truth is not None and len(result.trajectory) > 2:
+        report = evaluate_trajectory(result.trajectory, result.record.truth)
+        alignment = report.se3 if result.metric else report.sim3
+        first, last = result.trajectory.timestamps[[0, -1]]
+        times = result.record.truth.timestamps
+        length = result.record.truth.select((times >= first) & (times <= last)).length
+        error = 100 * alignment.statistics.rmse
+    tracked = f"{result.summary['frames_tracked']}/{result.summary['frames']}"
+    cells = (
+        *(name, f"{start} to {start + frames - 1}", tracked, str(len(keyframes)), f"{error:.1f}", f"{length:.1f}"),
+        *(f"{np.median(shares):.2f}" if shares else "", result.verdict.level, "; ".join(result.verdict.reasons)),
+    )
+    return "| " + " | ".join(cells) + " |"
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clips", type=Path, nargs="+")
+    parser.add_argument("--frames", type=int, default=60, help="of a piece")
+    parser.add_argument("--every", type=int, default=20, help="frames from the start of one piece to that of the next")
+    parser.add_argument("--depth", action="store_true", help="use the depth of the clips")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
