@@ -13,11 +13,12 @@ from trust_checks import found_by_camera, found_by_depth, found_by_parts, found_
 from witness import walk, with_depth
 
 from vggtgeo.results import Result
+from vggtgeo.slam.trust import judge as judge_module
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import EvidenceRecorder, FrameEvidence
 from vggtgeo.slam.trust.finding import Finding, Verdict
-from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.trust.judge import judge, judged_or_told
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.speed import check_speed
 
@@ -62,3 +63,19 @@ def test_a_run_is_judged_as_a_whole() -> None:
     assert stirred.level != "good"
     again = Verdict.from_dict(json.loads(json.dumps(stirred.to_dict())), stirred.metric)
     assert again == stirred
+
+
+def test_a_check_that_fails_loses_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its error is told, the verdict is not good, and what was found of the input stays. Oracle: the planted fault."""
+
+    def fails(*_: object) -> list[Finding]:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    slam = recorded_run().slam
+    known = Finding("input", "degraded", "two frames were left out")
+    assert judged_or_told(slam).level == judge(slam).level == "good"
+    monkeypatch.setattr(judge_module, "check_extent", fails)
+    verdict = judged_or_told(slam, (), (known,))
+    assert verdict.level == "degraded"
+    assert any("LinAlgError: Singular matrix" in reason for reason in verdict.reasons)
+    assert known.text in verdict.reasons

@@ -176,3 +176,16 @@ def test_a_run_whose_sensors_change_is_told(
     assert told([replace(noted, depth_median=float("nan")) for noted in recorder.frames]) == []
     monkeypatch.setattr(drift, lambda slam, stretch: _run(*curves, noise=0.1))
     assert told(recorder.frames) == [], "steps forward past depth that is noise look like a zoom"
+
+
+def test_depth_that_is_the_same_everywhere_tells_of_no_lens() -> None:
+    """Points at one depth, seen by a camera that goes straight ahead: a lens that zooms and a step look alike, and
+    the equations have no solution. Oracle: how the points were made; nothing is said, and nothing fails.
+    """
+    rng = np.random.default_rng(0)
+    before = rng.uniform((100, 100), (540, 380), (60, 2))
+    pair = replace(_pair(rng, (0, 1), (1.0, 1.0), (1.0, 1.0)), relative=np.eye(4))
+    after = (before - K[2:]) * 1.05 + K[2:]
+    same = replace(pair, before=before, after=after, depth=np.ones(60), depth_after=np.ones(60))
+    found = compare(same, K)
+    assert found.focal[1] == found.depth[1] == np.inf

@@ -43,7 +43,7 @@ from vggtgeo.slam.still_parts import APART, PICTURES, StillParts, find_still_par
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.input import check_input, check_refusals
-from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.trust.judge import judged_or_told
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
@@ -210,7 +210,7 @@ def _concluded(
     def judged() -> Verdict:
         with clock.measure("verdict (own thread)"):
             left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
-            return judge(slam, evidence.frames, left_out)
+            return judged_or_told(slam, evidence.frames, left_out)
 
     hooks.each("on_stage", "dense map and verdict")
     with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:

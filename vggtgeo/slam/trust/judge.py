@@ -62,6 +62,20 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)
 
 
+def judged_or_told(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
+    """As `judge`; a fault of a check is told, and loses nobody the result of hours."""
+    try:
+        return judge(slam, evidence, input_findings)
+    except (ArithmeticError, LookupError, TypeError, ValueError) as fault:  # `LinAlgError` is a ValueError
+        text = (
+            f"a check ended in an error ({type(fault).__name__}: {fault}), a fault of this program that its authors "
+            "would like to know of; how far the result can be trusted is not known"
+        )
+        estimate = Estimate.of(slam)
+        found = [*input_findings, Finding("checks", "degraded", text)]
+        return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)
+
+
 def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> Iterator[Finding]:
     taken = steps(estimate, evidence)
     wrong = breaks(estimate, evidence, taken)

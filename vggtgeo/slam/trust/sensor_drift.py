@@ -147,7 +147,7 @@ def compare(pair: DepthPair, intrinsics: np.ndarray) -> Factors:
     relative, value = pair.relative, 0.0
     fit = _fit(pair, intrinsics, relative, value)
     for _ in range(ITERATIONS):
-        if len(fit.residual) < LEAST:
+        if len(fit.residual) < LEAST or not fit.determined:
             return _NOTHING
         step = -np.linalg.solve(fit.normal, fit.gradient)
         relative = rigid.moved(relative[None], step[None, :6])[0]
@@ -182,6 +182,12 @@ class _Fit:
     weight: np.ndarray
     normal: np.ndarray
     gradient: np.ndarray
+
+    @property
+    def determined(self) -> bool:
+        """Whether the equations have one solution: where all depth is the same, a lens and a step ahead look alike."""
+        unit = 1.0 / np.sqrt(np.diag(self.normal))
+        return bool(np.linalg.eigvalsh(self.normal * np.outer(unit, unit))[0] > ROUNDING)
 
 
 def _fit(pair: DepthPair, intrinsics: np.ndarray, relative: np.ndarray, value: float) -> _Fit:
@@ -236,6 +242,8 @@ def change(numbers: np.ndarray, factors: list[tuple[float, float]]) -> Change | 
     return Change(float(values[most]), float(sigmas[most]), needed)
 
 
+ROUNDING = 1e-10
+"""Share of the largest possible eigenvalue, of equations scaled to a unit diagonal, that may be nothing."""
 _UNKNOWN = 0.0, float("inf")
 _NOTHING = Factors(_UNKNOWN, _UNKNOWN)
 
