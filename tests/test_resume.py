@@ -66,7 +66,7 @@ def run(monkeypatch: pytest.MonkeyPatch, checkpoints: Checkpoints | None = None,
         seen.extend(evidence)
         return judge(slam, evidence, *rest)
 
-    monkeypatch.setattr(reconstruction, "judge", judged)
+    monkeypatch.setattr(reconstruction, "judged_or_told", judged)
     given = {"frames": sequence(), "roles": ROLES, "settings": SETTINGS, "dense": "none", **options}
     return Run(reconstruct(**given, checkpoints=checkpoints), tuple(seen))
 
