@@ -142,6 +142,8 @@ def _options() -> argparse.Namespace:
     options = parser.parse_args()
     if options.truth and not (options.whole and len(options.clips) == 1):
         parser.error("--truth goes with --whole and one clip")
+    if (options.rgb_only or options.start or options.end) and not options.whole:
+        parser.error("--rgb-only, --start and --end go with --whole")
     return options
 
 

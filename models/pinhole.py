@@ -42,6 +42,21 @@ def project(points: np.ndarray, intrinsics: Intrinsics, nearest: float = 1e-3) -
     return pixels
 
 
+def epipolar_distance(
+    pixels_i: np.ndarray, pixels_j: np.ndarray, motion: np.ndarray, intrinsics: Intrinsics
+) -> np.ndarray:
+    """Of `pixels_j` [n, 2] from the lines of `pixels_i` under a motion i -> j, float64 [4, 4]; pixels, float64 [n].
+
+    Of square pixels. Zero where there is no line: a camera that has not moved contradicts no match.
+    """
+    essential = np.cross(motion[:3, 3], motion[:3, :3].T).T  # [t]x R: Hartley and Zisserman 2004, section 9.6
+    lines = rays(np.asarray(pixels_i, np.float64), intrinsics) @ essential.T
+    lever = np.linalg.norm(lines[:, :2], axis=1)
+    off = np.abs((lines * rays(np.asarray(pixels_j, np.float64), intrinsics)).sum(1))
+    focal = float(intrinsics[0])
+    return np.where(lever < 1e-9, 0.0, off / np.maximum(lever, 1e-12) * focal)
+
+
 def visible(
     points: np.ndarray, intrinsics: Intrinsics, shape: tuple[int, int], nearest: float = 0.1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

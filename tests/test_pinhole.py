@@ -71,3 +71,19 @@ def test_the_floating_type_is_kept() -> None:
     assert pinhole.project(points, np.array(INTRINSICS)).dtype == np.float32
     assert pinhole.grid_rays((2, 3), np.array(INTRINSICS), np.float32).dtype == np.float32
     assert pinhole.rays(np.array([[1, 2]]), INTRINSICS).dtype == np.float64
+
+
+def test_epipolar_distance_is_that_from_opencvs_lines() -> None:
+    # Proves the distance of matches from their epipolar lines, and that a camera that stays has none. Oracle: OpenCV.
+    rng = np.random.default_rng(4)
+    intrinsics, motion = np.array([310.0, 310.0, 160.0, 118.0]), np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix()
+    motion[:3, 3] = (0.3, -0.1, 0.2)
+    first, second = rng.uniform((0, 0), (320, 240), (2, 50, 2))
+    inverse, (x, y, z) = np.linalg.inv(pinhole.matrix(intrinsics)), motion[:3, 3]
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ motion[:3, :3]
+    lines = cv2.computeCorrespondEpilines(first.reshape(-1, 1, 2), 1, inverse.T @ essential @ inverse).reshape(-1, 3)
+    expected = np.abs((lines * np.column_stack([second, np.ones(50)])).sum(1))
+    np.testing.assert_allclose(pinhole.epipolar_distance(first, second, motion, intrinsics), expected, rtol=1e-4)
+    motion[:3, 3] = 0.0
+    assert not pinhole.epipolar_distance(first, second, motion, intrinsics).any()

@@ -16,7 +16,7 @@ from vggtgeo.models.classical.sample_order import SampleOrder, in_order
 from vggtgeo.models.classical.sift import SiftMatcher
 from vggtgeo.models.classical.structure_tensor import StructureTensor
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
-from vggtgeo.models.classical.two_view import TwoViewStart, epipolar_distance
+from vggtgeo.models.classical.two_view import TwoViewStart
 from vggtgeo.models.classical.verification import EpipolarVerifier
 
 __all__ = [
@@ -37,7 +37,6 @@ __all__ = [
     "StructureTensor",
     "TwoViewStart",
     "can_search",
-    "epipolar_distance",
     "in_order",
     "line_coefficients",
     "match_pixels",

@@ -66,7 +66,7 @@ class TwoViewStart:
     def _has_rival(self, pose: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> bool:
         """Whether a motion that a plane would have, and that goes elsewhere, explains nearly as many matches."""
         explained = lambda motion: np.count_nonzero(
-            epipolar_distance(pixels_i, pixels_j, motion, intrinsics) < self.threshold
+            pinhole.epipolar_distance(pixels_i, pixels_j, motion, intrinsics) < self.threshold
         )
         needed = self.rival * explained(pose)
         rivals = self._motions_of_a_plane(pixels_i, pixels_j, intrinsics)
@@ -124,16 +124,6 @@ class TwoViewStart:
         rotation = _rotation_between(rays_i, rays_j)
         off = np.arccos(np.clip(((rays_i @ rotation.T) * rays_j).sum(axis=1), -1.0, 1.0))
         return bool(np.median(off) * float(intrinsics[0]) < self.threshold)
-
-
-def epipolar_distance(
-    pixels_i: np.ndarray, pixels_j: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray
-) -> np.ndarray:
-    """Of `pixels_j` [n, 2] from the lines of `pixels_i` under a motion i -> j, float64 [4, 4]; pixels, float64 [n]."""
-    here, there = (pinhole.rays(np.asarray(pixels, np.float64), intrinsics) for pixels in (pixels_i, pixels_j))
-    lines = np.cross(motion[:3, 3], here @ motion[:3, :3].T)
-    lever = np.linalg.norm(lines[:, :2], axis=1)
-    return np.asarray(np.abs((lines * there).sum(1)) / np.maximum(lever, 1e-12) * float(intrinsics[0]))
 
 
 def _direction_between(first: np.ndarray, second: np.ndarray) -> float:

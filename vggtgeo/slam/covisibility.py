@@ -127,10 +127,5 @@ def _consistent(
     known = np.isfinite(inverse)
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
     off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)
-    seen = pinhole.rays(points.pixels_j, intrinsics)
-    normal = rigid.cross(relative[:3, 3], ray @ relative[:3, :3].T)
-    lever = np.linalg.norm(normal[:, :2], axis=1)
-    epipolar = np.abs((normal * seen).sum(1)) / np.maximum(lever, 1e-12) * float(intrinsics[0])
-    return np.where(
-        known, off < settings.matching.match_gate, (epipolar < settings.matching.epipolar_gate) | (lever < 1e-9)
-    )
+    epipolar = pinhole.epipolar_distance(points.pixels_i, points.pixels_j, relative, intrinsics)
+    return np.where(known, off < settings.matching.match_gate, epipolar < settings.matching.epipolar_gate)

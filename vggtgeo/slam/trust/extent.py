@@ -13,8 +13,8 @@ from vggtgeo.slam.trust.finding import Finding
 
 MOST_UNKNOWN = 0.55
 """Median standard deviation of the places, of their spread. Without depth, 240 frames of freiburg1/rpy, which turns
-within 10 cm, have 0.69 and are 3.4 cm off; icl-office, which moves as little but sideways, 0.43 and 0.5 cm;
-corridor-office and the rendered rooms 0.05."""
+within 10 cm, have 0.69 (0.28 before `SHARED_ERRORS`, times its root) and are 3.4 cm off; icl-office, which moves as
+little but sideways, 0.43 and 0.5 cm; corridor-office and the rendered rooms 0.05."""
 
 
 def check_extent(estimate: Estimate, sigma: np.ndarray | None) -> list[Finding]:

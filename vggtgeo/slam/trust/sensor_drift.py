@@ -26,6 +26,7 @@ from scipy.stats import t as student_t
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.gauge import NULL
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
@@ -187,7 +188,7 @@ class _Fit:
     def determined(self) -> bool:
         """Whether the equations have one solution: where all depth is the same, a lens and a step ahead look alike."""
         unit = 1.0 / np.sqrt(np.diag(self.normal))
-        return bool(np.linalg.eigvalsh(self.normal * np.outer(unit, unit))[0] > ROUNDING)
+        return bool(np.linalg.eigvalsh(self.normal * np.outer(unit, unit))[0] > NULL)
 
 
 def _fit(pair: DepthPair, intrinsics: np.ndarray, relative: np.ndarray, value: float) -> _Fit:
@@ -242,8 +243,6 @@ def change(numbers: np.ndarray, factors: list[tuple[float, float]]) -> Change | 
     return Change(float(values[most]), float(sigmas[most]), needed)
 
 
-ROUNDING = 1e-10
-"""Share of the largest possible eigenvalue, of equations scaled to a unit diagonal, that may be nothing."""
 _UNKNOWN = 0.0, float("inf")
 _NOTHING = Factors(_UNKNOWN, _UNKNOWN)
 
