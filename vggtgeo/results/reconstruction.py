@@ -31,7 +31,6 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import CompileAhead
 from vggtgeo.slam.first_pass import begin_with_found_camera
-from vggtgeo.slam.frame_refinement import can_refine, refine_frames
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.presets import Perception
@@ -141,8 +140,6 @@ def reconstruct(
         with loop.keeping(checkpoints, wanted) as keeper:
             tracked = loop.track(keeper)
             slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
-            if not interrupted:
-                slam = _frames_placed(slam, source, selection, perception.roles, settings, hooks, stop)
         began -= 0.0 if before is None else before.whole
         report = compare(slam, source.truth)
         known = {
@@ -319,27 +316,3 @@ def _adjust(
     except KeyboardInterrupt:
         hooks.each("on_message", "interrupted: keeping what there is, without the last adjustment")
         return tracked.slam, True
-
-
-def _frames_placed(
-    slam: Slam,
-    source: Source,
-    selection: tuple[int, int | None, int],
-    roles: Roles,
-    settings: SlamSettings,
-    hooks: RunCallbacks,
-    stop: Interruption,
-) -> Slam:
-    """The state with its frames placed against the finished map, where they can be read once more."""
-    if not (settings.refinement.frames and can_refine(slam, roles) and source.comes_again(selection)):
-        return slam
-    hooks.each("on_stage", "frames against the map")
-    start, end, stride = selection
-    try:
-        with stop.at_once(), warnings.catch_warnings(), hooks.clock.measure("place frames"):
-            warnings.simplefilter("ignore", InputWarning)  # what is wrong with a frame was told when the run came to it
-            return refine_frames(slam, source.frames.frames(start, end, stride), source.camera, roles)
-    except (KeyboardInterrupt, InputError) as error:  # files may go while a run goes on
-        why = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
-        hooks.each("on_message", f"{why}: frames between keyframes stay as they were tracked")
-        return slam

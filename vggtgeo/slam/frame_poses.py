@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.frame_refinement import by_both
 from vggtgeo.slam.state import FramePose, Slam
 
 
@@ -12,8 +13,9 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known.
 
     A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and the
-    next is shared out over the frames in between, in proportion to time, so that the path has no steps. The frame that
-    a keyframe was made of has the keyframe's pose, whether it was tracked there (`arrival`) or began a piece of map.
+    next is shared out over the frames in between, in proportion to time, so that the path has no steps. What a second
+    keyframe says of a frame is averaged with that (`frame_refinement.py`). The frame that a keyframe was made of has
+    the keyframe's pose, whether it was tracked there (`arrival`) or began a piece of map.
     """
     poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
     times = np.array([record.timestamp for record in slam.frames])
@@ -29,7 +31,7 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             for k in between:
                 poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
         last = row
-    return times, poses
+    return times, by_both(slam, poses)
 
 
 def _made_its_keyframe(record: FramePose) -> bool:

@@ -1,185 +1,122 @@
-"""Frames between keyframes, once the map is done: each against two keyframes of it, no longer one alone.
+"""Frames between keyframes: each against two of them, the one that it was tracked against and the one that comes next.
 
-While a run goes on, a frame is placed against one keyframe and follows when that one is adjusted. Its error is that of
-one alignment, and jumps where the next keyframe takes over. So each frame is read once more and aligned to the other
-keyframe that stands nearest, from where it was carried to. What was tracked and what this says are averaged by
-information: each with the error that no sample removes, which grows with the way from its keyframe
-(`fusion.with_systematic`), so that the path passes smoothly from one keyframe to the next. Keyframes stay.
-
-ATE, all frames, cm: icl-office 0.131 -> 0.100, corridor-office 1.068 -> 1.062 (three frames in five are keyframes);
-redkitchen from frame to frame, against COLMAP, 0.36 -> 0.33. It takes 11 ms a frame on two cores, reading counted in.
+A frame that hangs on one keyframe has the error of one alignment, and its path jumps where the next takes over. So the
+last frames before that moment are aligned to the next keyframe as well, while their pictures are at hand. Both motions
+stay as they were measured; the pose of the frame is their mean by information, each with the error that no sample
+removes, which grows with the way from its keyframe (`fusion.with_systematic`), so that the path passes smoothly from
+one keyframe to the next, wherever adjustments move them. Keyframes stay.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from itertools import islice
+from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.camera import Camera, Undistorter
 from vggtgeo.models.classical import SensorDepth
-from vggtgeo.models.rigid_motion import exponential
-from vggtgeo.slam.connected import piece_of
-from vggtgeo.slam.evidence import LEAST_CORRELATION, LEAST_OVERLAP, LEAST_SURFACE, tangent
-from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.evidence import LEAST_CORRELATION, LEAST_OVERLAP, LEAST_SURFACE
 from vggtgeo.slam.fusion import AGREEMENT_GATE, with_systematic
-from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.map_points import in_view
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.relocalisation import view_of
 from vggtgeo.slam.rgbd_alignment import Aligned, RgbdAlignment
-from vggtgeo.slam.rgbd_view import RgbdView
-from vggtgeo.slam.settings import Roles
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.rgbd_view import RgbdView, Samples
+from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.state import SecondMotion, Slam
 from vggtgeo.slam.threads import map_in_threads
 
-NEAREST = 1
-"""Keyframes besides the one that the frame was tracked against; with two, icl-office is at 0.090 cm, and all takes half
-as long again."""
 FINEST = (4, 0, 0)
-"""Iterations by level, the finest first: a frame begins within a millimetre of where it ends."""
-AT_ONCE, KEPT = 16, 24
-"""Frames (as many are read ahead) and views of keyframes in memory."""
+"""Iterations by level, the finest first: a frame begins within millimetres of where it ends."""
+MOST = 32
+"""Frames whose pictures wait for the next keyframe, 1.5 MB each. Where one keyframe serves for longer, an earlier one
+takes its part."""
+NOTHING = 1e-9
+"""Information, 1/m^2 and 1/rad^2, that is none: an inverse exists with it."""
 
 
-def can_refine(slam: Slam, roles: Roles) -> bool:
-    """Whether frames have what an alignment needs: a sensor's depth."""
-    sensor = isinstance(roles.depth, SensorDepth)
-    return sensor and roles.alignment is not None and slam.metric and len(slam.keyframes) > 1
+def with_view(slam: Slam, view: RgbdView | None, roles: Roles, settings: SlamSettings) -> Slam:
+    """The state with the view of its last frame, which waits for the next keyframe; not for long."""
+    measured = settings.refinement.frames and isinstance(roles.depth, SensorDepth) and roles.alignment is not None
+    if view is None or not (measured and slam.metric):
+        return slam
+    slam = replace(slam, between=(*slam.between, (len(slam.frames) - 1, _as_target(view))))
+    return against_nearest(slam, roles) if len(slam.between) == MOST else slam
 
 
-@in_double_precision
-def refine_frames(slam: Slam, frames: Iterable[Frame], camera: Camera, roles: Roles) -> Slam:
-    """The state with its frames, but for the keyframes, placed against the finished map.
-
-    slam: after the last adjustment, and `can_refine`. frames: those of the run, as they are read, in any order; one
-    that does not come stays where it is. camera: of `frames`.
+def against_reference(slam: Slam) -> Slam:
+    """The state after the keyframe that frames are tracked against has changed: frames that waited for it are aligned
+    to it.
     """
-    slam = _carried(slam)
-    undistorter = (slam.lens or camera).undistorter()
-    row_of = _rows(slam)
-    views = _KeyframeViews(slam, roles)
-    found = list(slam.frames)
-    coming = ((row_of[frame.index], frame) for frame in frames if frame.index in row_of)
-    some_more = lambda: list(islice(coming, AT_ONCE))
-    with ThreadPoolExecutor(1, thread_name_prefix="read again") as reader:
-        ahead = reader.submit(some_more)
-        while some := ahead.result():
-            ahead = reader.submit(some_more)
-            near = [views.near(slam.frames[row]) for row, _ in some]
-            at_hand = views.of({keyframe.number for group in near for keyframe in group})
-            placing = _Placing(slam, undistorter, roles, at_hand)
-            items = [(row, frame, group) for (row, frame), group in zip(some, near, strict=True)]
-            records = map_in_threads(placing.of, items)
-            for (row, _), record in zip(some, records, strict=True):
-                found[row] = record
-    return replace(slam, frames=tuple(found))
+    return replace(slam, between=()) if slam.reference is None else _against(slam, *slam.reference)
 
 
-def _carried(slam: Slam) -> Slam:
-    """The same poses, each said by its keyframe alone: nothing is left to be shared out between keyframes."""
-    poses = frame_poses(slam)[1]
-    relative = lambda record, pose: rigid.orthonormal(pose @ rigid.invert(slam.keyframes[record.reference].pose))
-    frames = (
-        replace(record, relative=relative(record, pose), arrival=None)
-        for record, pose in zip(slam.frames, poses, strict=True)
-    )
-    return replace(slam, frames=tuple(frames))
+def against_nearest(slam: Slam, roles: Roles) -> Slam:
+    """The state after no other keyframe has come for long, or will: frames that wait are aligned to the nearest one
+    that they were not tracked against.
+    """
+    if not slam.between:
+        return slam
+    last = slam.frames[slam.between[-1][0]]
+    near = in_view(slam.keyframes[slam.origins[-1] :], slam.pose(last), last.reference)
+    return _against(slam, near[0].number, view_of(near[0], slam, roles)) if near else replace(slam, between=())
 
 
-def _rows(slam: Slam) -> dict[int, int]:
-    """Places in `slam.frames` of the frames that have a pose and are no keyframe, by the number of the frame."""
-    keyframes = {keyframe.frame for keyframe in slam.keyframes if keyframe.recorded is None}
-    rows = enumerate(slam.frames)
-    return {record.frame: row for row, record in rows if record.tracked and record.frame not in keyframes}
+def _against(slam: Slam, number: int, source: RgbdView | None) -> Slam:
+    """The state with the frames that waited placed by one keyframe, as far as they were tracked against another."""
+    keyframe = slam.keyframes[number]
 
-
-class _KeyframeViews:
-    """Keyframes near a frame, and what the alignment needs of them, made when it is asked for and kept for a while."""
-
-    def __init__(self, slam: Slam, roles: Roles) -> None:
-        self._slam, self._roles = slam, roles
-        label = piece_of(slam)
-        self._piece: dict[int, list[Keyframe]] = {}
-        for keyframe in slam.keyframes:
-            self._piece.setdefault(int(label[keyframe.number]), []).append(keyframe)
-        self._label = label
-        self._kept: OrderedDict[int, RgbdView | None] = OrderedDict()
-
-    def near(self, record: FramePose) -> Sequence[Keyframe]:
-        """The nearest of the frame's own piece of map, without the one it was tracked against."""
-        piece = self._piece[int(self._label[record.reference])]
-        return in_view(piece, self._slam.pose(record), record.reference)[:NEAREST]
-
-    def of(self, numbers: set[int]) -> dict[int, RgbdView | None]:
-        """Their views, and those of others that are still at hand."""
-        new = sorted(numbers - self._kept.keys())
-        made = map_in_threads(lambda number: view_of(self._slam.keyframes[number], self._slam, self._roles), new)
-        self._kept.update(zip(new, made, strict=True))
-        for number in numbers:
-            self._kept.move_to_end(number)
-        while len(self._kept) > max(KEPT, len(numbers)):
-            self._kept.popitem(last=False)
-        return dict(self._kept)
-
-
-@dataclass(frozen=True, eq=False)
-class _Placing:
-    """Places single frames of a state. views: of the keyframes by number."""
-
-    slam: Slam
-    undistorter: Undistorter
-    roles: Roles
-    views: Mapping[int, RgbdView | None]
-
-    def of(self, item: tuple[int, Frame, Sequence[Keyframe]]) -> FramePose:
-        """The record of a frame, given its row, with the mean, by information, of its pose as tracked and as aligned to
-        the keyframes near it.
-        """
-        row, frame, near = item
-        record, view = self.slam.frames[row], self._view(frame)
-        if view is None:
-            return record
-        pose, information = self.slam.pose(record), _tracked_information(record)
-        total, pull = information.copy(), np.zeros(6)
-        for keyframe, found in _aligned(view, pose, near, self.views):
-            own = with_systematic(found.information, found.motion)
-            off = tangent(found.motion @ keyframe.pose @ rigid.invert(pose))
-            if _agree(off, information, own):
-                total += own
-                pull += own @ off
-        if not pull.any():
-            return record
-        moved = exponential(np.linalg.solve(total, pull)) @ pose
-        relative = moved @ rigid.invert(self.slam.keyframes[record.reference].pose)
-        return replace(record, relative=rigid.orthonormal(relative))
-
-    def _view(self, frame: Frame) -> RgbdView | None:
-        """The frame as it is aligned, None without depth."""
-        if frame.depth is None:
+    def second(item: tuple[int, RgbdView]) -> SecondMotion | None:
+        record, view = slam.frames[item[0]], item[1]
+        if source is None or record.reference == number:
             return None
-        depth = self.undistorter.depth(frame.depth)
-        if self.roles.still_parts is not None:
-            depth = self.roles.still_parts.without_depth(depth)
-        image = self.undistorter.image(frame.image)
-        return RgbdView.of(image, self.roles.tracking_depth(depth), self.slam.intrinsics)
+        found = RgbdAlignment(FINEST).align(source, view, slam.pose(record) @ rigid.invert(keyframe.pose))
+        if found is None or not _shows(found):
+            return None
+        return SecondMotion(number, rigid.orthonormal(found.motion), with_systematic(found.information, found.motion))
+
+    frames = list(slam.frames)
+    for (row, _), motion in zip(slam.between, map_in_threads(second, slam.between), strict=True):
+        frames[row] = replace(frames[row], second=motion)
+    return replace(slam, frames=tuple(frames), between=())
 
 
-def _aligned(
-    view: RgbdView, pose: np.ndarray, near: Sequence[Keyframe], views: Mapping[int, RgbdView | None]
-) -> Iterator[tuple[Keyframe, Aligned]]:
-    """The alignments with keyframes that show the frame beyond doubt."""
-    for keyframe in near:
-        source, start = views[keyframe.number], pose @ rigid.invert(keyframe.pose)
-        found = None if source is None else RgbdAlignment(FINEST).align(source, view, start)
-        if found is not None and _shows(found):
-            yield keyframe, found
+def by_both(slam: Slam, poses: np.ndarray) -> np.ndarray:
+    """World -> camera of all frames [n, 4, 4], given what each is by the keyframe that it was tracked against: the mean
+    with what the second motion says, where they agree.
+    """
+    rows = [row for row, record in enumerate(slam.frames) if record.second is not None]
+    if not rows:
+        return poses
+    records = [slam.frames[row] for row in rows]
+    seconds = [record.second for record in records if record.second is not None]
+    placed = np.array([second.relative @ slam.keyframes[second.keyframe].pose for second in seconds])
+    own = np.array(
+        [_tracked_information(record.evidence.sigma_translation, record.evidence.sigma_rotation) for record in records]
+    )
+    other = np.array([second.information for second in seconds])
+    apart = placed @ rigid.invert(poses[rows])
+    off = np.concatenate([apart[:, :3, 3], Rotation.from_matrix(apart[:, :3, :3]).as_rotvec()], 1)
+    share = np.linalg.solve(own + other, np.einsum("nij,nj->ni", other, off)[..., None])[..., 0]
+    agreeing = squared_distance(off, own, other) < AGREEMENT_GATE
+    found = poses.copy()
+    found[rows] = np.where(agreeing[:, None, None], rigid.moved(poses[rows], share), poses[rows])
+    return found
+
+
+def squared_distance(off: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Mahalanobis distances [n], squared, of poses `off` [n, 6] apart, in the noise of both, given their information
+    [n, 6, 6]. A contradiction is left to the tracking, which had more witnesses.
+    """
+    none = NOTHING * np.eye(6)
+    noise = np.linalg.inv(first + none) + np.linalg.inv(second + none)
+    return np.asarray(np.einsum("ni,ni->n", off, np.linalg.solve(noise, off[..., None])[..., 0]))
+
+
+def _as_target(view: RgbdView) -> RgbdView:
+    """What the finest level of an alignment needs of its target, half of the view's memory."""
+    none, empty = np.zeros((3, 0), np.float32), np.zeros(0, np.float32)
+    return replace(view, levels=view.levels[:1], samples=Samples(none, none, empty), edges=none, edge_values=(empty,))
 
 
 def _shows(found: Aligned) -> bool:
@@ -188,16 +125,7 @@ def _shows(found: Aligned) -> bool:
     return bool(found.correlation >= LEAST_CORRELATION and found.overlap >= LEAST_OVERLAP and surface)
 
 
-def _tracked_information(record: FramePose) -> np.ndarray:
+def _tracked_information(sigma_translation: float, sigma_rotation: float) -> np.ndarray:
     """Of the tracked pose, by what it was known to in its worst directions."""
-    sigma = [record.evidence.sigma_translation, record.evidence.sigma_rotation]
+    sigma = np.array([sigma_translation, sigma_rotation])
     return np.diag(1 / np.repeat(np.maximum(sigma, 1e-6), 3) ** 2) if np.isfinite(sigma).all() else np.zeros((6, 6))
-
-
-def _agree(off: np.ndarray, first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether two poses, `off` [6] apart, differ by no more than both may be off. A contradiction is left to the
-    tracking, which had more witnesses.
-    """
-    tiny = 1e-9 * np.eye(6)
-    noise = np.linalg.inv(first + tiny) + np.linalg.inv(second + tiny)
-    return bool(off @ np.linalg.solve(noise, off) < AGREEMENT_GATE)

@@ -36,16 +36,19 @@ def is_due(slam: Slam) -> bool:
 
 
 def settled(slam: Slam) -> Slam:
-    """The state with the window that was pending; waits for it. What tracking has noted since is kept."""
+    """The state with the window that was pending; waits for it. What tracking has noted since is kept, and what the
+    other thread has found of the frames before.
+    """
     if slam.pending is None:
         return slam
     begun, found = slam.pending.begun, slam.pending.result.result()
     return replace(
         found,
-        frames=slam.frames,
+        frames=(*found.frames, *slam.frames[len(found.frames) :]),
         velocity=slam.velocity,
         reference=slam.reference,
         waiting=slam.waiting,
+        between=slam.between,
         lost=slam.lost,
         factors=(*found.factors, *slam.factors[len(begun.factors) :]),
         notes=(*found.notes, *slam.notes[len(begun.notes) :]),

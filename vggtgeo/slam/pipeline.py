@@ -16,6 +16,7 @@ from vggtgeo.slam.covisibility import without_matches
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.frame_refinement import against_reference, with_view
 from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pending_window import begin_window, is_due, settled
@@ -188,7 +189,8 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
             slam = slam if settings.keyframes.localise_only else tied
     if settings.keyframes.localise_only or not _needs_keyframe(found, settings):
         slam = _refer_to(slam, found.keyframe, roles)
-        return replace(slam, frames=(*slam.frames, record_of(frame, found)))
+        slam = replace(slam, frames=(*slam.frames, record_of(frame, found)))
+        return with_view(slam, sight.view, roles, settings)
     number = len(slam.keyframes)
     with clock.measure("keyframe"):
         keyframe = make_keyframe(
@@ -218,6 +220,8 @@ def _mapped(
             entered = enter(slam, keyframe, roles, settings, tied_to=tied_to)
             entered = _with_pair(replace(entered, factors=(*slam.factors, tie), reference=reference), tie)
             entered = constrain_rotation(entered, settings)
+        with clock.measure("place frames" + own):
+            entered = against_reference(entered)
         with clock.measure("adjust window" + own):
             return adjust(entered, settings)
 
@@ -228,6 +232,7 @@ def _mapped(
             window=(*slam.window, keyframe.number),
             factors=(*slam.factors, tie),
             reference=reference,
+            between=(),
         )
         return begin_window(begun, lambda: adjusted(" (own thread)"))
     slam = adjusted("")
@@ -245,7 +250,7 @@ def _with_pair(slam: Slam, tie: MeasuredRelativePose) -> Slam:
 def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
     if slam.reference is not None and slam.reference[0] == keyframe.number:
         return slam
-    return replace(slam, reference=(keyframe.number, view_of(keyframe, slam, roles)))
+    return against_reference(replace(slam, reference=(keyframe.number, view_of(keyframe, slam, roles))))
 
 
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:

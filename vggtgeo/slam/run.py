@@ -26,6 +26,7 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.description import Description
 from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.frame_refinement import against_nearest
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.loops import close_loops
@@ -146,6 +147,8 @@ def finish(
     if fixed or len(slam.keyframes) < 3:
         return slam
     clock = clock or Clock()
+    with clock.measure("place frames"):
+        slam = against_nearest(slam, roles)
     with clock.measure("loops"):
         slam = close_loops(slam, roles, settings)
     with clock.measure("global adjustment"):

@@ -242,6 +242,6 @@ class RefinementSettings(CheckedSettings):
     rolling_shutter: bool = switch(True)
     """Find how long the camera takes to read an image out, row by row, and take that out of the map."""
     frames: bool = switch(True)
-    """Place every frame with depth once more, against the finished map; not of frames that come once."""
+    """Place frames with a sensor's depth by the next keyframe, too."""
     loop_candidates: int = whole(3, at_least=0)
     """Pairs that each keyframe may propose in the search for places seen before."""

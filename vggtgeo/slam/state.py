@@ -21,6 +21,17 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 
 @dataclass(frozen=True, eq=False)
+class SecondMotion:
+    """From a second keyframe to a frame, see `frame_refinement.py`. relative: float64 [4, 4], camera -> camera.
+    information: float64 [6, 6] over its left tangent, translation first, of the error that no sample removes, too.
+    """
+
+    keyframe: int
+    relative: np.ndarray
+    information: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class FramePose:
     """Pose of one frame relative to a keyframe, so that it follows when the keyframe is adjusted.
 
@@ -38,6 +49,7 @@ class FramePose:
     arrival: tuple[int, np.ndarray] | None = None
     """Of a frame that became a keyframe: the earlier keyframe it was tracked against, and its pose relative to that
     one as tracked, before any adjustment."""
+    second: SecondMotion | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +114,8 @@ class Slam:
     in: windows hold them, and the last adjustment estimates the camera once more. focal_wanted: the focal lengths that
     the last adjustment of a given camera without measured depth finds if they are free, float64 [2], pixels; None where
     they explain matches no better than chance. readout: of the rolling shutter that the last adjustment found and took
-    out of the poses (`rolling_shutter.py`); pixels and images stay as they were read.
+    out of the poses (`rolling_shutter.py`); pixels and images stay as they were read. between: rows of the last frames,
+    and their views, that wait for the next keyframe (`frame_refinement.py`).
     """
 
     intrinsics: np.ndarray
@@ -132,6 +145,7 @@ class Slam:
     camera_found: bool = False
     focal_wanted: np.ndarray | None = None
     readout: Readout | None = None
+    between: tuple[tuple[int, RgbdView], ...] = ()
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)

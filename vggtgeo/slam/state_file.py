@@ -40,13 +40,25 @@ from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.keyframe_images import CompressedImage, KeyframeImages
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import Gray, RgbdView, Samples, Surface
-from vggtgeo.slam.state import FramePose, PendingWindow, Readout, Slam, Waiting
+from vggtgeo.slam.state import FramePose, PendingWindow, Readout, SecondMotion, Slam, Waiting
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(Slam, Camera, PendingWindow, FramePose, Waiting, Evidence, Keyframe, Slots, KeyframeImages, CompressedImage),
+    *(
+        Slam,
+        Camera,
+        PendingWindow,
+        FramePose,
+        SecondMotion,
+        Waiting,
+        Evidence,
+        Keyframe,
+        Slots,
+        KeyframeImages,
+        CompressedImage,
+    ),
     *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
     *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, WindowPrior, MarginalPrior, Readout),
     *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
@@ -54,7 +66,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 7
+VERSION = 8
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -93,6 +105,13 @@ def _with_readout(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
+def _with_second_motions(header: Header) -> Header:
+    """Version 7 placed frames against a second keyframe when a map was done."""
+    tree, classes = with_field(header["tree"], header["classes"], "FramePose", "second")
+    tree, classes = with_field(tree, classes, "Slam", "between", [])
+    return {**header, "tree": tree, "classes": classes}
+
+
 UPGRADES = {
     1: _with_recorded_times,
     2: _with_lens,
@@ -100,6 +119,7 @@ UPGRADES = {
     4: _with_focal_wanted,
     5: _with_enlargement,
     6: _with_readout,
+    7: _with_second_motions,
 }
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)
