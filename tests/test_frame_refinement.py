@@ -1,4 +1,4 @@
-"""Frames between keyframes, placed against the finished map; oracle: the true motions of a rendered room."""
+"""Frames between keyframes, placed by the next keyframe, too; oracle: the true motions of a rendered room."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.frame_refinement import _agree, refine_frames
-from vggtgeo.slam.settings import Roles
+from vggtgeo.slam.frame_refinement import MOST, against_nearest, against_reference, squared_distance, with_view
+from vggtgeo.slam.fusion import AGREEMENT_GATE
+from vggtgeo.slam.rgbd_view import RgbdView
+from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
 AWAY = np.array([0.006, -0.005, 0.004, 0.002, -0.003, 0.001])
@@ -30,9 +32,20 @@ def between(slam: Slam) -> list[int]:
     return [row for row, record in enumerate(slam.frames) if record.frame not in frames]
 
 
-def moved(slam: Slam, away: np.ndarray, sigma: float) -> Slam:
-    """The state with its frames between keyframes off by `away`, and said to be known to `sigma` metres."""
-    rows, frames = between(slam), list(slam.frames)
+def waiting(run: RecordedRun, slam: Slam, rows: list[int]) -> Slam:
+    """The state with these frames waiting for a keyframe, and not placed by any so far."""
+    frames = tuple(replace(record, second=None) for record in slam.frames)
+    return replace(slam, frames=frames, between=tuple((row, view(run, slam, row)) for row in rows))
+
+
+def view(run: RecordedRun, slam: Slam, row: int) -> RgbdView:
+    frame = run.frames[slam.frames[row].frame]
+    return RgbdView.of(frame.image, Roles().tracking_depth(frame.depth), slam.intrinsics)
+
+
+def moved(slam: Slam, rows: list[int], away: np.ndarray, sigma: float) -> Slam:
+    """The state with some frames off by `away`, every second one to the other side, and said to be known to `sigma`."""
+    frames = list(slam.frames)
     for number, row in enumerate(rows):
         record, sign = frames[row], (-1) ** number
         evidence = replace(record.evidence, sigma_translation=sigma, sigma_rotation=sigma / 2)
@@ -40,53 +53,78 @@ def moved(slam: Slam, away: np.ndarray, sigma: float) -> Slam:
     return replace(slam, frames=tuple(frames))
 
 
-def off(run: RecordedRun, slam: Slam) -> np.ndarray:
-    """Metres by which the camera of each frame between keyframes is off, seen from its keyframe."""
-    errors = []
-    for row in between(slam):
-        record = slam.frames[row]
-        keyframe = slam.keyframes[record.reference].frame
-        true = run.sequence.pose(record.frame) @ rigid.invert(run.sequence.pose(keyframe))
-        errors.append(np.linalg.norm(rigid.centre(record.relative) - rigid.centre(true)))
+def off(run: RecordedRun, slam: Slam, rows: list[int]) -> np.ndarray:
+    """Metres by which the camera of each frame is off, seen from its keyframe."""
+    poses, errors = frame_poses(slam)[1], []
+    for row in rows:
+        keyframe = slam.keyframes[slam.frames[row].reference]
+        relative = poses[row] @ rigid.invert(keyframe.pose)
+        true = run.sequence.pose(slam.frames[row].frame) @ rigid.invert(run.sequence.pose(keyframe.frame))
+        errors.append(np.linalg.norm(rigid.centre(relative) - rigid.centre(true)))
     return np.array(errors)
 
 
 def test_frames_that_stand_aside_come_back(run: RecordedRun) -> None:
-    """Frames 9 mm aside, every second one to the other side, are brought back to less than half of that, and keyframes
-    are left alone; oracle: the renderer's poses.
+    """Frames 9 mm aside are brought back to less than half of that by the next keyframe, and keyframes are left alone;
+    oracle: the renderer's poses.
     """
-    wrong = moved(run.slam, AWAY, 0.02)
-    found = refine_frames(wrong, run.sequence.frames(), run.sequence.camera, Roles())
-    before, after = off(run, wrong), off(run, found)
+    slam, number = run.slam, run.slam.reference[0]
+    rows = [row for row in between(run.slam) if run.slam.frames[row].reference == number - 1]
+    wrong = moved(waiting(run, slam, rows), rows, AWAY, 0.02)
+    found = against_reference(wrong)
+    before, after = off(run, wrong, rows), off(run, found, rows)
     assert len(before)
     assert before.min() > 0.005
     assert after.max() < 0.5 * before.max(), (before, after)
-    keyframes = sorted({*range(len(wrong.frames))} - {*between(wrong)})
-    for row in keyframes:
-        np.testing.assert_allclose(found.pose(found.frames[row]), wrong.pose(wrong.frames[row]), atol=1e-12)
+    others = sorted({*range(len(slam.frames))} - {*between(slam)})
+    np.testing.assert_allclose(frame_poses(found)[1][others], frame_poses(wrong)[1][others], atol=1e-12)
+    assert not found.between
 
 
-def test_poses_that_contradict_each_other_are_told_by_what_both_know() -> None:
-    """Two poses agree up to the chi-square quantile of 0.9999 of their distance, in the noise of both together; one of
-    which nothing is known agrees with any. Oracle: the quantile, 27.86 with six degrees of freedom.
+def test_a_run_places_its_frames_by_the_keyframe_after_them(run: RecordedRun) -> None:
+    """All frames that a later keyframe follows were placed by it; oracle: the order of the run."""
+    placed = [row for row in between(run.slam) if run.slam.frames[row].reference < run.slam.reference[0]]
+    assert placed
+    for row in placed:
+        record = run.slam.frames[row]
+        assert record.second is not None
+        assert record.second.keyframe == record.reference + 1
+
+
+def test_frames_that_no_keyframe_follows_are_placed_by_an_earlier_one(run: RecordedRun) -> None:
+    """Frames of the newest keyframe are placed by the one before it, in which they stand aside; oracle: true poses."""
+    slam, number = run.slam, run.slam.reference[0]
+    row = between(slam)[-1]
+    own = replace(slam.frames[row], reference=number, relative=np.eye(4))
+    true = run.sequence.pose(own.frame) @ rigid.invert(run.sequence.pose(slam.keyframes[number].frame))
+    frames = (*slam.frames[:row], replace(own, relative=true), *slam.frames[row + 1 :])
+    wrong = moved(waiting(run, replace(slam, frames=frames), [row]), [row], AWAY, 0.02)
+    found = against_nearest(wrong, Roles())
+    assert found.frames[row].second.keyframe != number
+    assert off(run, found, [row])[0] < 0.6 * off(run, wrong, [row])[0]
+
+
+def test_pictures_do_not_wait_for_long(run: RecordedRun) -> None:
+    """The picture that would be one too many is the last that waits: all of them are placed; oracle: the count."""
+    slam, row = run.slam, between(run.slam)[-1]
+    slam = waiting(run, replace(slam, frames=slam.frames[: row + 1]), [row] * (MOST - 1))
+    seen = slam.between[0][1]
+    assert len(with_view(replace(slam, between=slam.between[1:]), seen, Roles(), SlamSettings()).between) == MOST - 1
+    assert not with_view(slam, seen, Roles(), SlamSettings()).between
+    free = replace(slam, metric=False)
+    assert len(with_view(free, seen, Roles(), SlamSettings()).between) == MOST - 1, "lengths of a map without unit"
+
+
+def test_poses_that_contradict_each_other_are_told_by_what_both_know(run: RecordedRun) -> None:
+    """The squared distance of two poses is that in the noise of both together, and nothing contradicts one of which
+    nothing is known. Oracle: the distance as it was made; a frame that contradicts its second motion stays.
     """
-    first, second = np.eye(6) / 0.003**2, np.eye(6) / 0.004**2  # together 5 mm
-    for squared, agree in ((27.0, True), (29.0, False)):
-        off = np.array([1.0, -1, 0, 0, 1, 0]) / np.sqrt(3) * 0.005 * np.sqrt(squared)
-        assert _agree(off, first, second) is agree
-        assert _agree(100 * off, np.zeros((6, 6)), second)
-
-
-def test_frames_that_do_not_come_again_are_carried_along_as_before(run: RecordedRun) -> None:
-    """Without frames, or with frames without depth, the path is the one that keyframes carry along; oracle: that path,
-    whose frames here share out a change of 10 cm that an adjustment made.
-    """
-    slam = run.slam
-    rows = [row for row, record in enumerate(slam.frames) if record.arrival is not None]
-    reference, tracked = slam.frames[rows[0]].arrival
-    shifted = replace(slam.frames[rows[0]], arrival=(reference, exponential(np.full(6, 0.05)) @ tracked))
-    slam = replace(slam, frames=(*slam.frames[: rows[0]], shifted, *slam.frames[rows[0] + 1 :]))
-    frames = [replace(frame, depth=None) for frame in run.sequence.frames()]
-    for given in ([], frames):
-        found = refine_frames(slam, given, run.sequence.camera, Roles())
-        np.testing.assert_allclose(frame_poses(found)[1], frame_poses(slam)[1], atol=1e-9)
+    first, second = np.eye(6)[None] / 0.003**2, np.eye(6)[None] / 0.004**2  # together 5 mm
+    away = (np.array([1.0, -1, 0, 0, 1, 0]) / np.sqrt(3) * 0.005 * np.sqrt(29.0))[None]
+    assert squared_distance(away, first, second) == pytest.approx(29.0)
+    assert squared_distance(100 * away, np.zeros((1, 6, 6)), second) < 1.0
+    assert pytest.approx(27.86, abs=0.01) == AGREEMENT_GATE
+    rows = [row for row, record in enumerate(run.slam.frames) if record.second is not None]
+    contradicted = moved(run.slam, rows, 100 * AWAY, 0.001)
+    alone = replace(contradicted, frames=tuple(replace(record, second=None) for record in contradicted.frames))
+    np.testing.assert_allclose(frame_poses(contradicted)[1], frame_poses(alone)[1], atol=1e-12)

@@ -105,7 +105,7 @@ def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: P
         place = [name for name, _ in header["classes"]].index("Keyframe")
         header["version"] = 1
         header["classes"][place][1].remove("recorded")
-        for later in ("readout", "focal_wanted", "camera_found", "lens"):  # of versions 7, 5, 4 and 3
+        for later in ("between", "readout", "focal_wanted", "camera_found", "lens"):  # of versions 8, 7, 5, 4 and 3
             assert header["classes"][header["tree"]["c"]][1].pop() == later
             header["tree"]["v"].pop()
         for keyframe in header["tree"]["v"][4]:

@@ -21,15 +21,15 @@ from vggtgeo.slam.fusion import AGREEMENT_GATE, with_systematic
 from vggtgeo.slam.map_points import in_view
 from vggtgeo.slam.relocalisation import view_of
 from vggtgeo.slam.rgbd_alignment import Aligned, RgbdAlignment
-from vggtgeo.slam.rgbd_view import RgbdView, Samples
+from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import SecondMotion, Slam
 from vggtgeo.slam.threads import map_in_threads
 
 FINEST = (4, 0, 0)
 """Iterations by level, the finest first: a frame begins within millimetres of where it ends."""
-MOST = 32
-"""Frames whose pictures wait for the next keyframe, 1.5 MB each. Where one keyframe serves for longer, an earlier one
+MOST = 16
+"""Frames whose pictures wait for the next keyframe, 2 MB each. Where one keyframe serves for longer, an earlier one
 takes its part."""
 NOTHING = 1e-9
 """Information, 1/m^2 and 1/rad^2, that is none: an inverse exists with it."""
@@ -40,7 +40,7 @@ def with_view(slam: Slam, view: RgbdView | None, roles: Roles, settings: SlamSet
     measured = settings.refinement.frames and isinstance(roles.depth, SensorDepth) and roles.alignment is not None
     if view is None or not (measured and slam.metric):
         return slam
-    slam = replace(slam, between=(*slam.between, (len(slam.frames) - 1, _as_target(view))))
+    slam = replace(slam, between=(*slam.between, (len(slam.frames) - 1, view)))
     return against_nearest(slam, roles) if len(slam.between) == MOST else slam
 
 
@@ -111,12 +111,6 @@ def squared_distance(off: np.ndarray, first: np.ndarray, second: np.ndarray) -> 
     none = NOTHING * np.eye(6)
     noise = np.linalg.inv(first + none) + np.linalg.inv(second + none)
     return np.asarray(np.einsum("ni,ni->n", off, np.linalg.solve(noise, off[..., None])[..., 0]))
-
-
-def _as_target(view: RgbdView) -> RgbdView:
-    """What the finest level of an alignment needs of its target, half of the view's memory."""
-    none, empty = np.zeros((3, 0), np.float32), np.zeros(0, np.float32)
-    return replace(view, levels=view.levels[:1], samples=Samples(none, none, empty), edges=none, edge_values=(empty,))
 
 
 def _shows(found: Aligned) -> bool:

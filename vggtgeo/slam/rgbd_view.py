@@ -21,74 +21,84 @@ EDGE_CELL = 4
 """One brightness sample, the one with the strongest gradient, is taken of each such cell, shrunk pixels a side."""
 FAINT = 1.5
 """Grey levels a pixel; a weaker gradient is noise of the image."""
-MOST_POINTS = 2400
-"""Surface points of the source that take part; more cost time and change nothing, for they share their errors."""
+MOST_POINTS, MOST_EDGES = 2400, 3600
+"""Surface and edge points of the source that take part; more cost time and change nothing: they share their errors."""
+
+
+PIXELS_AT_ONCE, CELLS_AT_ONCE = 16384, 4096
+"""Tables have a multiple of so many rows: the alignment is compiled for few sizes of images."""
 
 
 @dataclass(frozen=True, eq=False)
-class Gray:
-    """One level. image: float32 [h, w, 3], brightness without its local mean and its derivatives by x and y."""
-
-    image: np.ndarray
-    intrinsics: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Cells of an image with depth. cells: float32 [7, h w], the point in the camera frame, metres, the unit normal
-    towards the camera, and the standard deviation of the depth, metres; normal zero = none. shape: h, w.
+class Points:
+    """Samples of a view in columns, the first `count` of which are there. points: float32 [3, n] in the camera frame,
+    metres. values: [k, n], what else is known of each: of a surface the unit normal towards the camera and the standard
+    deviation of the depth, metres; of an edge the brightness in each level.
     """
 
-    cells: np.ndarray
-    shape: tuple[int, int]
-    intrinsics: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Cells spread over the image: points float32 [3, n], normals [3, n], standard deviations of the depth [n]."""
-
     points: np.ndarray
-    normals: np.ndarray
-    sigma: np.ndarray
+    values: np.ndarray
+    count: int
 
-    def every(self, step: int) -> Samples:
-        """Each `step`-th."""
-        if step == 1:
-            return self
-        return Samples(*(np.ascontiguousarray(rows[..., ::step]) for rows in (self.points, self.normals, self.sigma)))
+    @classmethod
+    def of(cls, points: np.ndarray, values: np.ndarray, room: int) -> Points:
+        """From as many as there are, each in a column; at most `room`."""
+        count = points.shape[1]
+        padded = np.zeros((3 + len(values), room), np.float32)
+        padded[:3, :count], padded[3:, :count] = points, values
+        return cls(padded[:3], padded[3:], count)
 
 
 @dataclass(frozen=True, eq=False)
 class RgbdView:
     """What an alignment needs of one image.
 
-    levels: finest first. edges: float32 [3, m] points in the camera frame with a strong gradient, metres, and
-    edge_values: one float32 [m] of brightness for each level.
+    picture: float32 [p, 3], brightness without its local mean and its derivatives by x and y, all levels one after the
+    other, the finest first, row by row. cells: [c, 7] of the image with depth, row by row: the point in the camera
+    frame, metres, the unit normal towards the camera, and the standard deviation of the depth, metres; normal zero =
+    none. sizes: int32 [levels + 1, 3], width and height of each level and where it begins; the last is that of the
+    cells. intrinsics: [levels + 1, 4] of the same. surface: cells spread over the image. edges: points with a strong
+    gradient.
     """
 
-    levels: tuple[Gray, ...]
-    surface: Surface
-    samples: Samples
-    edges: np.ndarray
-    edge_values: tuple[np.ndarray, ...]
+    picture: np.ndarray
+    cells: np.ndarray
+    sizes: np.ndarray
+    intrinsics: np.ndarray
+    surface: Points
+    edges: Points
 
     @classmethod
     def of(cls, image: np.ndarray, depth: tuple[np.ndarray, np.ndarray] | None, intrinsics: np.ndarray) -> RgbdView:
         """From an image uint8 [H, W, 3], its depth float [H, W], metres, NaN = none, and that one's relative sigma."""
         factor = max(round(image.shape[1] / WIDTH), 1)
         gray = _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), factor)
-        levels = _pyramid(gray, pinhole.coarser(intrinsics, factor))
+        levels = _pyramid(gray)
         coarse = pinhole.coarser(intrinsics, factor * BLOCK)
-        if depth is None or not np.isfinite(depth[0]).any():
-            none, empty = np.zeros((3, 0), np.float32), np.zeros(0, np.float32)
-            nothing = Surface(np.zeros((7, 1), np.float32), (1, 1), coarse)
-            return cls(levels, nothing, Samples(none, none, empty), none, (empty,) * LEVELS)
-        cells, sigma = _cell_means(*depth, factor * BLOCK)
-        points = _unproject_grid(cells, coarse)
-        normals = _normals(points)
-        edges, values = _edge_samples(levels, cells)
-        return cls(levels, _surface(points, normals, sigma, coarse), _spread(points, normals, sigma), edges, values)
+        cameras = [*(pinhole.coarser(intrinsics, factor * 2**level) for level in range(LEVELS)), coarse]
+        shape, cells = (0, 0), np.zeros((0, 7), np.float32)
+        surface, edges = (Points.of(np.zeros((3, 0)), np.zeros((k, 0)), most) for k, most in _ROOM)
+        if depth is not None and np.isfinite(depth[0]).any():
+            z, sigma = _cell_means(*depth, factor * BLOCK)
+            points = _unproject_grid(z, coarse)
+            normals = _normals(points)
+            shape, cells = z.shape, _cells(points, normals, sigma)
+            surface, edges = _spread(cells), _edge_samples(levels, z, cameras[0])
+        picture = np.concatenate([level.reshape(-1, 3) for level in levels])
+        ends = np.cumsum([0, *(level.shape[0] * level.shape[1] for level in levels)])
+        sides = [*((level.shape[1], level.shape[0]) for level in levels), (shape[1], shape[0])]
+        sizes = np.array([(*side, begin) for side, begin in zip(sides, (*ends[:-1], 0), strict=True)], np.int32)
+        table = np.array(cameras, np.float32)
+        return cls(_padded(picture, PIXELS_AT_ONCE), _padded(cells, CELLS_AT_ONCE), sizes, table, surface, edges)
+
+
+_ROOM = ((4, MOST_POINTS), (LEVELS, MOST_EDGES))
+
+
+def _padded(rows: np.ndarray, step: int) -> np.ndarray:
+    """The table with zeros behind it, at least one row of them: what is nowhere in view reads the first rows."""
+    count = (len(rows) // step + 1) * step
+    return np.concatenate([rows, np.zeros((count - len(rows), rows.shape[1]), np.float32)])
 
 
 def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
@@ -97,14 +107,15 @@ def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
     return cv2.resize(image, (image.shape[1] // factor, image.shape[0] // factor), interpolation=cv2.INTER_AREA)
 
 
-def _pyramid(gray: np.ndarray, intrinsics: np.ndarray) -> tuple[Gray, ...]:
+def _pyramid(gray: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Brightness without its local mean, and its derivatives by x and y, float32 [h, w, 3] of each level."""
     levels = []
     for level in range(LEVELS):
         image = _shrink(gray, 2**level)
         value = image - cv2.GaussianBlur(image, (0, 0), BACKGROUND)
         dx = cv2.Scharr(value, cv2.CV_32F, 1, 0, scale=1 / 32)
         dy = cv2.Scharr(value, cv2.CV_32F, 0, 1, scale=1 / 32)
-        levels.append(Gray(cv2.merge([value, dx, dy]), pinhole.coarser(intrinsics, 2**level)))
+        levels.append(cv2.merge([value, dx, dy]))
     return tuple(levels)
 
 
@@ -153,26 +164,27 @@ def _normals(points: np.ndarray) -> np.ndarray:
     return normals
 
 
-def _surface(points: np.ndarray, normals: np.ndarray, sigma: np.ndarray, intrinsics: np.ndarray) -> Surface:
+def _cells(points: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     known = np.isfinite(normals[..., :1])
-    cells = np.where(known, np.concatenate([points, normals, sigma[..., None]], 2), np.float32(0))
-    return Surface(np.ascontiguousarray(cells.reshape(-1, 7).T), (sigma.shape[0], sigma.shape[1]), intrinsics)
+    return np.where(known, np.concatenate([points, normals, sigma[..., None]], 2), np.float32(0)).reshape(-1, 7)
 
 
-def _spread(surface: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> Samples:
-    """At most about `MOST_POINTS` cells, evenly spread."""
-    known = np.nonzero(np.isfinite(normals[..., 0]).ravel())[0]
+def _spread(cells: np.ndarray) -> Points:
+    """At most `MOST_POINTS` cells with a surface, evenly spread."""
+    known = np.flatnonzero(cells[:, 3:6].any(axis=1))
     # A fixed shuffle: a regular stride would take whole columns of the grid.
     order = np.random.default_rng(0).permutation(len(known))[:MOST_POINTS]
-    chosen = np.sort(known[order])
-    points, unit = (np.ascontiguousarray(grid.reshape(-1, 3)[chosen].T) for grid in (surface, normals))
-    return Samples(points, unit, sigma.ravel()[chosen])
+    chosen = cells[np.sort(known[order])].T
+    return Points.of(chosen[:3], chosen[3:], MOST_POINTS)
 
 
-def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """The strongest gradient of each cell whose depth is known: points float32 [3, m], brightness of each level."""
+def _edge_samples(levels: tuple[np.ndarray, ...], cells: np.ndarray, intrinsics: np.ndarray) -> Points:
+    """The strongest gradient of each cell whose depth is known, at most `MOST_EDGES` of them, and the brightness there.
+
+    cells: depth, [h, w]. intrinsics: of the finest level.
+    """
     finest = levels[0]
-    strength = cv2.magnitude(*(np.ascontiguousarray(finest.image[..., side]) for side in (1, 2)))
+    strength = cv2.magnitude(*(np.ascontiguousarray(finest[..., side]) for side in (1, 2)))
     height, width = (side // EDGE_CELL * EDGE_CELL for side in strength.shape)
     blocks = strength[:height, :width].reshape(height // EDGE_CELL, EDGE_CELL, width // EDGE_CELL, EDGE_CELL)
     flat = blocks.transpose(0, 2, 1, 3).reshape(height // EDGE_CELL, width // EDGE_CELL, -1)
@@ -182,13 +194,17 @@ def _edge_samples(levels: tuple[Gray, ...], cells: np.ndarray) -> tuple[np.ndarr
     row, column = row.ravel(), column.ravel()
     z = cells[np.minimum(row // BLOCK, cells.shape[0] - 1), np.minimum(column // BLOCK, cells.shape[1] - 1)]
     inner = (row > 2) & (column > 2) & (row < strength.shape[0] - 3) & (column < strength.shape[1] - 3)
-    good = np.isfinite(z) & (strength[row, column] > FAINT) & inner
+    good = np.flatnonzero(np.isfinite(z) & (strength[row, column] > FAINT) & inner)
+    if len(good) > MOST_EDGES:
+        weakest_last = np.argsort(-strength[row[good], column[good]], kind="stable")
+        good = np.sort(good[weakest_last[:MOST_EDGES]])
     row, column, z = row[good], column[good], z[good]
     pixels = np.column_stack([column, row]).astype(np.float64)
-    points = pinhole.rays(pixels, finest.intrinsics) * z[:, None]
-    values = []
+    points = pinhole.rays(pixels, intrinsics) * z[:, None]
+    values = np.zeros((LEVELS, len(good)), np.float32)
     for number, level in enumerate(levels):
         x, y = ((pixels + 0.5) / 2**number - 0.5).astype(np.float32).T
-        value = np.ascontiguousarray(level.image[..., 0])
-        values.append(cv2.remap(value, x[None], y[None], cv2.INTER_LINEAR)[0] if len(x) else x)
-    return np.ascontiguousarray(points.T, np.float32), tuple(values)
+        value = np.ascontiguousarray(level[..., 0])
+        if len(x):
+            values[number] = cv2.remap(value, x[None], y[None], cv2.INTER_LINEAR)[0]
+    return Points.of(points.T, values, MOST_EDGES)

@@ -39,7 +39,7 @@ from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, Measure
 from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.keyframe_images import CompressedImage, KeyframeImages
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.rgbd_view import Gray, RgbdView, Samples, Surface
+from vggtgeo.slam.rgbd_view import Points, RgbdView
 from vggtgeo.slam.state import FramePose, PendingWindow, Readout, SecondMotion, Slam, Waiting
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
@@ -63,7 +63,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, WindowPrior, MarginalPrior, Readout),
     *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
     *(PointTerm, LineTerm, DepthPrior, IntrinsicsPrior, RelativePose, SurfaceAlignment, RotationPrior, BaselinePrior),
-    *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Gray, Surface, Samples),
+    *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
 VERSION = 8
