@@ -17,7 +17,7 @@ from vggtgeo.cli.address_space import check_address_space
 from vggtgeo.export import export
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.jax_environment import cache_folder
-from vggtgeo.results import Result
+from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import taken
 
 

@@ -33,8 +33,8 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.learning import WindowDataset
-from vggtgeo.results import Result
 from vggtgeo.results.files import read_uncertainty
+from vggtgeo.results.result import Result
 from vggtgeo.results.scene import Scene
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import load_state, save_state

@@ -20,7 +20,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.results import Result
+from vggtgeo.results.result import Result
 from vggtgeo.slam.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.trust.finding import Verdict
 

@@ -11,7 +11,7 @@ import tiny_sequences as tiny
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.results import Result
+from vggtgeo.results.result import Result
 
 
 @pytest.mark.usefixtures("uncompiled")

@@ -22,8 +22,8 @@ from vggtgeo.datasets import without_depth
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.results import Result
 from vggtgeo.results.files import write_trajectories
+from vggtgeo.results.result import Result
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.known_map import as_map, save_map

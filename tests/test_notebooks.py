@@ -52,6 +52,7 @@ def _run(path: Path, changes: dict[str, str]) -> None:
     assert not unused, f"`{path.name}` no longer holds {unused}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", [path for path in NOTEBOOKS if path.stem in QUICK], ids=lambda path: path.stem)
 def test_notebook_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every cell runs, in order, without an error or a warning, and prints something."""

@@ -394,6 +394,7 @@ def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
     assert told[1]["frames"] == [0, 7]
 
 
+@pytest.mark.long
 def test_back_from_a_jump_the_window_is_of_one_piece(room) -> None:
     """Back where the map began after a jump that began a piece of its own: keyframes of that piece, whose place is a
     guess, are not matched with those of the first, which lines alone would tie to it.

@@ -140,8 +140,8 @@ def test_any_iterable_of_frames_will_do() -> None:
     sequence = vg.simulate("room", 3, 0, (160, 120))
     pairs = [(frame.image, frame.depth) for frame in sequence.frames()]
     log = _Log()
-    found = vg.reconstruct(iter(pairs), camera=sequence.camera, callbacks=[log], title="a list")
-    expected = vg.reconstruct(sequence)
+    found = vg.reconstruct(iter(pairs), settings=SETTINGS, camera=sequence.camera, callbacks=[log], title="a list")
+    expected = vg.reconstruct(sequence, settings=SETTINGS)
     np.testing.assert_array_equal(found.trajectory.poses, expected.trajectory.poses)
     assert log.calls == ["begin frames None", "frame 0", "frame 1", "frame 2", "adjust", "finish"]
     assert found.record.title == "a list"

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recorded_run import SETTINGS as SHORT_RUN
 
 import vggtgeo as vg
 from vggtgeo.datasets.in_memory import frame_stream
@@ -64,8 +65,8 @@ def test_a_run_of_large_images_says_so_and_is_right() -> None:
     sequence and from plain frames; its summary has both sizes, and the camera as it was read.
     """
     settings = vg.SlamSettings(
-        window=vg.WindowSettings(size=3, point_slots=64, line_slots=12),
-        refinement=vg.RefinementSettings(global_adjustment=False),
+        window=SHORT_RUN.window,
+        refinement=SHORT_RUN.refinement,
         camera=vg.CameraSettings(most_pixels=MOST),
     )
     sequence = room(LARGE, 6)

@@ -15,12 +15,13 @@ from same_leaves import differences
 from typer.testing import CliRunner
 from vggtgeo.models.onnx.bounds import Refusals
 
+import vggtgeo.results.reconstruction as reconstruction
 from vggtgeo.cli.main import make_app
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
-from vggtgeo.results import Result, reconstruction
 from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, Notice, RunSoFar, frames_kept
 from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import check_finished, taken
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.callback import Callback

@@ -22,8 +22,8 @@ from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import end_on_signals, interruption
 from vggtgeo.io.locks import LockedError, locked
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.results import Result
 from vggtgeo.results.files import write_depth
+from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import RESERVE, check_finished, taken
 from vggtgeo.slam.keyframe import Keyframe
 

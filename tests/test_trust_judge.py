@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from trust_checks import found_by_camera, found_by_depth, found_by_parts, found_by_scale, found_by_steps
 from witness import walk, with_depth
 
-from vggtgeo.results import Result
+from vggtgeo.results.result import Result
 from vggtgeo.slam.trust import judge as judge_module
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.estimate import Estimate

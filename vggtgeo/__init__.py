@@ -78,11 +78,11 @@ if TYPE_CHECKING:
     from vggtgeo.learning.window_dataset import WindowDataset as WindowDataset
     from vggtgeo.learning.window_dataset import WindowWriter as WindowWriter
     from vggtgeo.mapping.fusion import SurfaceFusion as SurfaceFusion
-    from vggtgeo.results import Result as Result
-    from vggtgeo.results import evaluate as evaluate
-    from vggtgeo.results import read as read
     from vggtgeo.results.checkpoints import Checkpoints as Checkpoints
+    from vggtgeo.results.reading import evaluate as evaluate
+    from vggtgeo.results.reading import read as read
     from vggtgeo.results.reconstruction import reconstruct as reconstruct
+    from vggtgeo.results.result import Result as Result
     from vggtgeo.simulation import SimulatedWindow as SimulatedWindow
     from vggtgeo.simulation import simulate as simulate
     from vggtgeo.simulation import simulate_window as simulate_window
@@ -152,7 +152,8 @@ _HOME = {
     "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),
     "learning.window_dataset": ("RunWindows", "WindowDataset", "WindowWriter"),
     "mapping.fusion": ("SurfaceFusion",),
-    "results": ("Result", "evaluate", "read"),
+    "results.result": ("Result",),
+    "results.reading": ("evaluate", "read"),
     "results.reconstruction": ("reconstruct",),
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
     "slam.callback": ("Callback",),

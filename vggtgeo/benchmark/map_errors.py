@@ -13,7 +13,7 @@ from jaxtyping import Float
 from vggtgeo.benchmark.exact_frames import ExactFrames, exact_cloud
 from vggtgeo.benchmark.inputs import Input
 from vggtgeo.evaluation import CloudError, Similarity, cloud_error, depth_error, surface_points
-from vggtgeo.results import Result
+from vggtgeo.results.result import Result
 
 _DEPTH_MAPS = 40  # keyframes whose dense depth is compared, evenly spaced: more changes the mean by little
 _MOST = 200_000

@@ -14,7 +14,7 @@ from vggtgeo.benchmark.map_errors import depth_errors, map_errors
 from vggtgeo.evaluation import Similarity, TrajectoryReport, evaluate_trajectory, focal_error, pose_consistency
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.results import Result
+from vggtgeo.results.result import Result
 
 DELTAS: tuple[tuple[str, float, str], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0, "metres"))
 """Of RTE and RRE: the name in the columns, how far, and its unit."""

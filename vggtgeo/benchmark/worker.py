@@ -22,8 +22,8 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 from vggtgeo.io.warned import collected_warnings
-from vggtgeo.results import Result
 from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import updated

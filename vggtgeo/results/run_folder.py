@@ -29,7 +29,6 @@ from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.io.text_files import whole_text
-from vggtgeo.results.checkpoints import frames_kept
 
 UNFINISHED = "unfinished"
 """Folder, inside that of the run, of what a run has written before it is done."""
@@ -181,6 +180,8 @@ def check_finished(folder: Path) -> str | None:
 
 def _refuse_unfinished(run: RunFolder) -> None:
     if run.checkpoint.is_file():
+        from vggtgeo.results.checkpoints import frames_kept  # here: whoever asks about a folder waits for no JAX
+
         raise InputError(
             f"`{run.folder}` holds a run that was killed after {frames_kept(run.checkpoint)}: add `--resume` to go on "
             "with it, or `--no-resume` to begin anew"
