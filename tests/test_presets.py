@@ -119,6 +119,7 @@ def test_depth_that_knows_nothing_leaves_every_other_network_its_part(
     assert slam.waiting or not slam.metric
 
 
+@pytest.mark.long
 def test_an_interrupted_run_goes_on(
     files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
 ) -> None:

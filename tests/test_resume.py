@@ -22,7 +22,8 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, Notice, RunSoFar, frames_kept
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import Result
-from vggtgeo.results.run_folder import check_finished, taken
+from vggtgeo.results.run_folder import taken
+from vggtgeo.results.unfinished import check_finished
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam

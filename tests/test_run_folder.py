@@ -24,7 +24,8 @@ from vggtgeo.io.locks import LockedError, locked
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.results.files import write_depth
 from vggtgeo.results.result import Result
-from vggtgeo.results.run_folder import RESERVE, check_finished, taken
+from vggtgeo.results.run_folder import RESERVE, taken
+from vggtgeo.results.unfinished import check_finished
 from vggtgeo.slam.keyframe import Keyframe
 
 pytestmark = [

@@ -61,7 +61,7 @@ def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
     that are written without any.
     """
     from vggtgeo.datasets.trajectory_files import load_trajectory
-    from vggtgeo.results.run_folder import check_finished
+    from vggtgeo.results.unfinished import check_finished
 
     unfinished = check_finished(path)
     if unfinished:

@@ -31,10 +31,11 @@ from vggtgeo.results.files import (
     write_trajectories,
     write_uncertainty,
 )
-from vggtgeo.results.run_folder import RunFolder, check_finished, taken_beside
+from vggtgeo.results.run_folder import RunFolder, taken_beside
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise, with_writing
 from vggtgeo.results.summary_file import read_summary, unusable
+from vggtgeo.results.unfinished import check_finished
 from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pose_uncertainty import PoseUncertainty, frame_uncertainty

@@ -29,12 +29,9 @@ from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.io.text_files import whole_text
+from vggtgeo.results.checkpoints import frames_kept
+from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED
 
-UNFINISHED = "unfinished"
-"""Folder, inside that of the run, of what a run has written before it is done."""
-SUMMARY = "summary.json"
-CHECKPOINT = "checkpoint.npz"
-"""In `unfinished/`: the state that a killed run can go on from."""
 NAMES = (
     SUMMARY,
     "settings.toml",
@@ -168,20 +165,8 @@ def taken(
             _remove_if_empty(path)
 
 
-def check_finished(folder: Path) -> str | None:
-    """A sentence if a run into `folder` has not ended, or was killed; None for any other folder."""
-    stage = folder / UNFINISHED
-    if not stage.is_dir():
-        return None
-    older = ", and the files beside that are of the run before" if (folder / SUMMARY).is_file() else ""
-    further = "; `vggtgeo run --resume` goes on with it" if (stage / CHECKPOINT).is_file() else ""
-    return f"a run into `{folder}` goes on or was killed: what it has so far is in `{stage}`{older}{further}"
-
-
 def _refuse_unfinished(run: RunFolder) -> None:
     if run.checkpoint.is_file():
-        from vggtgeo.results.checkpoints import frames_kept  # here: whoever asks about a folder waits for no JAX
-
         raise InputError(
             f"`{run.folder}` holds a run that was killed after {frames_kept(run.checkpoint)}: add `--resume` to go on "
             "with it, or `--no-resume` to begin anew"
