@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
@@ -26,7 +27,7 @@ from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.pipeline import step
-from vggtgeo.slam.rgbd_alignment import RgbdAlignment
+from vggtgeo.slam.rgbd_alignment import RgbdAlignment, _median
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
@@ -119,6 +120,20 @@ def test_tracking_takes_the_noise_that_the_depth_states(room: Room) -> None:
         found.append(RgbdAlignment().align(*views, poses[1] @ rigid.invert(poses[0])))
     once, twice = (each.information for each in found)
     np.testing.assert_allclose(once, 4 * twice, atol=0.01 * np.abs(once).max())
+
+
+@pytest.mark.parametrize("count", [61, 100, 2399])
+def test_the_middle_of_what_is_in_view(count: int) -> None:
+    """The median that weighs samples, to a part in two thousand, whatever stands where nothing is in view; oracle:
+    sorting.
+    """
+    generator = np.random.default_rng(count)
+    values = generator.exponential(3.0, 2400).astype(np.float32)
+    used = np.zeros(2400, bool)
+    used[generator.permutation(2400)[:count]] = True
+    values[~used] = np.nan
+    found = float(_median(jnp.asarray(values), jnp.asarray(used), jnp.int32(count)))
+    assert found == pytest.approx(np.sort(values[used])[count // 2], rel=5e-4)
 
 
 def test_a_network_depth_states_its_own_noise(room: Room) -> None:

@@ -132,7 +132,7 @@ def reconstruct(
         windows, evidence = WindowRecorder(), EvidenceRecorder(seen_by)
         hooks = RunCallbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
-            hooks.warm_up(settings, perception.roles)
+            hooks.warm_up(settings, perception.roles, source.camera)
         perception = _without_still_parts(perception, source, selection, settings, hooks, evidence, stop)
         if first is None and before is None:
             first = _first_pass(source, selection, perception, settings, hooks, stop)

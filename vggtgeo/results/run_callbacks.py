@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.given import check_kind
 from vggtgeo.results.checkpoints import RunSoFar
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.rgbd_alignment import compile_alignment
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.window import warm_up
 
@@ -24,10 +26,12 @@ class RunCallbacks:
         for member in self.members:
             check_kind("callbacks", member, Callback, "objects of `vggtgeo.Callback` in it")
 
-    def warm_up(self, settings: SlamSettings, roles: Roles) -> None:
-        """Compile what every window needs, and what the callbacks make of windows."""
+    def warm_up(self, settings: SlamSettings, roles: Roles, camera: Camera) -> None:
+        """Compile what every window needs, every alignment with depth, and what the callbacks make of windows."""
         self.each("on_stage", "compiling")
         compiled = warm_up(settings, roles.metric)
+        if roles.alignment is not None and roles.metric:
+            compile_alignment(camera)
         for member in self.members:
             member.on_warm_up(*compiled)
 

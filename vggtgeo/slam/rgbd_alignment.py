@@ -24,6 +24,7 @@ import jaxlie
 import numpy as np
 from jax import lax
 
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import LEVELS, Points, RgbdView
 
@@ -158,7 +159,7 @@ class _Target(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    """Between two iterations. stage: the level, `JUDGED` or `DONE`. count: iterations of it so far."""
+    """Between two iterations. stage: the level, `JUDGED` or `DONE`. number: of its iterations so far."""
 
     stage: jax.Array
     number: jax.Array
@@ -169,6 +170,13 @@ class _Carry(NamedTuple):
 
 JUDGED, DONE = -1, -2
 """After the finest level: both terms are looked at once more."""
+
+
+def compile_alignment(camera: Camera) -> None:
+    """Compile what every alignment of images of this camera needs."""
+    black = np.zeros((camera.height, camera.width, 3), np.uint8)
+    view = RgbdView.of(black, None, np.array(camera.intrinsics, np.float64))
+    RgbdAlignment().align(view, view, np.eye(4))
 
 
 @cache

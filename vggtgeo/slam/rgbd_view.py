@@ -23,8 +23,6 @@ FAINT = 1.5
 """Grey levels a pixel; a weaker gradient is noise of the image."""
 MOST_POINTS, MOST_EDGES = 2400, 3600
 """Surface and edge points of the source that take part; more cost time and change nothing: they share their errors."""
-
-
 PIXELS_AT_ONCE, CELLS_AT_ONCE = 16384, 4096
 """Tables have a multiple of so many rows: the alignment is compiled for few sizes of images."""
 
@@ -47,6 +45,11 @@ class Points:
         padded = np.zeros((3 + len(values), room), np.float32)
         padded[:3, :count], padded[3:, :count] = points, values
         return cls(padded[:3], padded[3:], count)
+
+    @classmethod
+    def none(cls, known: int, room: int) -> Points:
+        """None of which `known` numbers are known besides."""
+        return cls.of(np.zeros((3, 0)), np.zeros((known, 0)), room)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +80,7 @@ class RgbdView:
         coarse = pinhole.coarser(intrinsics, factor * BLOCK)
         cameras = [*(pinhole.coarser(intrinsics, factor * 2**level) for level in range(LEVELS)), coarse]
         shape, cells = (0, 0), np.zeros((0, 7), np.float32)
-        surface, edges = (Points.of(np.zeros((3, 0)), np.zeros((k, 0)), most) for k, most in _ROOM)
+        surface, edges = Points.none(4, MOST_POINTS), Points.none(LEVELS, MOST_EDGES)
         if depth is not None and np.isfinite(depth[0]).any():
             z, sigma = _cell_means(*depth, factor * BLOCK)
             points = _unproject_grid(z, coarse)
@@ -90,9 +93,6 @@ class RgbdView:
         sizes = np.array([(*side, begin) for side, begin in zip(sides, (*ends[:-1], 0), strict=True)], np.int32)
         table = np.array(cameras, np.float32)
         return cls(_padded(picture, PIXELS_AT_ONCE), _padded(cells, CELLS_AT_ONCE), sizes, table, surface, edges)
-
-
-_ROOM = ((4, MOST_POINTS), (LEVELS, MOST_EDGES))
 
 
 def _padded(rows: np.ndarray, step: int) -> np.ndarray:
