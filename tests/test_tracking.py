@@ -27,7 +27,7 @@ from vggtgeo.slam.keyframe import make_keyframe
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.pipeline import step
-from vggtgeo.slam.rgbd_alignment import RgbdAlignment, _median
+from vggtgeo.slam.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
@@ -120,6 +120,16 @@ def test_tracking_takes_the_noise_that_the_depth_states(room: Room) -> None:
         found.append(RgbdAlignment().align(*views, poses[1] @ rigid.invert(poses[0])))
     once, twice = (each.information for each in found)
     np.testing.assert_allclose(once, 4 * twice, atol=0.01 * np.abs(once).max())
+
+
+def test_what_is_compiled_ahead_is_what_is_needed(room: Room) -> None:
+    """Alignments of a camera's views compile nothing more than was compiled for it; oracle: JAX's count."""
+    frames, camera, _ = room
+    compile_alignment(camera)
+    before = _align._cache_size()
+    views = [_view(frames[i], np.array(camera.intrinsics)) for i in (0, 2)]
+    assert RgbdAlignment().align(*views, np.eye(4)) is not None
+    assert _align._cache_size() == before
 
 
 @pytest.mark.parametrize("count", [61, 100, 2399])

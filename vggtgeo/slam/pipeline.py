@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -127,7 +126,6 @@ def _follow(
         with clock.measure("track"):
             found = _find(slam, sight, roles, settings)
     if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
-        _look_ahead(sight)
         slam = _settled(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if slam.lost and (found is None or not found.accepted):
@@ -143,14 +141,6 @@ def _follow(
     velocity = np.eye(4) if was_lost else found.pose @ rigid.invert(slam.last_pose)
     slam = _enter_frame(replace(slam, velocity=velocity, lost=0), sight, found, roles, settings, clock)
     return place_waiting(slam, roles) if was_lost else slam
-
-
-def _look_ahead(sight: Sight) -> None:
-    """Find what the frame needs as a keyframe, whatever the map is, while the window is still being adjusted."""
-    with ThreadPoolExecutor(1, thread_name_prefix="describe") as pool:
-        described = pool.submit(lambda: sight.features)
-        _ = sight.lines
-        described.result()
 
 
 def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Track:

@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jax import lax
 
+from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import LEVELS, Points, RgbdView
@@ -174,8 +174,8 @@ JUDGED, DONE = -1, -2
 
 def compile_alignment(camera: Camera) -> None:
     """Compile what every alignment of images of this camera needs."""
-    black = np.zeros((camera.height, camera.width, 3), np.uint8)
-    view = RgbdView.of(black, None, np.array(camera.intrinsics, np.float64))
+    black, wall = np.zeros((camera.height, camera.width, 3), np.uint8), np.ones((camera.height, camera.width))
+    view = RgbdView.of(black, (wall, 0.01 * wall), np.array(camera.intrinsics, np.float64))
     RgbdAlignment().align(view, view, np.eye(4))
 
 
@@ -226,7 +226,7 @@ def _align(
         return _Carry(
             jnp.where(lost, DONE, jnp.where(ends, carry.stage - 1, carry.stage)),
             jnp.where(ends, 0, count),
-            jnp.where(lost | (carry.stage == JUDGED), carry.motion, _exponential(change) @ carry.motion),
+            jnp.where(lost | (carry.stage == JUDGED), carry.motion, lie.exp(change).as_matrix() @ carry.motion),
             hessian,
             terms,
         )
@@ -338,10 +338,3 @@ def _projected(points: jax.Array, intrinsics: jax.Array) -> tuple[jax.Array, jax
     z = jnp.where(ahead, points[2], 1)
     fx, fy, cx, cy = intrinsics
     return points[0] / z * fx + cx, points[1] / z * fy + cy, ahead
-
-
-def _exponential(tangent: jax.Array) -> jax.Array:
-    """Exp on R^3 x SO(3), as `rigid_motion.exponential`."""
-    rotation = jaxlie.SO3.exp(tangent[3:]).as_matrix()
-    upper = jnp.concatenate([rotation, tangent[:3, None]], 1)
-    return jnp.concatenate([upper, jnp.array([[0.0, 0.0, 0.0, 1.0]])])

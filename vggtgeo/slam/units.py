@@ -10,7 +10,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.factors import Factor, MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.state import FramePose
+from vggtgeo.slam.state import FramePose, SecondMotion
 
 LEAST_SHARED = 20
 """Key points with a depth in both keyframes that tell the ratio of their units."""
@@ -60,7 +60,14 @@ def scaled_keyframe(keyframe: Keyframe, ratio: float) -> Keyframe:
 def scaled_record(record: FramePose, ratio: float) -> FramePose:
     """The record of a frame that hangs on such a keyframe."""
     arrival = None if record.arrival is None else (record.arrival[0], longer(record.arrival[1], ratio))
-    return replace(record, relative=longer(record.relative, ratio), arrival=arrival)
+    second = None if record.second is None else scaled_second(record.second, ratio)
+    return replace(record, relative=longer(record.relative, ratio), arrival=arrival, second=second)
+
+
+def scaled_second(second: SecondMotion, ratio: float) -> SecondMotion:
+    """What the second keyframe says of such a frame."""
+    information = _of_longer(second.information, ratio)
+    return replace(second, relative=longer(second.relative, ratio), information=information)
 
 
 def scaled_factor(factor: Factor, ratio: float) -> Factor:
@@ -70,5 +77,10 @@ def scaled_factor(factor: Factor, ratio: float) -> Factor:
 
 def scaled_motion(motion: MeasuredRelativePose, ratio: float) -> MeasuredRelativePose:
     """A measured motion whose translation is `ratio` times as long, and its information."""
+    return replace(motion, pose=longer(motion.pose, ratio), information=_of_longer(motion.information, ratio))
+
+
+def _of_longer(information: np.ndarray, ratio: float) -> np.ndarray:
+    """The information [6, 6], translation first, of a motion that is `ratio` times as long."""
     by = np.repeat([1.0 / ratio, 1.0], 3)
-    return replace(motion, pose=longer(motion.pose, ratio), information=motion.information * np.outer(by, by))
+    return np.asarray(information * np.outer(by, by))
