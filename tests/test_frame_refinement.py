@@ -15,7 +15,8 @@ from vggtgeo.slam.frame_refinement import MOST, against_nearest, against_referen
 from vggtgeo.slam.fusion import AGREEMENT_GATE
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.units import scaled_keyframe, scaled_record
 
 AWAY = np.array([0.006, -0.005, 0.004, 0.002, -0.003, 0.001])
 """Metres and radians."""
@@ -128,3 +129,24 @@ def test_poses_that_contradict_each_other_are_told_by_what_both_know(run: Record
     contradicted = moved(run.slam, rows, 100 * AWAY, 0.001)
     alone = replace(contradicted, frames=tuple(replace(record, second=None) for record in contradicted.frames))
     np.testing.assert_allclose(frame_poses(contradicted)[1], frame_poses(alone)[1], atol=1e-12)
+
+
+def test_in_a_larger_world_frames_are_placed_as_before(run: RecordedRun) -> None:
+    """A map whose lengths become three times as long, as a piece that joins another one: frames stand where they stood,
+    three times as far, and agree with both keyframes as well as they did. Oracle: the poses before.
+    """
+    slam = run.slam
+    assert any(record.second is not None for record in slam.frames)
+    scaled = replace(
+        slam,
+        keyframes=tuple(scaled_keyframe(keyframe, 3.0) for keyframe in slam.keyframes),
+        frames=tuple(_known_as_well(scaled_record(record, 3.0), 3.0) for record in slam.frames),
+    )
+    before, after = frame_poses(slam)[1], frame_poses(scaled)[1]
+    np.testing.assert_allclose(after[:, :3, 3], 3 * before[:, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(after[:, :3, :3], before[:, :3, :3], atol=1e-9)
+
+
+def _known_as_well(record: FramePose, ratio: float) -> FramePose:
+    evidence = replace(record.evidence, sigma_translation=ratio * record.evidence.sigma_translation)
+    return replace(record, evidence=evidence)

@@ -39,7 +39,7 @@ SETTLED = 1e-4
 at best; with a tenth of this, poses of redkitchen and corridor-office differ by 0.1 mm, for twice the iterations."""
 COARSE_SPREAD = 2.0
 """Times the spread of the surface, on coarse levels: what slides along a wall is led by the picture. With 1, motions of
-redkitchen are off by 5.3 mm against COLMAP, not 5.1, those of icl-office by 1.05 both times (`benchmarks/alignment.py`)."""
+redkitchen are off by 5.3 mm against COLMAP, not 5.1; of icl-office by 1.05 both times (`benchmarks/alignment.py`)."""
 TUKEY = 4.685
 """Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
 BITS = 20
