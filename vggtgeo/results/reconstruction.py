@@ -25,6 +25,7 @@ from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, identity, re
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source, as_read, opened
+from vggtgeo.results.still_search import StillSearch
 from vggtgeo.results.summary import compare, summarise
 from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
@@ -38,7 +39,6 @@ from vggtgeo.slam.run import check_run_arguments, default_roles, finish
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.settings_table import changed
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.still_parts import APART, PICTURES, StillParts, find_still_parts
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.input import check_input, check_refusals
@@ -129,11 +129,11 @@ def reconstruct(
         before = resumed(source.resumable(checkpoints), wanted)
         # The verdict takes the lens of a known map out of these corners, as it does with one that this run finds.
         seen_by = source.camera if first is None or first.lens is None else source.camera.pinhole
-        windows, evidence = WindowRecorder(), EvidenceRecorder(seen_by)
-        hooks = RunCallbacks((windows, evidence, CompileAhead(settings), *callbacks), clock)
+        windows, evidence, still = WindowRecorder(), EvidenceRecorder(seen_by), StillSearch()
+        hooks = RunCallbacks((windows, evidence, still, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles, source.camera)
-        perception = _without_still_parts(perception, source, selection, settings, hooks, evidence, stop)
+        perception = _without_still_parts(perception, source, selection, settings, hooks, (still, evidence), stop)
         if first is None and before is None:
             first = _first_pass(source, selection, perception, settings, hooks, stop)
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
@@ -148,13 +148,13 @@ def reconstruct(
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
             **as_read(source, slam),
-            **({"still_parts": round(still.share, 4)} if (still := perception.roles.still_parts) is not None else {}),
+            **({} if still.found is None else {"still_parts": round(still.found.share, 4)}),
         }
         notices = (*warned, *(collected if before is None else before.unsaid(collected)))
         ending = _Ending(
             slam, source.truth, report, notices, perception.refusals, title or source.name, known, clock, began, dense
         )
-        return _concluded(ending, settings, hooks, windows.records, evidence)
+        return _concluded(ending, settings, hooks, windows.records, (still, evidence))
 
 
 def _check_arguments(
@@ -198,16 +198,17 @@ def _concluded(
     settings: SlamSettings,
     hooks: RunCallbacks,
     windows: Iterable[WindowRecord],
-    evidence: EvidenceRecorder,
+    witnesses: tuple[StillSearch, EvidenceRecorder],
 ) -> Result:
     """The map, the verdict, the summary."""
     slam, clock = run.slam, run.clock
+    still, evidence = witnesses
 
     @in_double_precision
     def judged() -> Verdict:
         with clock.measure("verdict (own thread)"):
-            left_out = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals)
-            return judged_or_told(slam, evidence.frames, left_out)
+            of_input = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals) + still.findings()
+            return judged_or_told(slam, evidence.frames, of_input)
 
     hooks.each("on_stage", "dense map and verdict")
     with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:
@@ -275,26 +276,20 @@ def _without_still_parts(
     selection: tuple[int, int | None, int],
     settings: SlamSettings,
     hooks: RunCallbacks,
-    evidence: EvidenceRecorder,
+    witnesses: tuple[StillSearch, EvidenceRecorder],
     stop: Interruption,
 ) -> Perception:
     """Roles, and the verdict's witness, that look for nothing where the picture moves with the camera."""
+    search, evidence = witnesses
     if not (settings.camera.still_parts and source.comes_again(selection)):
         return perception
     hooks.each("on_stage", "looking for what stays in its place in the picture")
     with hooks.clock.measure("still parts"), stop.at_once():
-        seen = find_still_parts(source.some_pictures(*selection, PICTURES, APART))
-    if seen is None:
+        search.look(source, selection)
+    if search.found is None:
         return perception
-    parts = StillParts(seen)
-    warnings.warn(
-        f"{100 * parts.share:.1f} % of the picture stays in its place while the rest moves (bars, a watermark, "
-        "something on the lens?): nothing is looked for there",
-        InputWarning,
-        stacklevel=3,
-    )
-    evidence.leave_out(parts.mask)
-    return replace(perception, roles=replace(perception.roles, still_parts=parts))
+    evidence.leave_out(search.found.mask)
+    return replace(perception, roles=replace(perception.roles, still_parts=search.found))
 
 
 def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:

@@ -13,7 +13,7 @@ passes through a pixel has gradients of all directions, which cancel.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,9 +33,13 @@ of them, no more than 0.0001 of the picture is above 0.9 while the camera moves;
 nine pictures of a camera that turns to the side."""
 LEAST_SEEN = 0.8
 """Share of the pictures in which a pixel has a gradient."""
-LEAST_AREA, MOST_AREA = 5e-4, 0.35
-"""Share of the picture that is still, and with gaps and margins: less are a few pixels, with more nobody can say what
-the world is."""
+LEAST_AREA, SURE_AREA, MOST_AREA = 5e-4, 0.35, 0.7
+"""Share of the picture that is still, and with gaps and margins: less are a few pixels; more than `SURE_AREA` is left
+out, and told, because a camera that stands before a train that passes sees the same; beyond `MOST_AREA` too little is
+left to follow."""
+LEAST_TOLD = 0.1
+"""Share of the picture that is still and cannot be left out, from which it is told: 0.17 to 0.35 with text over half of
+a bare room; slow pieces of icl-office have up to 0.024."""
 CELL, LEAST_OF_CELL = 24, 0.03
 """Pixels a side of a cell, and the share of its pixels that must have a gradient for it to say something. Each part of
 the picture has one voice, so that a busy poster that passes does not speak for a room that stays."""
@@ -59,18 +63,26 @@ _GAP, _REACH = 6, 6
 
 @dataclass(frozen=True, eq=False)
 class StillParts:
-    """mask: bool [H, W], True where the picture belongs to the camera."""
+    """mask: bool [H, W], True where the picture belongs to the camera. separable: False where the rest of the picture
+    says too little to go without these parts: what belongs to the camera and what to the world cannot be told apart.
+    """
 
     mask: np.ndarray
+    separable: bool = True
 
     @property
     def share(self) -> float:
         """Of the picture."""
         return float(self.mask.mean())
 
+    @property
+    def sure(self) -> bool:
+        """Whether the camera must carry this, and no room that stays can look like it."""
+        return self.separable and self.share <= SURE_AREA
+
     def undistorted(self, camera: Camera) -> StillParts:
         """The same of images that the lens of `camera` does not distort."""
-        return StillParts(camera.undistorter().image(self.mask.astype(np.uint8) * 255) > 0)
+        return replace(self, mask=camera.undistorter().image(self.mask.astype(np.uint8) * 255) > 0)
 
     def without_points(self, features: Features) -> Features:
         """The key points that do not lie there; those of networks that describe the whole image stay as they are."""
@@ -95,17 +107,23 @@ class StillParts:
         return np.where(self.mask, np.float32(np.nan), depth).astype(depth.dtype)
 
 
-def find_still_parts(pictures: Iterable[np.ndarray]) -> np.ndarray | None:
-    """The still parts of pictures uint8 [H, W, 3] of a moving camera, bool [H, W]; None where there are none, or nobody
-    can say because the camera hardly moves, or there are fewer than twelve pictures.
+def find_still_parts(pictures: Iterable[np.ndarray]) -> StillParts | None:
+    """The still parts of pictures uint8 [H, W, 3] of a moving camera; None where there are none, or nobody can say
+    because the camera hardly moves, or there are fewer than twelve pictures.
     """
-    gradients, size = [], (0, 0)
+    size, greys = (0, 0), []
     for picture in pictures:
         size = picture.shape[1], picture.shape[0]
-        gradients.append(_gradient(picture))
-    count = len(gradients)
+        greys.append(small_grey(picture))
+    return still_parts_of(greys, size)
+
+
+def still_parts_of(greys: Sequence[np.ndarray], size: tuple[int, int]) -> StillParts | None:
+    """The same of pictures that `small_grey` made smaller; size: (W, H) before that."""
+    count = len(greys)
     if count < LEAST_PICTURES:
         return None
+    gradients = [_gradient(grey) for grey in greys]
     lengths = [np.linalg.norm(gradient, axis=0) for gradient in gradients]
     length = np.sum(lengths, axis=0)
     coherence = np.linalg.norm(np.sum(gradients, axis=0), axis=0) / np.maximum(length, 1e-6)
@@ -115,12 +133,21 @@ def find_still_parts(pictures: Iterable[np.ndarray]) -> np.ndarray | None:
     if still.mean() < LEAST_AREA:
         return None
     mask = _filled(still, structured)
-    rest = structured & ~mask
-    if mask.mean() > MOST_AREA or _standing(coherence, rest) > MOST_STANDING:
-        return None
     if np.median(_changed(gradients, lengths, ~mask)) < LEAST_CHANGED:
         return None
-    return np.asarray(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST), bool)
+    separable = bool(mask.mean() <= MOST_AREA) and _standing(coherence, structured & ~mask) <= MOST_STANDING
+    if not separable and still.mean() < LEAST_TOLD:
+        return None
+    full = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    return StillParts(np.asarray(full, bool), separable)
+
+
+def small_grey(picture: np.ndarray) -> np.ndarray:
+    """A picture uint8 [H, W, 3] as it is compared: uint8 [h, w], the longer side `WIDTH` pixels at most."""
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    factor = max(max(grey.shape) / WIDTH, 1.0)
+    size = round(grey.shape[1] / factor), round(grey.shape[0] / factor)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
 
 
 def _standing(coherence: np.ndarray, rest: np.ndarray) -> float:
@@ -144,14 +171,10 @@ def _changed(gradients: list[np.ndarray], lengths: list[np.ndarray], where: np.n
     return found
 
 
-def _gradient(picture: np.ndarray) -> np.ndarray:
+def _gradient(grey: np.ndarray) -> np.ndarray:
     """By x and y, grey levels a pixel, float32 [2, h, w]."""
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    factor = max(max(grey.shape) / WIDTH, 1.0)
-    size = round(grey.shape[1] / factor), round(grey.shape[0] / factor)
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    small = cv2.GaussianBlur(small, (0, 0), 1.0)
-    return np.stack([cv2.Sobel(small, cv2.CV_32F, 1 - axis, axis, ksize=3, scale=0.125) for axis in (0, 1)])
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    return np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1 - axis, axis, ksize=3, scale=0.125) for axis in (0, 1)])
 
 
 def _filled(still: np.ndarray, structured: np.ndarray) -> np.ndarray:
