@@ -14,6 +14,9 @@ What is done already lies in `--out` and is not run again; `--fresh` runs all.
 - crash, hang: as they say.
 
 The ATE is after SE(3) where lengths are called metric, or doubtful; after Sim(3) where the scale is free.
+
+The last column of the first table counts the good of those variants in which the information for a good result is there
+(`WITHOUT_INFORMATION` has the others).
 """
 
 from __future__ import annotations
@@ -45,6 +48,23 @@ SHARED = ROOT.parent / "shared"
 ORDER = ("good", "alarm", "mild", "told", "SILENT", "error", "crash", "hang")
 MOST_TURN = 2.5
 """Degrees, RMS from frame to frame, beyond which poses are wrong whatever the ATE is."""
+
+
+WITHOUT_INFORMATION = {
+    "more than a tenth of the frames show nothing of the place, or another one": (
+        *("black5", "black_first5", "black20", "black20_depth", "rgb_black20", "mirror", "rgb_mirror"),
+        *("same_stamps", "kidnap_other"),
+    ),
+    "calibration, lens or depth are of another recording": (
+        *("K_x2", "K_cx40", "rgb_K+20", "crop75_untold", "portrait_untold", "rgb_portrait_untold", "distorted"),
+        *("rgb_distorted", "depth_1m", "depth_frozen", "depth_late3", "depth_x0.2", "depth_x5"),
+    ),
+    "nothing tells how far anything is": ("rotation_rgb", "rgb_still100"),
+    "as much of the picture moves on its own, or with the camera, as stays": (
+        *("occluder", "occluder_slow_big", "rgb_occluder", "overlay50"),
+    ),
+}
+"""Variants of which nobody could ask a good result, by the reason."""
 
 
 @dataclass(frozen=True)
@@ -235,12 +255,15 @@ def _page(outcomes: list[Outcome], options: argparse.Namespace) -> str:
         "",
         "Written by `" + " ".join(["benchmarks/stress.py", *sys.argv[1:]]) + "`; the words are explained there.",
         "",
-        "| source | cases | " + " | ".join(ORDER) + " |",
-        "|---" * (len(ORDER) + 2) + "|",
+        "| source | cases | " + " | ".join(ORDER) + " | good where the information is there |",
+        "|---" * (len(ORDER) + 3) + "|",
     ]
     for source in [*dict.fromkeys(outcome.source for outcome in outcomes), "all"]:
-        count = Counter(w for o, w in zip(outcomes, words, strict=True) if source in (o.source, "all"))
-        lines.append(f"| {source} | {sum(count.values())} | " + " | ".join(str(count[w]) for w in ORDER) + " |")
+        own = [(o.name, w) for o, w in zip(outcomes, words, strict=True) if source in (o.source, "all")]
+        count = Counter(word for _, word in own)
+        there = [word for name, word in own if not any(name in names for names in WITHOUT_INFORMATION.values())]
+        share = f"{there.count('good')} of {len(there)} ({there.count('good') / max(len(there), 1):.0%})"
+        lines.append(f"| {source} | {len(own)} | " + " | ".join(str(count[w]) for w in ORDER) + f" | {share} |")
     lines += [
         "",
         "| source | variant | outcome | verdict | SE(3) cm | Sim(3) cm | tracked | reasons |",
