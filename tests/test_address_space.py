@@ -31,6 +31,7 @@ def test_a_command_that_would_be_aborted_does_not_begin(tmp_path: Path) -> None:
     assert limited(500, "data", "list").returncode == 0
 
 
+@pytest.mark.long
 def test_memory_that_runs_out_is_told(tmp_path: Path) -> None:
     """The check lets through what NumPy or a thread is then refused: one line, the code of what is given wrongly."""
     done = limited(2000, "simulate", "room", "--size", "8000x8000", "--frames", "2", "-o", tmp_path / "new")

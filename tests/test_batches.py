@@ -34,7 +34,9 @@ def batch() -> tuple[Problem, State, list]:
     return pack_batch([window(scene) for scene in SCENES], intrinsics_sigma=5.0)
 
 
-@pytest.mark.parametrize("at_once", [1, pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize(
+    "at_once", [3, pytest.param(1, marks=pytest.mark.long), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_a_ragged_batch_gives_what_each_window_gives(at_once: int) -> None:
     # Proves padding to one shape, mapping and vmapping, and `gather` of every window. Oracle: `solve` of each alone,
     # packed to its own size.

@@ -134,6 +134,7 @@ def coordinates(problem: vg.Problem, index: object) -> np.ndarray:
     return np.concatenate([np.nonzero(free)[0], len(free) + index.host * slots + index.slot])
 
 
+@pytest.mark.long
 def test_two_cameras_are_adjusted_and_judged_as_by_dense_algebra() -> None:
     # Proves the optimum with two groups of keyframes (free, with a prior, one parameter held), and all covariances.
     # Oracles: `scipy.optimize.least_squares` on residuals by numpy, from the same wrong start; the inverse of J'J with

@@ -96,6 +96,7 @@ def run(problem: Problem, state: State, solver: SchurLevenbergMarquardt, graduat
     return solve(problem, state, solver=solver, graduation=graduation)
 
 
+@pytest.mark.long
 def test_graduation_finds_the_better_basin() -> None:
     # Proves that wider kernels first reach the optimum around the truth where a redescending kernel alone ends in
     # another, 20 cm and 6 degrees away at the start. Oracle: the energy from the true state, which neither is told.

@@ -149,6 +149,7 @@ def test_localising_leaves_the_map_as_it_is(known: Slam) -> None:
     assert worst_error(slam) < 0.03
 
 
+@pytest.mark.long
 def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     """Frames of another room have no pose in the map; oracle: it is another room."""
     slam = run(0, 6, seed=3, settings=FIXED, known_map=known)
@@ -183,7 +184,7 @@ def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("localise_only", [False, True])
+@pytest.mark.parametrize("localise_only", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_map_without_a_unit_serves_with_and_without_depth(localise_only: bool, tmp_path: Path) -> None:
     """A map made of images alone places later frames, of images alone or with depth, in its own unit, and the depth
     that is not used is told; oracle: the truth after Sim(3) alignment, the warning.

@@ -55,6 +55,7 @@ def test_windows_hold_what_they_say(windows: list[TrackedWindow]) -> None:
         assert ((window.saliency >= 0) & (window.saliency <= 1)).all()
 
 
+@pytest.mark.long
 def test_every_match_is_stored_with_its_own_features(windows: list[TrackedWindow], batch: Batch) -> None:
     """The padded arrays hold each match's features beside its target; oracle: a mark put into one match."""
     marked = windows[0].features.copy()
@@ -147,6 +148,7 @@ def test_methods_are_told_apart(batch: Batch) -> None:
     assert set(found.to_dict()) == {"uniform", "saliency", "learned", "oracle"}
 
 
+@pytest.mark.long
 def test_the_network_starts_near_trust_and_stays_in_range(batch: Batch) -> None:
     """At its start every confidence lies near 0.7; for any feature it stays between its floor and one."""
     features = batch.features[batch.present]

@@ -65,6 +65,7 @@ def found_in(window: vg.SimulatedWindow, focal: float) -> FoundLens:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_a_lens_is_found(seed: int) -> None:
     # Proves that distortion that nobody told is found beside a focal length that begins 10 % off, and how far it moves

@@ -371,6 +371,7 @@ def test_bad_sequences_end_with_finite_poses(room, case: int) -> None:
     assert np.all(np.isfinite(poses)), name
 
 
+@pytest.mark.long
 def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
     """After a jump to a place never seen, tracking is reported lost, the map goes on from a new origin, and each piece
     is written to a file of its own, the one of more frames first. Oracle: which frames are of which place.

@@ -178,7 +178,7 @@ def test_the_stop_button_keeps_what_there_is(monkeypatch: pytest.MonkeyPatch, st
     if stop_at.startswith("finish"):
         monkeypatch.setattr("vggtgeo.results.reconstruction.finish", stopped)
     log = _Log(stop_at)
-    result = vg.reconstruct(vg.simulate("room", 4, 0, (160, 120)), callbacks=[log])
+    result = vg.reconstruct(vg.simulate("room", 4, 0, (160, 120)), settings=SETTINGS, callbacks=[log])
     assert result.summary["interrupted"] is True
     assert result.summary["frames"] == len(result.trajectory) == (2 if stop_at == "frame 1" else 4)
     assert any(call.startswith("interrupted: keeping what there is") for call in log.calls)

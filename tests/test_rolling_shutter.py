@@ -220,7 +220,7 @@ def test_a_readout_that_moves_much_is_told(shift: float, columns: bool, told: bo
         assert ("columns" if columns else "rows") in reason
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rows_are_drawn_as_the_simulated_camera_draws_them() -> None:
     """A picture of one moment, drawn again row by row by its depth and the true motion, is the one that the simulated
     camera takes with that readout; oracle: that camera. Most of what the readout changes is there.
@@ -243,6 +243,7 @@ def test_rows_are_drawn_as_the_simulated_camera_draws_them() -> None:
         rolled(replace(frames[0], depth=None), velocities[0], at_once.camera.intrinsics, 0.02)
 
 
+@pytest.mark.long
 def test_corners_that_judge_are_of_the_middle_of_the_image() -> None:
     """Where rows are read one by one, depth and true motion carry corners beside where they were followed, and nearer
     to that once the readout is taken out of them; oracle: the simulated camera.

@@ -36,7 +36,6 @@ ONLY_DENSE: dict[str, Leaf] = {
     "marginal intrinsics": lambda p: p.marginal.intrinsics,
 }
 LEAVES = ONLY_LANDMARKS | ONLY_DENSE
-LONG = ("depth mean", "marginal poses")
 
 
 def made() -> tuple[Problem, State]:
@@ -58,9 +57,8 @@ def by_all() -> Problem:
     return eqx.filter_jit(eqx.filter_grad(loss))(problem, state)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.long if n in LONG else pytest.mark.slow) for n in LEAVES]
-)
+@pytest.mark.slow  # half a minute of compilation each; test_learning.py differentiates by one leaf, too
+@pytest.mark.parametrize("name", LEAVES)
 def test_one_leaf_alone(name: str, by_all: Problem) -> None:
     # Proves that a leaf which touches only landmarks, or only poses and camera, has its derivative too. Oracle: the
     # gradient by all leaves, which finite differences confirm (tests/test_gradients.py).

@@ -35,7 +35,8 @@ def test_what_cannot_be_printed_is_told(words: tuple[str, ...], unbuffered: bool
     assert done.stderr.startswith(LOST)
 
 
-@pytest.mark.parametrize("stream", ["stdout", pytest.param("stderr", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("stream", ["stdout", pytest.param("stderr", marks=pytest.mark.slow)])
 def test_a_run_that_cannot_print_is_written_as_a_whole(
     tmp_path: Path, stream: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -183,7 +183,7 @@ def test_gradients_in_reverse_mode(name: str, solved: State, by_dense: Tree) -> 
     assert worst(found, by_dense) < tolerance
 
 
-@pytest.mark.long
+@pytest.mark.slow  # a minute of compilation; test_single_leaves.py has the same of the dense way
 def test_a_derivative_whose_system_was_not_solved_can_be_refused(solved: State) -> None:
     # Proves that a derivative is NaN where it is asked for and its linear system was not solved, though the point is an
     # optimum. Oracle: two iterations cannot be enough, see above.

@@ -74,9 +74,10 @@ def used(model: Any) -> tuple[jax.Array, jax.Array]:
     return model.gram.at[-1, -1].set(0.0), model.coupled
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(  # one kind of kernel, so that it is compiled once
     ("shape", "camera"),
-    [(1.0, vg.Pinhole), (-2.0, vg.Pinhole), pytest.param(1.0, vg.SquarePinhole, marks=pytest.mark.long)],
+    [(1.0, vg.Pinhole), (-2.0, vg.Pinhole), pytest.param(1.0, vg.SquarePinhole, marks=pytest.mark.slow)],
 )
 def test_what_is_written_by_hand_is_what_is_derived(shape: float, camera: type[vg.AbstractCamera]) -> None:
     # Proves energy, columns (with and without a correction), gradient and exact model of points and lines, outliers,

@@ -155,6 +155,25 @@ def test_a_camera_that_cannot_be_is_told_though_nobody_gave_it(healthy: Walk) ->
         assert ["what was found cannot be right" in text for text in texts] == [True] * told
 
 
+def test_a_guess_that_was_never_checked_is_told(healthy: Walk) -> None:
+    """Where two keyframes are all, nothing tells of the camera; where there are more, it is estimated, and nothing is
+    said. Oracle: both.
+    """
+    nobody = replace(healthy.estimate, sigma=np.full(4, 150.0))
+    texts = [finding.text for finding in check_camera(replace(nobody, guessed=True), None, SIZE)]
+    assert ["is a guess" in text for text in texts] == [True]
+    assert check_camera(nobody, None, SIZE) == []
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1.05, False), (0.92, False), (1.25, True), (0.75, True)])
+def test_a_lens_that_changes_the_focal_length_much_is_told(healthy: Walk, factor: float, told: bool) -> None:
+    """Either way; oracle: the focal length without it."""
+    nobody = replace(healthy.estimate, sigma=np.full(4, 150.0))
+    estimate = replace(nobody, focal_without_lens=float(K[0] / factor))
+    texts = [finding.text for finding in check_camera(estimate, None, SIZE)]
+    assert ["by the lens that was found" in text for text in texts] == [True] * told
+
+
 def test_a_focal_length_that_a_map_without_depth_wants_is_told(healthy: Walk) -> None:
     """20 % are told with the right one; 5 %, or what the run has moved to by itself, are not. Oracle: the intrinsics
     that the walk was made with.

@@ -211,6 +211,7 @@ class Sight(vg.PoseTerm):
         return camera.project(pose @ jnp.array([0.1, 0.2, 3.0]))
 
 
+@pytest.mark.long
 def test_what_speaks_of_held_unknowns_alone_is_no_redundancy() -> None:
     # Proves that rows which never change are left out by what they depend on, whatever their class. Oracle: what is
     # held.

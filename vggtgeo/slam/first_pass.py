@@ -60,6 +60,7 @@ def begin_with_found_camera(
             given_intrinsics=found.intrinsics,
             camera_found=True,
             lens=found.lens,
+            focal_without_lens=found.focal_without_lens,
             notes=(_note(found, passes),),
         )
         moved = np.abs(found.intrinsics[:2] / last[0].intrinsics[:2] - 1).max()

@@ -21,7 +21,7 @@ from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, undistorted
 from vggtgeo.slam.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
 from vggtgeo.slam.settings import SlamSettings
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window import solve_jit
 
@@ -33,7 +33,7 @@ SURE, MOST_WARP = 5.0, 3.0
 
 def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     """Bundle-adjust every keyframe: features and, where there is metric depth, surfaces, in a few rounds."""
-    if len(slam.keyframes) < 3 or not slam.pairs:
+    if len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA or not slam.pairs:
         return slam
     edges = _edges(slam, settings)
     degrees = np.bincount([edge.host for edge in edges])
@@ -169,7 +169,8 @@ def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> 
     """The state of the run with its lens taken out, if that pays, and a word on it."""
     if found is None or not found.pays:
         return slam
-    adjusted = undistorted(_taken(slam, adjustment, found.state), found.camera)
+    without = float(slam.intrinsics[0])
+    adjusted = replace(undistorted(_taken(slam, adjustment, found.state), found.camera), focal_without_lens=without)
     k1, k2, *_ = found.camera.distortion
     note = (
         f"nobody gave the camera, and its lens distorts: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "

@@ -19,6 +19,9 @@ from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
+LEAST_TO_FIND_A_CAMERA = 3
+"""Keyframes; as many as the last adjustment needs."""
+
 
 @dataclass(frozen=True, eq=False)
 class SecondMotion:
@@ -115,7 +118,8 @@ class Slam:
     the last adjustment of a given camera without measured depth finds if they are free, float64 [2], pixels; None where
     they explain matches no better than chance. readout: of the rolling shutter that the last adjustment found and took
     out of the poses (`rolling_shutter.py`); pixels and images stay as they were read. between: rows of the last frames,
-    and their views, that wait for the next keyframe (`frame_refinement.py`).
+    and their views, that wait for the next keyframe (`frame_refinement.py`). focal_without_lens: the focal length, in
+    pixels, that the frames by which `lens` was found had told before it.
     """
 
     intrinsics: np.ndarray
@@ -146,6 +150,7 @@ class Slam:
     focal_wanted: np.ndarray | None = None
     readout: Readout | None = None
     between: tuple[tuple[int, RgbdView], ...] = ()
+    focal_without_lens: float | None = None
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)

@@ -66,7 +66,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 8
+VERSION = 9
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -112,6 +112,12 @@ def _with_second_motions(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
+def _with_focal_without_lens(header: Header) -> Header:
+    """Version 8 did not keep by how much a lens that was found changed the focal length."""
+    tree, classes = with_field(header["tree"], header["classes"], "Slam", "focal_without_lens")
+    return {**header, "tree": tree, "classes": classes}
+
+
 UPGRADES = {
     1: _with_recorded_times,
     2: _with_lens,
@@ -120,6 +126,7 @@ UPGRADES = {
     5: _with_enlargement,
     6: _with_readout,
     7: _with_second_motions,
+    8: _with_focal_without_lens,
 }
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)

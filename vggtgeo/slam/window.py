@@ -28,7 +28,7 @@ from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.line_triangulation import with_segment_depths
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
@@ -191,8 +191,10 @@ def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) 
 
 
 def _camera_sigma(slam: Slam, settings: SlamSettings) -> np.ndarray:
-    """Of the camera's prior in a window, float64 [4], pixels: what a first pass found is held, as a given one is."""
-    if not slam.camera_found:
+    """Of the camera's prior in a window, float64 [4], pixels: what a first pass found is held, as a given one is, and
+    so is a guess while there are two keyframes. 521 px, both, became 524 and 580 by such two and their depth.
+    """
+    if not slam.camera_found and (slam.calibrated or len(slam.keyframes) >= LEAST_TO_FIND_A_CAMERA):
         return slam.intrinsics_sigma
     return np.full(4, settings.camera.known_intrinsics_sigma * slam.given_intrinsics[0])
 

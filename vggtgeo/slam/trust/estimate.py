@@ -10,7 +10,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.state import Readout, Slam
+from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Readout, Slam
 
 GUESSED = 0.1
 """A prior on the focal length that is wider than this share of it stands for a guess."""
@@ -26,7 +26,8 @@ class Estimate:
     has. started: whether there ever was a map. by_surface: bool [n], frames that picture and surfaces place beyond
     doubt, without any match; None: no frame. focal_wanted: focal lengths that the last adjustment found if they are
     free, float64 [2], pixels; None where that explained nothing. readout: of the rolling shutter that was found.
-    in_known_map: whether the run began in the map of an earlier one.
+    in_known_map: whether the run began in the map of an earlier one. guessed: whether nobody gave the camera, and too
+    little was seen to find it. focal_without_lens: pixels, by the frames that told of a lens, before it was found.
     """
 
     frames: np.ndarray
@@ -45,6 +46,8 @@ class Estimate:
     focal_wanted: np.ndarray | None = None
     readout: Readout | None = None
     in_known_map: bool = False
+    guessed: bool = False
+    focal_without_lens: float | None = None
 
     @classmethod
     def of(cls, slam: Slam) -> Self:
@@ -68,6 +71,8 @@ class Estimate:
             slam.focal_wanted,
             slam.readout,
             any(keyframe.frame < 0 for keyframe in slam.keyframes),
+            not (slam.calibrated or slam.camera_found) and len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA,
+            slam.focal_without_lens,
         )
 
     def __len__(self) -> int:
