@@ -295,7 +295,7 @@ def test_seven_scenes_as_published_is_registered(tmp_path: Path) -> None:
 @pytest.mark.parametrize("colour", ["rgb_png/{}.png", "color_images/{}.png"])
 def test_a_few_loose_pictures_are_not_the_recording(tmp_path: Path, colour: str) -> None:
     # Proves that folders whose names say the format, too, are paired, and that pictures beside them are left out with a
-    # word where they are few. Oracle: what was written.
+    # word where they are few, or depth is there for every image. Oracle: what was written.
     folder = tmp_path / "own"
     for number in range(12):
         tiny_sequences.write_image(folder / colour.format(number), tiny_sequences.image(number))
@@ -307,7 +307,10 @@ def test_a_few_loose_pictures_are_not_the_recording(tmp_path: Path, colour: str)
     assert (type(sequence).__name__, len(sequence), sequence.has_depth) == ("RgbdFolders", 12, True)
     for number in range(2):
         tiny_sequences.write_image(folder / f"another{number}.png", tiny_sequences.image(0))
-    with pytest.warns(InputWarning, match="`.*` in it has 12: give that folder to read those"):
+    with pytest.warns(InputWarning, match="3 images beside"):
+        assert len(open_sequence(folder)) == 12
+    (folder / "depth_png" / "11.png").unlink()  # now it is not so clear what is meant
+    with pytest.warns(InputWarning, match=f"`{colour.split('/')[0]}` in it has 12: give that folder to read those"):
         assert len(open_sequence(folder)) == 3
 
 

@@ -55,13 +55,12 @@ def _tell_of_more(folder: Path, count: int) -> None:
     """The recording may be in a folder below, and what lies here a few pictures of it."""
     below = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
     more = {path.name: len(image_files(path)) for path in below}
-    for name, number in more.items():
-        if number > count:
-            text = (
-                f"`{folder}`: reading its {count} images; `{name}` in it has {number}: give that folder to read those"
-            )
-            warnings.warn(text, InputWarning, stacklevel=4)
-            return
+    larger = [name for name, number in more.items() if number > count]
+    if larger:
+        # Of colour and depth the first is meant.
+        name = next((name for name in larger if "depth" not in name.lower()), larger[0])
+        text = f"reading its {count} images; `{name}` in it has {more[name]}: give that folder to read those"
+        warnings.warn(f"`{folder}`: {text}", InputWarning, stacklevel=4)
 
 
 def natural_key(name: str) -> list[int | str]:

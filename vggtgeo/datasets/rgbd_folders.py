@@ -23,8 +23,9 @@ COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
 DEPTH = ("depth", "depths")
 _SAYS_NOTHING = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
 """Endings of the names of folders: `rgb_png`, `depth_images`."""
-MOST_LOOSE = 0.1
-"""Of the images in the folder of colour: so few beside it are none of the recording."""
+MOST_LOOSE, MOST_LOOSE_BESIDE_DEPTH = 0.1, 0.5
+"""Of the images in the folder of colour: so few beside it are none of the recording; where there is a folder of as many
+depths, too, it is clear what the recording is."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,12 @@ class RgbdFolders(FolderSequence):
     @classmethod
     def matches(cls, folder: Path) -> bool:
         """Whether `folder` has images in a folder named as one of `COLOUR`, and hardly any of its own."""
-        colour = _folder(folder, COLOUR)
-        return colour is not None and len(image_files(folder)) <= MOST_LOOSE * len(image_files(colour))
+        colour, depth = _folder(folder, COLOUR), _folder(folder, DEPTH)
+        if colour is None:
+            return False
+        count = len(image_files(colour))
+        paired = depth is not None and len(image_files(depth)) == count
+        return len(image_files(folder)) <= (MOST_LOOSE_BESIDE_DEPTH if paired else MOST_LOOSE) * count
 
     @classmethod
     def open(cls, folder: Path) -> Self:
