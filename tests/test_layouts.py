@@ -310,7 +310,7 @@ def test_a_few_loose_pictures_are_not_the_recording(tmp_path: Path, colour: str)
     with pytest.warns(InputWarning, match="3 images beside"):
         assert len(open_sequence(folder)) == 12
     (folder / "depth_png" / "11.png").unlink()  # now it is not so clear what is meant
-    with pytest.warns(InputWarning, match=f"`{colour.split('/')[0]}` in it has 12: give that folder to read those"):
+    with pytest.warns(InputWarning, match=f"`{Path(colour).parent}` in it has 12: give that folder to read those"):
         assert len(open_sequence(folder)) == 3
 
 
