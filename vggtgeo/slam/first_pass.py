@@ -61,7 +61,7 @@ def begin_with_found_camera(
             camera_found=True,
             lens=found.lens,
             focal_without_lens=found.focal_without_lens,
-            notes=(_note(found, passes),),
+            notes=(_note(found, passes, camera),),
         )
         moved = np.abs(found.intrinsics[:2] / last[0].intrinsics[:2] - 1).max()
         if moved < SETTLED and (found.lens is None) == (last[0].lens is None):
@@ -84,10 +84,13 @@ def _is_plausible(found: Slam, camera: Camera) -> bool:
     return True
 
 
-def _note(found: Slam, passes: int) -> str:
+def _note(found: Slam, passes: int, camera: Camera) -> str:
     focal = " and ".join(dict.fromkeys(f"{value:.1f}" for value in found.intrinsics[:2]))
     times = "a first pass" if passes == 1 else f"{passes} first passes"
-    text = f"nobody gave the camera: {times} over {len(found.frames)} frames found a focal length of {focal} px"
+    text = (
+        f"nobody gave the camera: {times} over {len(found.frames)} frames found a focal length of {focal} px in images "
+        f"of {camera.width} x {camera.height}"
+    )
     if found.lens is None:
         return text
     k1, k2, *_ = found.lens.distortion
