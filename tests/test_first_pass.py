@@ -56,7 +56,7 @@ def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
     assert slam.intrinsics.tolist() == slam.given_intrinsics.tolist() == list(LENS.intrinsics)
     assert not slam.calibrated, "the last adjustment estimates it once more"
     assert (slam.frames, slam.keyframes, slam.factors) == ((), (), ())
-    assert "280.0 px and a lens that distorts, k1 -0.100" in slam.notes[0]
+    assert "280.0 px (images of 320 x 240) and a lens that distorts, k1 -0.100" in slam.notes[0]
     plain = begun(monkeypatch, found())
     assert plain is not None
     assert plain.lens is None

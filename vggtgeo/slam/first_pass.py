@@ -88,8 +88,8 @@ def _note(found: Slam, passes: int, camera: Camera) -> str:
     focal = " and ".join(dict.fromkeys(f"{value:.1f}" for value in found.intrinsics[:2]))
     times = "a first pass" if passes == 1 else f"{passes} first passes"
     text = (
-        f"nobody gave the camera: {times} over {len(found.frames)} frames found a focal length of {focal} px in images "
-        f"of {camera.width} x {camera.height}"
+        f"nobody gave the camera: {times} over {len(found.frames)} frames found a focal length of {focal} px "
+        f"(images of {camera.width} x {camera.height})"
     )
     if found.lens is None:
         return text
