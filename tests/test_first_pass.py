@@ -60,7 +60,7 @@ def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
     plain = begun(monkeypatch, found())
     assert plain is not None
     assert plain.lens is None
-    assert plain.notes[0].endswith("focal length of 280.0 px")
+    assert plain.notes[0].endswith("focal length of 280.0 px (images of 320 x 240)")
 
 
 def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:
