@@ -27,6 +27,8 @@ from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.window import _camera_sigma
 
 SEQUENCE = recorded_run().sequence
 GUESS = Camera.guess(SEQUENCE.camera.width, SEQUENCE.camera.height)
@@ -49,10 +51,10 @@ def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
 
 def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that camera and lens are handed on, with a word for the user, and nothing else of the pass.
-    slam = begun(monkeypatch, found(lens=LENS))
+    slam = begun(monkeypatch, found(lens=LENS, focal_without_lens=300.0))
     assert slam is not None
     assert slam.camera_found
-    assert slam.lens == LENS
+    assert (slam.lens, slam.focal_without_lens) == (LENS, 300.0)
     assert slam.intrinsics.tolist() == slam.given_intrinsics.tolist() == list(LENS.intrinsics)
     assert not slam.calibrated, "the last adjustment estimates it once more"
     assert (slam.frames, slam.keyframes, slam.factors) == ((), (), ())
@@ -61,6 +63,19 @@ def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
     assert plain is not None
     assert plain.lens is None
     assert plain.notes[0].endswith("focal length of 280.0 px (images of 320 x 240)")
+
+
+def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
+    # Proves that a window of two keyframes leaves a camera that nobody gave where it is, that one of three does not,
+    # and that the verdict knows which of them it has. Oracle: the standard deviations of the priors.
+    wide = replace(recorded_run().slam, intrinsics_sigma=np.full(4, 100.0), camera_found=False)
+    for count, held in ((2, True), (3, False)):
+        slam = replace(wide, keyframes=wide.keyframes[:count])
+        assert bool(_camera_sigma(slam, SETTINGS)[0] < 1.0) == held
+        numbers = frozenset(range(count))
+        pairs = tuple(pair for pair in wide.pairs if numbers.issuperset(pair.key))
+        frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
+        assert Estimate.of(replace(slam, pairs=pairs, frames=frames, factors=(), origins=(0,))).guessed == held
 
 
 def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:
