@@ -174,7 +174,7 @@ def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
     settings = updated(
         SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 2, "global_rounds": 1}}
     )
-    kept = solve_jit._cached._cache_size
+    kept = lambda: solve_jit.prepared
     before = kept()
     compile_global(shape_for(len(tracked.keyframes), settings), settings)
     compiled = kept()

@@ -126,10 +126,10 @@ def test_what_is_compiled_ahead_is_what_is_needed(room: Room) -> None:
     """Alignments of a camera's views compile nothing more than was compiled for it; oracle: JAX's count."""
     frames, camera, _ = room
     compile_alignment(camera)
-    before = _align._cache_size()
+    before = _align.prepared
     views = [_view(frames[i], np.array(camera.intrinsics)) for i in (0, 2)]
     assert RgbdAlignment().align(*views, np.eye(4)) is not None
-    assert _align._cache_size() == before
+    assert _align.prepared == before
 
 
 @pytest.mark.parametrize("count", [61, 100, 2399])

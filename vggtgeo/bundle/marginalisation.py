@@ -32,6 +32,7 @@ from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_whole
+from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.solvers.arrow import reduce
 
 _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
@@ -73,11 +74,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> Marg
     check_pair(problem, state)
     if not isinstance(leaving, jax.core.Tracer):
         check_whole("leaving", np.asarray(leaving).item(), 0, problem.num_keyframes - 1)
-    prior = next((term for term in problem.terms if isinstance(term, MarginalPrior)), None)
-    if prior is None:
-        raise ValueError(
-            "`problem` has no `marginal` term; add `problem.with_term(no_prior(n))` before the first marginalisation"
-        )
+    prior = _marginal_term(problem)
     point = _linearisation_point(prior, state)
     quadratic, gradient = _quadratic(problem, point, leaving)
     leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
@@ -186,4 +183,13 @@ def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) ->
     return root, offset
 
 
-marginalise_jit = jax.jit(marginalise)
+def _marginal_term(problem: Problem) -> MarginalPrior:
+    for term in problem.terms:
+        if isinstance(term, MarginalPrior):
+            return term
+    raise ValueError(
+        "`problem` has no `marginal` term; add `problem.with_term(no_prior(n))` before the first marginalisation"
+    )
+
+
+marginalise_jit = KeptProgram(marginalise, lambda problem, state, leaving: _marginal_term(problem))

@@ -24,6 +24,7 @@ from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm, node_residuals
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.io.readable import Readable
 
 
@@ -75,8 +76,7 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
     return _sizes_jit(problem, state)
 
 
-@jax.jit
-def _sizes_jit(problem: Problem, state: State) -> ResidualSizes:
+def _sizes(problem: Problem, state: State) -> ResidualSizes:
     problem = prepared(problem)
     found = {term.name: _size(term, term_residuals(problem, term, state)) for term in problem.terms}
     return ResidualSizes(
@@ -84,6 +84,15 @@ def _sizes_jit(problem: Problem, state: State) -> ResidualSizes:
         {name: count for name, (_, count) in found.items()},
         tuple((term.name, term.unit) for term in problem.terms),
     )
+
+
+def _sizes_like(problem: Problem, state: State) -> ResidualSizes:
+    numbers = {term.name: jnp.zeros(()) for term in problem.terms}
+    counts = dict.fromkeys(numbers, jnp.asarray(0))
+    return ResidualSizes(numbers, counts, tuple((term.name, term.unit) for term in problem.terms))
+
+
+_sizes_jit = KeptProgram(_sizes, _sizes_like)
 
 
 def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."]]:

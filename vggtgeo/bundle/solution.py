@@ -179,6 +179,26 @@ def _solve_jit(
     )
 
 
+def solution_like(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:
+    """A solution of the structure of the one of these, without its numbers: for what keeps programs."""
+    count, number = jnp.asarray(0), jnp.zeros(())
+    tries = jnp.zeros(solver.max_iterations + 1)
+    moved = jax.tree.map(lambda part: jnp.zeros((len(tries), *part.shape)), BundleAdjustment(problem).recorded(initial))
+    return Solution(
+        state=initial,
+        energy=number,
+        history=tries,
+        iterations=count,
+        linearisations=count,
+        gradient_norm=number,
+        termination=Termination.running,  # type: ignore[arg-type] # Equinox makes members of messages
+        polished=jnp.asarray(False),
+        gradient_residual=number,
+        at_bound=count,
+        record=IterationRecord(tries, tries, tries, moved) if solver.record_iterations else None,
+    )
+
+
 def _at_bound(problem: Problem, state: State) -> Int[Array, ""]:
     if not problem.positive_depth:
         return jnp.asarray(0)

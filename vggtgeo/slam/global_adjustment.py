@@ -61,7 +61,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         slam = replace(slam, notes=(*slam.notes, *told))
         adjustment = _without_readout(slam, adjustment)
         solver = global_solver(adjustment.problem, settings)
-        solution = solve_jit(adjustment.problem, adjustment.initial, solver=solver)
+        solution = solve_jit(adjustment.problem, adjustment.initial, solver)
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
         slam, solved = _taken(slam, adjustment, solution.state), (adjustment.problem, solution.state)
@@ -88,7 +88,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
 
 def _solves(settings: SlamSettings) -> Solve:
     """Adjusts any problem of the shape of a global adjustment."""
-    return lambda problem, state: solve_jit(problem, state, solver=global_solver(problem, settings)).state
+    return lambda problem, state: solve_jit(problem, state, global_solver(problem, settings)).state
 
 
 def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:

@@ -21,6 +21,7 @@ from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.geometry import lie, rigid
+from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
@@ -182,11 +183,13 @@ def _factor_jit(problem: Problem, state: State, determined: Array) -> Array:
 _reduced_jit = eqx.filter_jit(reduced_blocks)
 
 
-@eqx.filter_jit
-def sigma_jit(
+def _sigma(
     problem: Problem, state: State, solver: AbstractReducedSolver, asked: Int[Array, " h"]
 ) -> tuple[Array, Array]:
     """Largest variance of translation and of rotation of the keyframes asked for [h, 2], and the variance factor."""
     found = covariances(problem, state, reduced_solver=solver, keyframes=asked)
     worst = [jnp.linalg.eigvalsh(found.poses[:, part, part])[:, -1] for part in (slice(0, 3), slice(3, 6))]
     return jnp.stack(worst, axis=1), found.variance_factor
+
+
+sigma_jit = KeptProgram(_sigma, lambda problem, state, solver, asked: (asked, asked))

@@ -25,6 +25,7 @@ from jax import lax
 
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import LEVELS, Points, RgbdView
 
@@ -89,7 +90,7 @@ class RgbdAlignment:
                 _Target(target.picture, target.cells, target.sizes, target.intrinsics),
                 np.asarray(start, np.float64),
                 np.array(self.iterations, np.int32),
-                first,
+                np.int32(first),
                 noise,
             )
         motion, information, terms = jax.device_get(found)
@@ -188,8 +189,7 @@ def _processor() -> jax.Device | None:
         return None
 
 
-@jax.jit
-def _align(
+def _aligned(
     source: tuple[_Samples, _Samples],
     target: _Target,
     start: jax.Array,
@@ -231,11 +231,20 @@ def _align(
             terms,
         )
 
-    nothing = _Agreement(jnp.int32(0), jnp.array(False), jnp.float32(0))
-    terms = _Terms(nothing, nothing, jnp.float32(0))
-    begin = _Carry(jnp.asarray(first, jnp.int32), jnp.int32(0), start, jnp.zeros((6, 6)), terms)
+    begin = _Carry(jnp.asarray(first, jnp.int32), jnp.int32(0), start, jnp.zeros((6, 6)), _nothing())
     found: _Carry = lax.while_loop(lambda carry: carry.stage != DONE, step, begin)
     return found.motion, found.information, found.terms
+
+
+def _nothing() -> _Terms:
+    """Of no samples."""
+    nothing = _Agreement(jnp.int32(0), jnp.array(False), jnp.float32(0))
+    return _Terms(nothing, nothing, jnp.float32(0))
+
+
+_align: KeptProgram[tuple[jax.Array, jax.Array, _Terms]] = KeptProgram(
+    _aligned, lambda source, target, start, *settings: (start, start, _nothing())
+)
 
 
 def _brightness(edges: _Samples, target: _Target, level: jax.Array, motion: jax.Array) -> tuple[_Term, jax.Array]:

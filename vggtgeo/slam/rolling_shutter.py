@@ -296,9 +296,15 @@ def _descend(search: _Search, state: State, slope: float, longest: float, solve:
         here = seconds, float(search.slopes(seconds, state).sum())
         if not np.isfinite(here[1]):
             break
-        step = LONGEST * (here[0] - lower[0])
+        step = here[0] - lower[0]
+        farthest = here[0] + LONGEST * step
+        sought = _zero(lower, here)
         lower, upper = (lower, here) if here[1] * slope <= 0 else (here, upper)
-        following = np.clip(seconds + step, -longest, longest) if upper is None else _between(lower, upper)
+        if upper is None:
+            ahead = np.isfinite(sought) and (sought - here[0]) * step > 0
+            following = np.clip(min(sought, farthest, key=abs) if ahead else farthest, -longest, longest)
+        else:
+            following = _zero(lower, upper)
         if abs(following - seconds) * search.usual < SETTLED:
             break
         seconds = float(following)
@@ -307,6 +313,7 @@ def _descend(search: _Search, state: State, slope: float, longest: float, solve:
     return float(seconds), state
 
 
-def _between(lower: tuple[float, float], upper: tuple[float, float]) -> float:
-    """Where a line through two slopes of opposite sign is zero."""
-    return (lower[0] * upper[1] - upper[0] * lower[1]) / (upper[1] - lower[1])
+def _zero(one: tuple[float, float], other: tuple[float, float]) -> float:
+    """Where a line through two slopes is zero; not finite of equal ones."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.divide(one[0] * other[1] - other[0] * one[1], other[1] - one[1]))

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,10 +14,11 @@ from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
+from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.models.classical import can_search
 from vggtgeo.slam.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.covisibility import Directed, directions, match_keyframes
@@ -33,7 +33,12 @@ from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-solve_jit = eqx.filter_jit(solve)
+
+def _solve(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:
+    return solve(problem, initial, solver=solver)
+
+
+solve_jit = KeptProgram(_solve, solution_like)
 
 
 def window_size(settings: SlamSettings) -> PaddedSize:
@@ -62,7 +67,7 @@ def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State
 
 @in_double_precision
 def _compile_solver(problem: Problem, initial: State, settings: SlamSettings) -> None:
-    solve_jit(problem, initial, solver=window_solver(settings)).energy.block_until_ready()
+    solve_jit(problem, initial, window_solver(settings)).energy.block_until_ready()
 
 
 @in_double_precision
@@ -141,7 +146,7 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     adjustment, gauge = window_problem(slam, members, settings)
     told = (note for note in gauge_notes(gauge, adjustment.keyframes, "window") if note not in slam.notes)
     slam = replace(slam, notes=(*slam.notes, *told))
-    solution = solve_jit(adjustment.problem, adjustment.initial, solver=window_solver(settings))
+    solution = solve_jit(adjustment.problem, adjustment.initial, window_solver(settings))
     if not np.isfinite(float(solution.energy)):
         return replace(slam, notes=(*slam.notes, f"window at keyframe {members[-1].number}: {solution.message}"))
     updated, intrinsics = write_back(members, adjustment, solution.state)
