@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,14 @@ import bad_files as bad
 import cv2
 import numpy as np
 import picture_bytes as bytes_of
+import tiny_layouts as layouts
 import tiny_sequences as tiny
 from bad_row import Row, read_frames, rows
 from bad_rows_files import OPENED
 
 SIZE = (bad.WIDTH, bad.HEIGHT)
 PICTURE = bad.picture(1)
+NUL = b"\0"
 
 
 def image(content: bytes, suffix: str = ".png") -> Callable[[Path], Path]:
@@ -52,20 +55,43 @@ def other_kinds(folder: Path) -> None:
     cv2.imwrite(str(folder / "2.png"), PICTURE.astype(np.uint16) << 8)
 
 
-def depths(suffix: str, array: np.ndarray) -> Callable[[Path], Path]:
-    """A TUM folder with depth of another kind of file."""
+def depths(suffix: str, content: np.ndarray | bytes) -> Callable[[Path], Path]:
+    """A TUM folder with depth of another kind of file, written here or as bytes."""
 
     def change(folder: Path) -> None:
         for file in sorted((folder / "depth").iterdir()):
             file.unlink()
-            if suffix == ".npy":
-                np.save(file.with_suffix(suffix), array)
+            if isinstance(content, bytes):
+                file.with_suffix(suffix).write_bytes(content)
             else:
-                cv2.imwrite(str(file.with_suffix(suffix)), array)
+                cv2.imwrite(str(file.with_suffix(suffix)), content)
         listed = folder / "depth.txt"
         listed.write_text(listed.read_text().replace(".png", suffix))
 
     return bad.rgbd(change)
+
+
+def other_depth(folder: Path) -> Path:
+    """Folders of colour and depth, the depth in files of a recorder's own."""
+    layouts.rgbd(folder / "room", "rgb/{}.png", "other/{}.png")
+    bad.file("room/depth/0.raw", NUL)(folder)
+    return folder / "room"
+
+
+def zipped(folder: Path) -> Path:
+    """Good images in an archive, not packed: FFmpeg finds the first."""
+    images = bad.frames(folder / "frames")
+    with zipfile.ZipFile(folder / "frames.zip", "w") as archive:
+        for file in sorted(images.iterdir()):
+            archive.write(file, file.name)
+    return folder / "frames.zip"
+
+
+def two_in_one(folder: Path) -> Path:
+    """Two recordings in a folder of a folder."""
+    for name in ("left", "right"):
+        bad.frames(folder / "download" / "stereo" / name)
+    return folder / "download"
 
 
 def without_half(folder: Path) -> None:
@@ -105,7 +131,7 @@ def calibrated(content: str | bytes) -> Callable[[Path], Path]:
     return lambda folder: bad.frames(folder / "frames", calibration=content)
 
 
-GREATEST = np.full((tiny.HEIGHT, tiny.WIDTH), 1.5, np.float32)
+METRES = np.full((tiny.HEIGHT, tiny.WIDTH), 1.5, np.float32)
 NEGATIVE = np.full((tiny.HEIGHT, tiny.WIDTH), -5, np.int16)
 IMAGES = rows(
     "Images",
@@ -148,15 +174,29 @@ IMAGES = rows(
         ("half a WebP", image(bad.encoded(".webp")[:300], ".webp")),
         ("half a BMP", image(bad.encoded(".bmp")[:3000], ".bmp")),
         ("half a PNG, filled up with zeros", image(bad.encoded(".png")[:3000] + b"\0" * 5000)),
+        ("a zip archive of images", zipped),
+        ("a tar archive", bad.file("frames.tar", NUL * 200 + b"\0" * 57 + b"ustar\0" + NUL)),
+        ("a gzip archive", bad.file("frames.tgz", b"\x1f\x8b\x08" + NUL)),
+        ("recordings in folders below", two_in_one),
+        (
+            "colour and depth in one folder",
+            lambda folder: layouts.rgbd(folder / "room", "color_{}.png", "depth_{}.png"),
+        ),
     ],
     call=read_frames,
 )
 DEPTH = rows(
     "Depth images",
     [
-        ("floating-point TIFF", depths(".tiff", GREATEST)),
+        ("floating-point TIFF", depths(".tiff", METRES)),
         ("TIFF of negative numbers", depths(".tiff", NEGATIVE)),
-        ("`.npy`", depths(".npy", GREATEST)),
+        ("`.npy` of floats", depths(".npy", bytes_of.npy(METRES))),
+        ("`.npy` of Python objects", depths(".npy", bytes_of.npy(np.array([[{}]], object)))),
+        ("`.npy` of three numbers a pixel", depths(".npy", bytes_of.npy(np.stack([METRES] * 3, -1)))),
+        ("half an `.npy`", depths(".npy", bytes_of.npy(METRES)[:1000])),
+        ("an `.npy` that declares 70 TiB", depths(".npy", bytes_of.npy_header((10**7, 10**6)))),
+        ("floats of 1e10, which renderers write where there is nothing", depths(".tiff", 1e10 * METRES)),
+        ("a folder `depth` of other files", other_depth),
         ("half of them all zero", bad.rgbd(without_half)),
     ],
     call=read_frames,

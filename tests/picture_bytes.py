@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 
@@ -120,3 +121,17 @@ def bmp_header(width: int, height: int) -> bytes:
     """A BMP that declares so many pixels and has hardly any."""
     sizes = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 24, 0, 0, 0, 0, 0, 0)
     return b"BM" + struct.pack("<IHHI", 1000, 0, 0, 54) + sizes + b"\0" * 900
+
+
+def npy(array: np.ndarray) -> bytes:
+    """A file of NumPy."""
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=True)
+    return stream.getvalue()
+
+
+def npy_header(shape: tuple[int, ...]) -> bytes:
+    """One that declares so many floats, and holds none."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    return stream.getvalue()

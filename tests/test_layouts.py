@@ -57,6 +57,10 @@ def test_replica(tmp_path: Path) -> None:
         ("RGB/rgb_{}.png", "Depth/depth_00{}.png"),
         ("images/130503110{}.175304.png", "depth/130503110{}.162211.png"),
         ("image/{}_left_a1.png", "depth/{}_depth_a1.png"),  # only the order tells
+        ("rgb/{}.png", "aligned_depth_to_color/{}.png"),
+        ("color_{}.png", "depth_{}.png"),  # one folder for both
+        ("{:05d}-color.png", "{:05d}-depth.png"),
+        ("{}.png", "depth{}.png"),
     ],
 )
 def test_folders_of_colour_and_depth_are_paired(tmp_path: Path, colour: str, depth: str) -> None:
@@ -68,6 +72,32 @@ def test_folders_of_colour_and_depth_are_paired(tmp_path: Path, colour: str, dep
     halved = with_depth_scale(sequence, 2000.0)
     assert next(iter(halved.frames())).depth[3, 7] == pytest.approx(1.007 / 2)
     assert next(iter(with_rate(sequence, 10.0).frames(2))).timestamp == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".tiff", ".pfm"])
+def test_depth_of_floats_is_in_metres(tmp_path: Path, suffix: str) -> None:
+    # Proves the convention, its other units, and what is no depth: nothing, infinities, what a renderer writes for the
+    # sky, no picture but an array. Oracle: what was written.
+    folder = tiny.rgbd(tmp_path / "own")
+    for file in sorted((folder / "depth").iterdir()):
+        depth = np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float32) / 1000
+        depth[0, :5] = 0.0, -1.0, np.inf, np.nan, 1e10
+        np.save(file.with_suffix(".npy"), depth) if suffix == ".npy" else cv2.imwrite(
+            str(file.with_suffix(suffix)), depth
+        )
+        file.unlink()
+    sequence = tiny.quietly_opened(folder)
+    frames = _check(sequence, "RgbdFolders")
+    assert [frame.depth[3, 7] for frame in frames] == pytest.approx([1.007, 1.017, 1.027])
+    assert np.isnan(frames[0].depth[0, :5]).all()
+    assert next(iter(with_depth_scale(sequence, 2.0).frames())).depth[3, 7] == pytest.approx(1.007 / 2)
+
+
+def test_pictures_of_which_one_is_called_depth_are_pictures(tmp_path: Path) -> None:
+    # Proves that a folder is one of RGB-D only where half of the images have a depth.
+    folder = tiny.rgbd(tmp_path / "own", "{}.png", "other/{}.png")
+    tiny_sequences.write_image(folder / "depth_1.png", tiny_sequences.image(1))
+    assert type(tiny.quietly_opened(folder)).__name__ == "ImageFolder"
 
 
 def test_folders_that_cannot_be_paired_are_named(tmp_path: Path) -> None:

@@ -137,5 +137,5 @@ RateOption = Annotated[
 ]
 DepthScaleOption = Annotated[
     float | None,
-    typer.Option(help="Units a metre of 16-bit depth files, in place of what their layout says: 1000 is millimetres."),
+    typer.Option(help="Units a metre of depth files, in place of what their layout says: 1000 is millimetres."),
 ]

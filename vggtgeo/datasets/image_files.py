@@ -6,6 +6,7 @@ simplejpeg, which says what libjpeg-turbo warns of, files are looked at before (
 as they are stored.
 """
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,18 +18,28 @@ from jaxtyping import Float, UInt8
 from vggtgeo.datasets.image_defects import decoding_defect, defect
 from vggtgeo.datasets.image_orientation import as_stored, orientation
 from vggtgeo.datasets.image_sizes import declared_white
+from vggtgeo.io.archives import UNREADABLE, array_header
 from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 
 
+DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
+
+
 @dataclass(frozen=True)
 class DepthFormat:
-    """How a depth file codes metres: 16-bit, `units_per_metre`, and the codes that mean "no depth"."""
+    """How a depth file codes metres: `units_per_metre` of 16-bit numbers, and which of them mean "no depth"; floats are
+    metres by convention, `floats_per_metre` of them.
+    """
 
     units_per_metre: float
     invalid: tuple[int, ...] = (0,)
+    floats_per_metre: float = 1.0
 
+
+FARTHEST = 1000.0
+"""Metres, of a float: renderers write 1e10 where there is nothing."""
 
 MILLIMETRES = DepthFormat(1000.0, (0, 65535))
 """7-Scenes: 0 and, as published, 65535 mean none."""
@@ -77,31 +88,61 @@ def read_image_file(path: Path, least_bits: int = 8) -> ImageFile:
 
 
 def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
-    """The depth, float32 metres, NaN for none; InputError where the file is no 16-bit one-channel image."""
-    _, codes = _decode(path, cv2.IMREAD_UNCHANGED)
+    """The depth, float32 metres, NaN for none, of an image or an array of NumPy (`.npy`); InputError where it has not
+    one channel, of 16-bit numbers or of floats.
+    """
+    codes = _array(path) if path.suffix.lower() == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)[1]
+    codes = codes[..., 0] if codes.ndim == 3 and codes.shape[2] == 1 else codes
+    if codes.ndim == 2 and np.issubdtype(codes.dtype, np.floating):
+        with np.errstate(over="ignore", invalid="ignore"):
+            depth = np.divide(codes, coding.floats_per_metre).astype(np.float32)
+            return np.where((depth > 0) & (depth <= FARTHEST), depth, np.float32(np.nan))
     if codes.dtype != np.uint16 or codes.ndim != 2:
-        raise InputError(f"`{path}`: found {codes.dtype} of shape {codes.shape}; depth must be uint16 with one channel")
+        raise InputError(
+            f"`{path}`: found {codes.dtype} of shape {codes.shape}; depth must have one channel, of uint16 or of "
+            "floats in metres"
+        )
     depth = np.divide(codes, np.float32(coding.units_per_metre), dtype=np.float32)
     for code in coding.invalid:
         depth[codes == code] = np.nan
     return depth
 
 
+def _array(path: Path) -> np.ndarray:
+    """What an `.npy` file holds; no pickle is opened, and no size that its header declares is believed."""
+    content = _content(path)
+    try:
+        stream = io.BytesIO(content)
+        header = array_header(stream)
+        if header.dtype.hasobject:
+            raise ValueError("it holds Python objects")
+        if header.bytes != len(content) - stream.tell():
+            raise ValueError(f"it declares {header.bytes} bytes and has {len(content) - stream.tell()}")
+        return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
+    except UNREADABLE as error:
+        raise InputError(f"`{path}` is no array of NumPy that can be read: {error}") from None
+
+
 MOST_BYTES = 700_000_000
 """Of an image's file: all that is decoded, a hundred million pixels, unpacked, of 16 bits in three channels."""
 
 
-def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
-    """The file's bytes, and the image in them."""
+def _content(path: Path) -> bytes:
+    """All bytes of a regular file that is no larger than an image can be."""
     try:
         if path.exists() and not path.is_file():  # a list may name a pipe, which has no end
             raise InputError(f"`{path}` is no regular file")
         size = path.stat().st_size
         if size > MOST_BYTES:
             raise InputError(f"`{path}` has {size} bytes, more than {MOST_BYTES}: not decoded")
-        content = path.read_bytes()
+        return path.read_bytes()
     except (OSError, ValueError) as error:  # a name from a list may be none that a file system takes
         raise InputError(f"`{path}` cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
+    """The file's bytes, and the image in them."""
+    content = _content(path)
     wrong = defect(content)
     if wrong:
         raise InputError(f"`{path}` {wrong}")

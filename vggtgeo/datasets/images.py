@@ -69,12 +69,12 @@ def natural_key(name: str) -> list[int | str]:
     return [int(part) if row % 2 else part.lower() for row, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def image_files(folder: Path) -> list[Path]:
-    """The images in `folder`, in natural order.
+def image_files(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[Path]:
+    """The images in `folder`, in natural order; suffixes: of what counts as one.
 
     Hidden files are none of them: macOS puts one beside each file that it copies to another disk (`._1.png`).
     """
-    names = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != ".")
+    names = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.name[0] != ".")
     found = (path for path in names if path.is_file())
     return sorted(found, key=lambda path: (natural_key(path.name), path.name))
 

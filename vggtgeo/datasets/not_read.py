@@ -20,7 +20,33 @@ def reason_not_read(place: Path) -> str | None:
             f"`{place}` is a part of KITTI's raw recordings; give the folder of a drive, which holds `image_02/data` "
             "or `image_00/data`"
         )
+    if place.is_file() and (kind := _archive(place)):
+        return f"`{place}` is {kind}; unpack it, and give the folder of images or the video that is in it"
     return None
+
+
+_ARCHIVES = {
+    b"PK\x03\x04": "a zip archive",
+    b"\x1f\x8b": "a gzip archive",
+    b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive",
+    b"Rar!": "a RAR archive",
+    b"BZh": "a bzip2 archive",
+    b"\xfd7zXZ": "an xz archive",
+    b"\x28\xb5\x2f\xfd": "a zstd archive",
+}
+"""First bytes of the common ones; FFmpeg takes one that holds a picture for a video of one frame."""
+_TAR = 257, b"ustar"
+
+
+def _archive(file: Path) -> str | None:
+    try:
+        with file.open("rb") as opened:
+            head = opened.read(_TAR[0] + len(_TAR[1]))
+    except OSError:
+        return None
+    if head[_TAR[0] :] == _TAR[1]:
+        return "a tar archive"
+    return next((kind for start, kind in _ARCHIVES.items() if head.startswith(start)), None)
 
 
 def _is_record3d(place: Path) -> bool:

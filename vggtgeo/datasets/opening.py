@@ -1,6 +1,9 @@
 """Which reader a path needs, by looking at it."""
 
 import os
+from collections import deque
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
@@ -114,7 +117,7 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
         reason_not_read(place)
         or f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
         "a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of `vggtgeo data list`, or a folder "
-        "of images"
+        f"of images{_hint(place)}"
     )
 
 
@@ -130,6 +133,38 @@ def _open_video(file: Path) -> Sequence:
     if reason := reason_not_read(file):
         raise InputError(reason)
     return VideoFile.open(file)
+
+
+def _hint(folder: Path) -> str:
+    """What in a folder can be read in its place, as the end of a sentence."""
+    found = [f"`{path}`" for path in islice(_readable_below(folder), 4)]
+    if not found:
+        return ""
+    return f"; in it can be read: {', '.join(found[:3])}" + (", ..." if len(found) > 3 else "")
+
+
+def _readable_below(folder: Path) -> Iterator[Path]:
+    """Recordings in a folder and those below it, the nearest first."""
+    waiting = deque([(folder, 0)])
+    for _ in range(_MOST_LOOKED_AT):
+        if not waiting:
+            return
+        place, depth = waiting.popleft()
+        try:
+            inside = sorted(path for path in place.iterdir() if not path.name.startswith((".", "__")))
+            yield from (path for path in inside if path.suffix.lower() in _VIDEOS and path.is_file())
+            for path in (path for path in inside if path.is_dir()):
+                if any(reader.matches(path) for reader in FOLDER_KINDS.values()):
+                    yield path
+                elif depth < _DEEPEST:
+                    waiting.append((path, depth + 1))
+        except OSError:  # a folder that may not be looked into
+            continue
+
+
+_VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".bag", ".mcap"})
+_MOST_LOOKED_AT, _DEEPEST = 100, 2
+"""Folders, and levels below the one that was given: a whole disk is not searched for a hint."""
 
 
 def _names(folder: Path, most: int = 4) -> str:

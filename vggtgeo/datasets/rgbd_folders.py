@@ -1,7 +1,9 @@
-"""Two folders side by side, colour and depth, as recorders and scripts write them: `rgb/0.png` and `depth/0.png`.
+"""Colour and depth as recorders and scripts write them: folders `rgb/0.png` and `depth/0.png` side by side, or both in
+one folder, told apart by a word of their names (`color_0.jpg`, `depth_0.png`).
 
 Open3D's recorders write `color/`, `depth/` and `intrinsic.json`; many of one's own write `rgb/` and `depth/`, and no
-camera. Depth is in millimetres, as Open3D, RealSense and Kinect have it, unless `with_depth_scale` says otherwise.
+camera. Depth is in millimetres, as Open3D, RealSense and Kinect have it, or in metres where it is of floats (TIFF, PFM,
+`.npy`), unless `with_depth_scale` says otherwise.
 """
 
 import re
@@ -12,7 +14,7 @@ from pathlib import Path
 from typing import Self
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
-from vggtgeo.datasets.image_files import MILLIMETRES
+from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MILLIMETRES
 from vggtgeo.datasets.images import image_files, times_by_name
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, partners_in_time
@@ -26,11 +28,13 @@ _SAYS_NOTHING = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
 MOST_LOOSE, MOST_LOOSE_BESIDE_DEPTH = 0.1, 0.5
 """Of the images in the folder of colour: so few beside it are none of the recording; where there is a folder of as many
 depths, too, it is clear what the recording is."""
+LEAST_WITH_DEPTH = 0.5
+"""Depths an image, for a folder of both to be one of RGB-D: a picture called `depth` is none yet."""
 
 
 @dataclass(frozen=True)
 class RgbdFolders(FolderSequence):
-    """Images in one folder and, where there is a second one, their depth. Truth: `groundtruth.txt` (TUM format).
+    """Images in one folder and, in a second one or in the same, their depth. Truth: `groundtruth.txt` (TUM format).
 
     A depth belongs to the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), of the nearest
     time within 0.02 s where names are times, or of the same place in the list. Times are as in a folder of images.
@@ -38,25 +42,25 @@ class RgbdFolders(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has images in a folder named as one of `COLOUR`, and hardly any of its own."""
-        colour, depth = _folder(folder, COLOUR), _folder(folder, DEPTH)
+        """Whether `folder` has images in a folder named as one of `COLOUR`, and hardly any of its own; or names of its
+        own images say which are depth.
+        """
+        colour = _folder(folder, COLOUR)
         if colour is None:
-            return False
-        count = len(image_files(colour))
-        paired = depth is not None and len(image_files(depth)) == count
+            return _told_apart(folder) is not None
+        count, depth = len(image_files(colour)), _folder(folder, DEPTH, DEPTH_SUFFIXES)
+        paired = depth is not None and len(image_files(depth, DEPTH_SUFFIXES)) == count
         return len(image_files(folder)) <= (MOST_LOOSE_BESIDE_DEPTH if paired else MOST_LOOSE) * count
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Lists the images and finds their depths; InputError where the two cannot be paired."""
-        colour, depth = _folder(folder, COLOUR), _folder(folder, DEPTH)
-        if colour is None:
-            raise InputError(f"`{folder}` has no folder of images named {', '.join(f'`{name}`' for name in COLOUR)}")
-        images, loose = image_files(colour), image_files(folder)
+        colour, (images, depths) = _listed(folder)
+        loose = [file for file in image_files(folder) if file not in {*images, *depths}]
         if loose:
-            _warn(f"`{folder}`: {len(loose)} images beside `{colour.name}` ({loose[0].name}, ...) are left out")
+            beside = f" beside `{colour.name}`" if colour != folder else ""
+            _warn(f"`{folder}`: {len(loose)} images{beside} ({loose[0].name}, ...) are left out")
         times = times_by_name(images)
-        depths = [] if depth is None else image_files(depth)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
         alone = partners.count(None)
         if depths and alone:
@@ -78,12 +82,48 @@ class RgbdFolders(FolderSequence):
         return Trajectory.load_tum(file) if file.exists() else None
 
 
-def _folder(folder: Path, names: Sequence[str]) -> Path | None:
-    """The first of the folders `names`, in small or capital letters, that has images; `rgb_png` is `rgb`, too."""
+def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
+    """The folder of the images, and the files of images and of depths."""
+    colour = _folder(folder, COLOUR)
+    if colour is None:
+        both = _told_apart(folder)
+        if both is None:
+            raise InputError(f"`{folder}` has no folder of images named {', '.join(f'`{name}`' for name in COLOUR)}")
+        return folder, both
+    depth = _folder(folder, DEPTH, DEPTH_SUFFIXES)
+    if depth is None and (other := _there(folder, DEPTH)):
+        suffixes = sorted({path.suffix for path in other.iterdir()})
+        found = f"holds {', '.join(f'`{name}`' for name in suffixes[:4])}" if suffixes else "is empty"
+        known = ", ".join(sorted(DEPTH_SUFFIXES))
+        _warn(f"`{other}` {found}, and depth is read from files {known}; reading the images only")
+    return colour, (image_files(colour), [] if depth is None else image_files(depth, DEPTH_SUFFIXES))
+
+
+def _told_apart(folder: Path) -> tuple[list[Path], list[Path]] | None:
+    """Images and depths of one folder, by the words of their names; None where hardly any name says depth."""
+    words = lambda path: set(re.findall(r"[a-z]+", path.stem.lower()))
+    depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if words(path) & set(DEPTH)]
+    others = [path for path in image_files(folder) if not words(path) & set(DEPTH)]
+    images = [path for path in others if words(path) & set(COLOUR)] or others
+    return (images, depths) if images and len(depths) >= LEAST_WITH_DEPTH * len(images) else None
+
+
+def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str] = IMAGE_SUFFIXES) -> Path | None:
+    """The first of the folders `names` that has images; see `_there`."""
+    return next((found for name in names if (found := _there(folder, [name])) and image_files(found, suffixes)), None)
+
+
+def _there(folder: Path, names: Sequence[str]) -> Path | None:
+    """The first of the folders `names`, in small or capital letters, that is there; `rgb_png` is `rgb`, too, and depth
+    is what says so: `aligned_depth_to_color`.
+    """
     folders = sorted(path for path in folder.iterdir() if path.is_dir())
     there = {_SAYS_NOTHING.sub("", path.name.lower()): path for path in folders}
     there |= {path.name.lower(): path for path in folders}
-    return next((there[name] for name in names if name in there and image_files(there[name])), None)
+    for path in folders:
+        for word in set(re.findall(r"[a-z]+", path.name.lower())) & set(DEPTH):
+            there.setdefault(word, path)
+    return next((there[name] for name in names if name in there), None)
 
 
 def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path | None]:

@@ -69,7 +69,7 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
 
 
 def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
-    """The sequence whose 16-bit depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
+    """The sequence whose depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
 
     Raises:
         InputError: it is no positive number, or the depth comes from no such files.
@@ -81,7 +81,8 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
     if not plain or not sequence.has_depth:
         raise InputError(f"`{sequence.name}` has no depth files whose unit could be another")
     assert isinstance(sequence, FolderSequence)
-    return replace(sequence, depth_format=replace(sequence.depth_format, units_per_metre=units_per_metre))
+    coding = replace(sequence.depth_format, units_per_metre=units_per_metre, floats_per_metre=units_per_metre)
+    return replace(sequence, depth_format=coding)
 
 
 def without_depth(sequence: Sequence) -> Sequence:

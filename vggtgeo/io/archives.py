@@ -7,6 +7,7 @@ gives for them and against what the caller says of their shapes, and only then t
 
 from __future__ import annotations
 
+import io
 import math
 import struct
 import tokenize
@@ -15,6 +16,7 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -23,7 +25,7 @@ from vggtgeo.io.errors import InputError
 MOST_BYTES = 2**28
 """Bytes of all arrays together that are read: 5 million point observations."""
 # What zipfile, zlib and numpy raise for damaged archives and headers.
-_UNREADABLE = (
+UNREADABLE = (
     *(ValueError, OSError, EOFError, RuntimeError, NotImplementedError, OverflowError, MemoryError, SyntaxError),
     *(TypeError, KeyError, zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError),
 )
@@ -40,6 +42,18 @@ class ArrayHeader:
     def bytes(self) -> int:
         """Of the data."""
         return math.prod(self.shape) * self.dtype.itemsize
+
+
+def array_header(stream: IO[bytes] | io.BufferedIOBase) -> ArrayHeader:
+    """The header of an array in NumPy's format, after which the stream stands at its data; ValueError where it is
+    none.
+    """
+    version = np.lib.format.read_magic(stream)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in read:
+        raise ValueError(f"it is of version {version} of numpy's format; expected 1.0 or 2.0")
+    shape, _, dtype = read[version](stream)
+    return ArrayHeader(tuple(map(int, shape)), dtype)
 
 
 @dataclass(frozen=True)
@@ -62,19 +76,14 @@ class Archive:
         """
         info = self.members[name]
         with self.file.open(info) as stream:
-            version = np.lib.format.read_magic(stream)
-            read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-            if version not in read:
-                raise ValueError(f"array `{name}` is of version {version} of numpy's format; expected 1.0 or 2.0")
-            shape, _, dtype = read[version](stream)
-            if dtype.hasobject:
+            found = array_header(stream)
+            if found.dtype.hasobject:
                 raise InputError(f"array `{name}` of `{self.path}` holds Python objects; expected numbers")
-            found = ArrayHeader(tuple(map(int, shape)), dtype)
             there = info.file_size - stream.tell()
         if min(found.shape, default=0) < 0 or found.bytes != there:
             raise InputError(
-                f"array `{name}` of `{self.path}` declares the shape {found.shape} of {dtype}, {found.bytes} bytes; "
-                f"the file holds {there}"
+                f"array `{name}` of `{self.path}` declares the shape {found.shape} of {found.dtype}, "
+                f"{found.bytes} bytes; the file holds {there}"
             )
         return found
 
@@ -116,5 +125,5 @@ def read_archive(path: Path, what: str, use: Callable[[Archive], dict[str, np.nd
             return use(Archive(path, members, file))
     except InputError:
         raise
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise InputError(f"`{path}` cannot be read as .npz: {error}") from error
