@@ -31,7 +31,7 @@ def cuts(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> np.ndarra
     found = np.array([len(step.agrees) < LEAST_CORNERS for step in taken], bool)
     found &= shown[:-1] & shown[1:] & placed[:-1] & placed[1:]
     for row in np.nonzero(found)[0]:
-        found[row] = not _seen_around(evidence, int(row))
+        found[row] = not seen_around(evidence, int(row))
     return found
 
 
@@ -43,7 +43,7 @@ def check_blind(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> li
         weak &= ~estimate.by_surface[1:]
     unseen = few & weak[: len(taken)]
     for row in np.nonzero(unseen)[0]:
-        unseen[row] = not _seen_around(evidence, int(row))
+        unseen[row] = not seen_around(evidence, int(row))
     found = []
     for first, last in spans(unseen, join=2):
         smaller = min(first + 1, len(estimate) - last - 1) / len(estimate)
@@ -56,7 +56,7 @@ def check_blind(estimate: Estimate, evidence: Evidence, taken: list[Step]) -> li
     return found
 
 
-def _seen_around(evidence: Evidence, row: int) -> bool:
+def seen_around(evidence: Evidence, row: int) -> bool:
     """Whether corners live from some frame up to `row` to some frame after it."""
     before, after = range(max(row - 2, 0), row + 1), range(row + 1, min(row + 4, len(evidence)))
     return any(len(common(evidence[a], evidence[b])[0]) >= LEAST_CORNERS for a in before for b in after)

@@ -20,6 +20,7 @@ from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence
 from vggtgeo.slam.trust.extent import check_extent
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
+from vggtgeo.slam.trust.islands import check_islands
 from vggtgeo.slam.trust.pace import pace
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
@@ -54,7 +55,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
         found += check_matches(own, estimate.intrinsics, estimate.pieces == 1)
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
         height, width = slam.keyframes[0].size
-        found += _images(estimate, aligned, (width, height))
+        found += _images(slam, estimate, aligned, (width, height))
         if any(np.isfinite(noted.depth_median) for noted in aligned):
             found += check_sensors(slam)
     else:
@@ -76,13 +77,14 @@ def judged_or_told(slam: Slam, evidence: Evidence = (), input_findings: tuple[Fi
         return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)
 
 
-def _images(estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> Iterator[Finding]:
+def _images(slam: Slam, estimate: Estimate, evidence: Evidence, size: tuple[int, int]) -> Iterator[Finding]:
     taken = steps(estimate, evidence)
     wrong = breaks(estimate, evidence, taken)
     yield from check_speed(estimate, cuts(estimate, evidence, taken))
     yield from check_steps(estimate, taken, wrong)
     yield from check_sides(estimate, taken)
     yield from check_blind(estimate, evidence, taken)
+    yield from check_islands(slam, estimate, evidence, taken)
     yield from check_parts(estimate, [divide(step) for step in taken])
     ratios = depth_ratios(estimate, evidence, pace(estimate, evidence))
     yield from check_depth(estimate, ratios)

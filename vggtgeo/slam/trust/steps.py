@@ -143,12 +143,12 @@ def _together(taken: list[Step], sure: np.ndarray) -> np.ndarray:
 
 
 def _displaced(estimate: Estimate, evidence: Evidence, first: int, last: int) -> tuple[int, int]:
-    if _bridged(estimate, evidence, first, last + 1):
+    if bridged(estimate, evidence, first, last + 1):
         return min(first + 1, last), last
     return (0, last) if last < len(evidence) - first - 1 else (first + 1, len(evidence) - 1)
 
 
-def _bridged(estimate: Estimate, evidence: Evidence, before: int, after: int) -> bool:
+def bridged(estimate: Estimate, evidence: Evidence, before: int, after: int) -> bool:
     """Whether some frame up to `before` and some frame from `after` on agree with each other."""
     rows = [(a, b) for a in range(max(before - 2, 0), before + 1) for b in range(after, min(after + 4, len(evidence)))]
     across = [between(estimate, evidence, a, b) for a, b in rows if (a, b) != (before, after) or after - before > 1]
