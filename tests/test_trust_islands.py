@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_keyframe_depth import SIZE, keyframe
+from vggtgeo.models.roles import PointMatches
 from witness import Walk
 
-from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.covisibility import Pair, without_matches
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.state import FramePose, Slam
