@@ -70,11 +70,12 @@ def test_frames_that_hang_on_few_matches_are_told(healthy: Walk) -> None:
     [
         (((0, STRONG), (0, STRONG)), ()),
         (((0, SURFACE), (0, STRONG)), ()),
+        (((0, replace(WEAK, matches=26, inliers=23)), (0, STRONG)), ()),
         (((0, WEAK), (0, STRONG)), ((0, 1),)),
         (((0, WEAK), (0, STRONG)), ((1, 2),)),
         (((0, WEAK), (1, STRONG)), ((0, 2),)),
     ],
-    ids=["matches", "surfaces", "keyframes", "a later keyframe", "both by a later one"],
+    ids=["matches", "surfaces", "few, nearly all", "keyframes", "a later keyframe", "both by a later one"],
 )
 def test_one_sure_tie_is_enough(
     healthy: Walk, arrivals: tuple[tuple[int, Evidence], ...], pairs: tuple[tuple[int, int], ...]
