@@ -60,7 +60,7 @@ def _seen(estimate: Estimate, evidence: Evidence, stretches: list[tuple[int, int
 
 
 def _sure(evidence: PoseEvidence) -> bool:
-    """Whether a frame is placed by many matches, by fewer that nearly all agree, or by surfaces of which it sees half."""
+    """Whether many matches place a frame, fewer that nearly all agree, or surfaces of which it sees half."""
     nearly_all = evidence.inliers >= LEAST_INLIERS and evidence.share >= NEARLY_ALL
     by_surface = evidence.placed_by_surface and evidence.overlap >= BARE_OVERLAP
     return evidence.points_strong or nearly_all or by_surface
