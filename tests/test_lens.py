@@ -184,7 +184,7 @@ def test_corners_of_the_verdict_go_through_the_lens(monkeypatch: pytest.MonkeyPa
     nothing = np.zeros(3, np.float32)
     noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing, 1.0, 0.5, 30.0) for r in slam.frames]
     given: list[FrameEvidence] = []
-    monkeypatch.setattr(judging, "_images", lambda estimate, evidence, size: given.extend(evidence) or [])
+    monkeypatch.setattr(judging, "_images", lambda slam, estimate, evidence, size: given.extend(evidence) or [])
     judging.judge(slam, noted)
     assert len(given) == len(slam.frames) > 1
     np.testing.assert_allclose(redrawn(given[0].pixels), seen, atol=1e-3)

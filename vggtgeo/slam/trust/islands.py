@@ -34,8 +34,9 @@ def check_islands(slam: Slam, estimate: Estimate, evidence: Evidence, taken: lis
     if estimate.pieces > 1 or len(stretches) < 2:  # parts of a map are told as such
         return []
     ties = [*_seen(estimate, evidence, stretches), *_matched(slam, estimate, stretches)]
-    first, second = np.array(ties, int).reshape(-1, 2).T
-    _, group = connected_components(coo_array((np.ones(len(first)), (first, second)), (len(stretches),) * 2), False)
+    ends = np.array(ties, int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(ties)), (ends[0], ends[1])), (len(stretches), len(stretches)))
+    _, group = connected_components(graph, directed=False)
     lengths = np.array([last - first + 1 for first, last in stretches])
     size = np.bincount(group, lengths)
     found = []
