@@ -4,6 +4,9 @@ name.
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,12 +73,46 @@ def test_shapes_and_static_parts_have_programs_of_their_own(folder: Path) -> Non
 
 
 def test_a_program_takes_what_a_program_returned(folder: Path) -> None:
-    """Without a second compilation: such arrays name their device, which is another case for JAX's own `jit`."""
+    """Without a second compilation: such arrays name their device, which is another case for JAX's own `jit`. Oracle:
+    JAX's count.
+    """
+    compiled: list[str] = []
+    count = lambda name, seconds, **_: compiled.append(name) if "backend_compile" in name else None
     program = KeptProgram(pair, _as_pair)
     first = program(jnp.asarray(ONE), jnp.asarray(TWO), 3.0)
-    again = program(first.sum, first.scaled, 3.0)
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        again = program(first.sum, first.scaled, 3.0)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
     np.testing.assert_array_equal(again.sum, ONE + TWO + 3 * ONE)
-    assert program.prepared == 1
+    assert compiled == []
+
+
+ELSEWHERE = """
+import jax, numpy as np
+jax.config.update("jax_num_cpu_devices", 2)
+import test_kept_program as own
+from vggtgeo.io import kept_program
+kept_program.LASTING = (*kept_program.LASTING, "test_kept_program")
+program = kept_program.KeptProgram(own.pair, own._as_pair)
+for device in (*jax.devices(), jax.devices()[0]):
+    found = program(jax.device_put(own.ONE, device), jax.device_put(own.TWO, device), 3.0)
+    assert found.sum.devices() == {device}, found.sum.devices()
+    np.testing.assert_array_equal(found.sum, own.ONE + own.TWO)
+assert program.prepared == 1
+"""
+
+
+@pytest.mark.long
+def test_arrays_on_another_device_stay_there(tmp_path: Path) -> None:
+    """On two devices of one processor; oracle: NumPy, and where the result lies."""
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", ELSEWHERE]
+    here = Path(__file__).parent
+    done = subprocess.run(command, cwd=here, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert len(list((tmp_path / "programs").iterdir())) == 1
 
 
 def test_changed_sources_have_another_program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

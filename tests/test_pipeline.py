@@ -168,8 +168,8 @@ def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: floa
 
 @pytest.mark.long
 def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
-    """Compiled for a map of so many keyframes, the solver of the last adjustment is not compiled again; oracle: the
-    number of programs that JAX keeps of it.
+    """Compiled for a map of so many keyframes, the solver of the last adjustment is not compiled again; oracle: how
+    many programs of it were prepared.
     """
     settings = updated(
         SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 2, "global_rounds": 1}}

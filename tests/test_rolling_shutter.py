@@ -20,7 +20,15 @@ from vggtgeo.slam import calibration
 from vggtgeo.slam.calibration import keyframe_pairs
 from vggtgeo.slam.covisibility import Directed, directions
 from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
+from vggtgeo.slam.rolling_shutter import (
+    _descend,
+    _Search,
+    camera_motions,
+    find_readout,
+    frame_interval,
+    row_shifts,
+    without_readout,
+)
 from vggtgeo.slam.state import Readout
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import EvidenceRecorder, FrameEvidence, common
@@ -110,6 +118,28 @@ def test_a_rolling_shutter_is_found_and_taken_out(seconds: float, columns: bool)
     assert found.readout.seconds == pytest.approx(seconds, rel=0.05)
     before, after = (np.sqrt(np.mean(WINDOW.errors(one) ** 2)) for one in (state, found.state))
     assert after < 0.5 * before, (before, after)
+
+
+class _Straight(_Search):
+    """A map whose slope is a straight line through zero at 28 ms, matches moving by 1 px in 20 ms."""
+
+    usual = 50.0
+
+    def at(self, seconds: float) -> Problem:
+        return self.problem
+
+    def slopes(self, seconds: float, state: State) -> np.ndarray:
+        return np.array([seconds - 0.028])
+
+
+def test_a_straight_slope_takes_two_adjustments() -> None:
+    """One at the first step, one at its zero, within reach of the first; oracle: the line."""
+    problem, start, _ = WINDOW.pack()
+    solved: list[State] = []
+    search = _Straight(problem, row_shifts(problem, start, some_motions(), (HEIGHT, WIDTH), False), 100.0)
+    seconds, _ = _descend(search, start, -0.028, LONGEST, lambda _, state: solved.append(state) or state)
+    assert seconds == pytest.approx(0.028)
+    assert len(solved) == 2
 
 
 def test_what_is_taken_out_is_what_the_motion_put_in() -> None:

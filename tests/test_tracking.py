@@ -123,7 +123,7 @@ def test_tracking_takes_the_noise_that_the_depth_states(room: Room) -> None:
 
 
 def test_what_is_compiled_ahead_is_what_is_needed(room: Room) -> None:
-    """Alignments of a camera's views compile nothing more than was compiled for it; oracle: JAX's count."""
+    """Alignments of a camera's views compile nothing more than was compiled for it; oracle: the number of programs."""
     frames, camera, _ = room
     compile_alignment(camera)
     before = _align.prepared

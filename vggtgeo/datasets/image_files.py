@@ -23,8 +23,7 @@ from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 
-
-DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
+DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm"}
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ VERSIONS = ("optimistix", "equinox", "lineax", "jaxlie", "jax", "jaxlib", "numpy
 class KeptProgram(Generic[_Result]):
     """A pure function of pytrees, compiled for each structure and shape it is called with.
 
-    As `equinox.filter_jit`, which it falls back on: for traced arguments, on a GPU, and where nothing can be kept. Only
-    positional arguments.
+    As `equinox.filter_jit`, which it falls back on: for traced arguments, for arrays that lie elsewhere than on the
+    first processor (a GPU, several devices), and where nothing can be kept. Only positional arguments.
 
     Args:
         function: traceable; its name and module are those of its program.
@@ -58,7 +58,7 @@ class KeptProgram(Generic[_Result]):
 
     def __call__(self, *args: Any) -> _Result:
         leaves, structure = jax.tree.flatten(args)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if any(isinstance(leaf, jax.core.Tracer) or _elsewhere(leaf) for leaf in leaves):
             return self._plain(*args)
         key = structure, _setting("enable_x64"), tuple(map(_kind_of, leaves))
         with self._lock:
@@ -131,6 +131,16 @@ class _Program:
 
 def _is_array(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array | np.ndarray | np.generic)
+
+
+def _elsewhere(leaf: Any) -> bool:
+    """Whether an array lies on another device than the one that a kept program is compiled for, or on several."""
+    return isinstance(leaf, jax.Array) and leaf.devices() != _first_device()
+
+
+@cache
+def _first_device() -> set[jax.Device]:
+    return {jax.local_devices()[0]}
 
 
 def _kind_of(leaf: Any) -> Hashable:

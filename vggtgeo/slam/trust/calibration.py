@@ -48,7 +48,8 @@ none, are no farther than 1.1 cm off all the same."""
 NEARLY_ALL = 0.8
 """Of the pairs: where so many fit another focal length better, `SIGMAS` are enough. 0.97 and 6.6 deviations where 40
 frames of redkitchen had one 20 % too short (13 cm), 0.84 and 8.3 where building-walk's had one 20 % too long (6 cm),
-both called good. With the right one, in 17 pieces of 40 frames of the clips: at most 3.2 deviations where so many fit
+both called good (`benchmarks/stress.py --clips redkitchen --start 220 --variants K-20`, `building-walk --start 120
+--variants K+20`). With the right one, in 17 pieces of 40 frames of the clips: at most 3.2 deviations where so many fit
 better, and 6.0 where 0.70 do."""
 LEAST_BETTER = 2 / 3
 """Of the pairs that must fit that focal length better. 0.54 to 0.58 do with the right camera, 0.72 to 0.89 where it was
