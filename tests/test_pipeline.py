@@ -26,6 +26,7 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.compile_ahead import compile_global, expected_keyframes
 from vggtgeo.slam.connected import piece_of
+from vggtgeo.slam.factors import FREE_LENGTH
 from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.global_adjustment import adjust_all
 from vggtgeo.slam.global_shape import padded_count, shape_for
@@ -258,6 +259,10 @@ def test_rgb_recovers_the_shape(room) -> None:
     _, poses = frame_poses(slam)
     for keyframe in slam.keyframes:
         assert np.array_equal(poses[keyframe.frame], keyframe.pose)  # the second one began the map with the first
+    assert len(slam.ties) >= len(slam.keyframes) - 2
+    for tie in slam.ties:  # the unit is no measurement of any motion
+        length, noise = tie.pose[:3, 3], np.linalg.inv(tie.information)[:3, :3]
+        assert np.sqrt(length @ noise @ length) >= FREE_LENGTH * (length @ length)
 
 
 @pytest.mark.long

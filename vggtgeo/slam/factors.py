@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -60,7 +60,19 @@ class MeasuredRelativePose:
     def keyframes(self) -> tuple[int, int]:
         return self.first, self.second
 
+    def of_free_length(self) -> Self:
+        """The same without measured depth: how far the camera went is known in the unit of the map that it was tracked
+        against, and that unit is itself an estimate.
+        """
+        length = np.append(FREE_LENGTH * self.pose[:3, 3], np.zeros(3))
+        noise = np.linalg.inv(self.information) + np.outer(length, length)
+        return replace(self, information=np.linalg.inv(noise))
 
+
+FREE_LENGTH = 0.5
+"""Relative standard deviation of the length of a tracked motion without measured depth. As sure as its direction, the
+unit of the moment counts as measured again and again, and its drift is locked in: building-walk was 16.3 cm off with
+its images compressed once more, and is 3.7."""
 TIE_WIDTH = 12.6**0.5
 """Mahalanobis distance at which a measured motion counts half, so that one that all else contradicts (a false loop)
 gives way: the 95 % level of 6 degrees of freedom."""
