@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from test_keyframe_depth import SIZE, keyframe
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.state import FramePose, Slam
 
@@ -59,3 +61,20 @@ def test_a_keyframe_that_begins_a_piece_keeps_its_pose_and_begins_its_own_share(
     _, poses = frame_poses(_walked(begins=(0, 1)))
     assert np.allclose(poses[4:], _straight(1.5)[4:], atol=1e-12)
     assert np.allclose(poses[:4], _straight(1.0)[:4], atol=1e-12)
+
+
+@pytest.mark.parametrize(("sigma", "length"), [(0.5, 1.5), (0.05, 1.0)])
+def test_a_keyframe_that_was_tracked_wrongly_leaves_the_frames_before_it_where_they_are(
+    sigma: float, length: float
+) -> None:
+    """2.3 m between a keyframe as tracked and as adjusted are drift where its tracking left them open, and an error of
+    that frame alone where it did not. Oracle: the straight paths.
+    """
+    slam = _walked(begins=(0,))
+    known = np.diag(np.repeat([sigma, 0.1], 3) ** -2.0)
+    arrivals = [record for record in slam.frames if record.arrival is not None]
+    ties = tuple(MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known) for r in arrivals if r.arrival)
+    _, poses = frame_poses(replace(slam, factors=ties))
+    for first in (0, 4):
+        step = _straight(length) @ rigid.invert(_straight(length)[0])
+        assert np.allclose(poses[first : first + 4] @ rigid.invert(poses[first]), step[:4], atol=1e-12)

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.frame_refinement import by_both
+from vggtgeo.slam.fusion import AGREEMENT_GATE
+from vggtgeo.slam.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.state import FramePose, Slam
+
+GROSS = SHARED_ERRORS * AGREEMENT_GATE
+"""Of the squared Mahalanobis distance between a keyframe's pose as it was tracked and as it was adjusted: above, that
+frame alone was tracked wrongly, and its error is none of those before it. Healthy keyframes of the clips have 121 and
+less; one of building-walk 670 to 790, 21 cm, of which the frame before it took half."""
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known.
 
     A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and the
-    next is shared out over the frames in between, in proportion to time, so that the path has no steps. What a second
-    keyframe says of a frame is averaged with that (`frame_refinement.py`). The frame that a keyframe was made of has
-    the keyframe's pose, whether it was tracked there (`arrival`) or began a piece of map.
+    next is shared out over the frames in between, in proportion to time, so that the path has no steps, unless it is
+    the gross error of one (`GROSS`). What a second keyframe says of a frame is averaged with that
+    (`frame_refinement.py`). The frame that a keyframe was made of has the keyframe's pose, whether it was tracked there
+    (`arrival`) or began a piece of map.
     """
     poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
     times = np.array([record.timestamp for record in slam.frames])
+    ties = {(tie.first, tie.second): tie for tie in slam.ties}
     last = 0
     for row, record in enumerate(slam.frames):
         if not _made_its_keyframe(record):
@@ -26,12 +37,21 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
         if record.arrival is not None:
             reference, tracked = record.arrival
             change = poses[row] @ rigid.invert(tracked @ slam.keyframes[reference].pose)
-            between = [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
+            gross = _is_gross(change, ties.get((reference, record.reference)))
+            between = [] if gross else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
             span = max(times[row] - times[last], 1e-9)
             for k in between:
                 poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
         last = row
     return times, by_both(slam, poses)
+
+
+def _is_gross(change: np.ndarray, tie: MeasuredRelativePose | None) -> bool:
+    """Whether an adjustment changed a keyframe [4, 4] by more than its tracking left open."""
+    if tie is None:
+        return False
+    off = np.append(change[:3, 3], Rotation.from_matrix(change[:3, :3]).as_rotvec())
+    return bool(off @ tie.information @ off > GROSS)
 
 
 def _made_its_keyframe(record: FramePose) -> bool:
