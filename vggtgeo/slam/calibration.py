@@ -24,7 +24,7 @@ tracked and closed with the given ones, see `first_pass.py`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,8 +36,8 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera_gain import CHANCE, gain
 from vggtgeo.slam.camera_of_pairs import CameraOpinion, CameraPair, camera_of_pairs
 from vggtgeo.slam.covisibility import Directed
-from vggtgeo.slam.rolling_shutter import at_once, camera_motions, carried
-from vggtgeo.slam.state import Readout, Slam
+from vggtgeo.slam.rolling_shutter import camera_motions, pair_at_once
+from vggtgeo.slam.state import Slam
 
 PRIOR = 0.01
 """Standard deviation of a given calibration, relative to the focal length: what makers and calibration tools reach."""
@@ -159,29 +159,12 @@ def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
             continue
         relative = target.pose @ rigid.invert(host.pose)
         block = min(edge.host, edge.target) // BLOCK
-        pair = CameraPair(before, after, 1.0 / inverse[known], relative, block)
+        depth = 1.0 / inverse[known]
         if readout is not None:
-            pair = _at_once(pair, motions[edge.host], motions[edge.target], slam.intrinsics, host.size, readout)
-        found.append(pair)
+            moving = motions[edge.host], motions[edge.target]
+            before, after = pair_at_once(before, after, depth, relative, moving, slam.intrinsics, host.size, readout)
+        found.append(CameraPair(before, after, depth, relative, block))
     return found
-
-
-def _at_once(
-    pair: CameraPair,
-    host: np.ndarray,
-    target: np.ndarray,
-    camera: np.ndarray,
-    size: tuple[int, int],
-    readout: Readout,
-) -> CameraPair:
-    """The pair without a readout; host, target: how the camera moves in either image, [6]."""
-    inverse = 1.0 / pair.depth
-    _, there = carried(pair.before[None], inverse[None], pair.relative[None], camera)
-    return replace(
-        pair,
-        before=at_once(pair.before, inverse, host, camera, size, readout),
-        after=at_once(pair.after, there[0], target, camera, size, readout),
-    )
 
 
 def _averaged(opinion: CameraOpinion, given: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -194,6 +194,27 @@ def at_once(
     return np.asarray(there - readout.seconds * shift)
 
 
+def pair_at_once(
+    before: np.ndarray,
+    after: np.ndarray,
+    depth: np.ndarray,
+    relative: np.ndarray,
+    motions: tuple[np.ndarray, np.ndarray],
+    camera: np.ndarray,
+    size: tuple[int, int],
+    readout: Readout,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Matches [m, 2] of two images without the readout of either. depth: [m], in the first; relative: [4, 4], first
+    camera -> second; motions: [6] of each, see `camera_motions`.
+    """
+    inverse = 1.0 / depth
+    _, there = carried(before[None], inverse[None], relative[None], camera)
+    return (
+        at_once(before, inverse, motions[0], camera, size, readout),
+        at_once(after, there[0], motions[1], camera, size, readout),
+    )
+
+
 def read_at_once(problem: Problem, shifts: Shifts, seconds: float, most: float) -> Problem:
     """The problem with every match where it would have been at the middle of its image's readout. most: pixels, of a
     shift: beyond are landmarks that have run into the camera.

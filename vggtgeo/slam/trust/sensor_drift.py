@@ -17,7 +17,7 @@ found all three 1.05 and 1.16 times the given one where the last pictures are en
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -28,6 +28,7 @@ from vggtgeo.models import pinhole
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.gauge import NULL
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.rolling_shutter import camera_motions, pair_at_once
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 
@@ -248,14 +249,27 @@ _NOTHING = Factors(_UNKNOWN, _UNKNOWN)
 
 
 def depth_pairs(slam: Slam, stretch: range) -> Iterator[DepthPair]:
-    """Both directions of pairs of keyframes in a stretch, evenly over it: errors of depth pull them apart."""
+    """Both directions of pairs of keyframes in a stretch, evenly over it: errors of depth pull them apart. Where a
+    rolling shutter was found they are without it: turning up or down, it stretches the picture as a lens does.
+    """
+    motions = None if slam.readout is None else camera_motions(slam, len(slam.keyframes))
     inside = [pair for pair in slam.pairs if pair.first in stretch and pair.second in stretch]
     for row in np.unique(np.linspace(0, len(inside) - 1, MOST_PAIRS).astype(int)) if inside else ():
         pair = inside[row]
         first, second = slam.keyframes[pair.first], slam.keyframes[pair.second]
         for found in (_directed(pair, first, second, False), _directed(pair, second, first, True)):
             if len(found.depth) >= LEAST_MATCHES and np.median(_flow(found)) >= LEAST_FLOW:
-                yield found
+                yield found if motions is None else _at_once(found, slam, motions)
+
+
+def _at_once(pair: DepthPair, slam: Slam, motions: np.ndarray) -> DepthPair:
+    """The pair without the readout of its images; motions: [n, 6], of the keyframes."""
+    assert slam.readout is not None
+    first, second = pair.numbers
+    camera = np.asarray(slam.intrinsics, np.float64)
+    moving, size = (motions[first], motions[second]), slam.keyframes[first].size
+    before, after = pair_at_once(pair.before, pair.after, pair.depth, pair.relative, moving, camera, size, slam.readout)
+    return replace(pair, before=before, after=after)
 
 
 def _directed(pair: Pair, host: Keyframe, target: Keyframe, is_back: bool) -> DepthPair:
