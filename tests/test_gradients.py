@@ -59,7 +59,7 @@ def make_problem(scene: Scene = SCENE) -> Both:
     pose, information = np.eye(4), np.diag([4e4, 3e4, 5e4, 4e5, 3e5, 5e5])
     pose[:3, 3] = [-0.2, 0.02, 0.01]
     factors = [MeasuredRelativePose(1, 2, pose, information)]
-    (measured,) = factor_terms(factors, {1: 1, 2: 2}, {MeasuredRelativePose: 1})
+    (measured,) = factor_terms(factors, {1: 1, 2: 2}, {MeasuredRelativePose: 1}, metric=True)
     both = problem.with_term(prior_on(state, 2.0)).with_term(measured), state
     # No weak types: a leaf that is moved by an array would lose its own, and all be compiled once more.
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), both)

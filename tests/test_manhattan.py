@@ -102,7 +102,7 @@ def test_the_residual_is_the_measured_rotation() -> None:
     factors = [MeasuredRotation(7, measured.as_matrix(), information), MeasuredRotation(3, np.eye(3), information)]
     places, room = {5: 0, 7: 1, 9: 2}, {MeasuredRotation: 4}
     problem, _, _ = make_scene().pack()
-    problem = problem.with_terms(factor_terms(factors, places, room))  # keyframe 3 has left: it must not count
+    problem = problem.with_terms(factor_terms(factors, places, room, metric=True))  # 3 has left: it must not count
 
     def energy_at(rotation: Rotation, shift: float = 0.0) -> float:
         poses = np.tile(np.eye(4), (3, 1, 1))

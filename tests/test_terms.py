@@ -166,7 +166,7 @@ def made(kind: str, problem: vg.Problem, state: vg.State) -> vg.AbstractTerm:
         "relative_poses": [MeasuredRelativePose(*pair, pose, information) for pair in ((2, 1), (1, 0))],
     }
     if kind in factors:
-        (term,) = factor_terms(factors[kind], known, {type(factors[kind][0]): 4})
+        (term,) = factor_terms(factors[kind], known, {type(factors[kind][0]): 4}, metric=True)
     elif kind == "surfaces":
         hessians, gradients = np.stack([information, 0 * information]), np.zeros((2, 6))
         gradients[0] = [1.0, -2, 3, 40, -50, 60]

@@ -72,7 +72,10 @@ def compile_global(shape: GlobalShape, settings: SlamSettings, camera: type[Pinh
     """
     nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
     surfaces = surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing)
-    terms = (*factor_terms((), {}, shape.room), *([surfaces] if settings.depth_terms.surface_points > 0 else []))
+    terms = (
+        *factor_terms((), {}, shape.room, metric=True),
+        *([surfaces] if settings.depth_terms.surface_points > 0 else []),
+    )
     problem, initial = smallest_problem(shape.size, settings, terms, camera)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)

@@ -84,11 +84,12 @@ Factor = MeasuredRotation | MeasuredBaseline | MeasuredRelativePose
 
 
 def factor_terms(
-    factors: Sequence[Factor], places: Mapping[int, int], capacity: Mapping[type, int]
+    factors: Sequence[Factor], places: Mapping[int, int], capacity: Mapping[type, int], *, metric: bool
 ) -> tuple[AbstractTerm, ...]:
     """One term a kind of `capacity`, padded to that many observations: those between keyframes that have a place.
 
     places: row of each keyframe in the problem, by its number. Of more factors than there is room for, the last stay.
+    metric: whether depth was measured; see `MeasuredRelativePose.of_free_length`.
     """
     makers: dict[type, Callable[..., AbstractTerm]] = {
         MeasuredRotation: _rotations,
@@ -96,6 +97,8 @@ def factor_terms(
         MeasuredRelativePose: _relative_poses,
     }
     inside = [factor for factor in factors if all(number in places for number in factor.keyframes)]
+    if not metric:
+        inside = [f.of_free_length() if isinstance(f, MeasuredRelativePose) else f for f in inside]
     terms = []
     for kind, room in capacity.items():
         own = [factor for factor in inside if isinstance(factor, kind)]

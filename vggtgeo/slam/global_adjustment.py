@@ -193,7 +193,7 @@ def _terms(
 ) -> tuple[AbstractTerm, ...]:
     """What is known about poses beyond matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
-    terms = factor_terms(factors, places, shape.room)
+    terms = factor_terms(factors, places, shape.room, metric=slam.metric)
     if not surfaces or settings.depth_terms.surface_points <= 0:
         return terms
     pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]

@@ -82,7 +82,6 @@ def _joined(slam: Slam, place: Track, held: tuple[int, ...]) -> Slam:
     began = next(keyframe.frame for keyframe in slam.keyframes if inside(keyframe.number))
     note = f"the piece of map that began at frame {began} is joined to the one before at frame {newest.frame}"
     tie = MeasuredRelativePose(place.keyframe.number, newest.number, place.relative, place.information)
-    tie = tie if slam.metric else tie.of_free_length()
     return replace(
         slam,
         keyframes=keyframes,

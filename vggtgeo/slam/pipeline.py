@@ -210,7 +210,7 @@ def _mapped(
 
     Beside tracking where the keyframe's own depth places the next frames, and where there is one piece of map only.
     """
-    tie, tied_to = _in_its_unit(tie_to(found, keyframe.number), slam), found.keyframe.number
+    tie, tied_to = tie_to(found, keyframe.number), found.keyframe.number
     if tied_to not in slam.window:
         slam = _window_around(slam, tied_to, settings)
     reference = (keyframe.number, sight.view)
@@ -323,12 +323,7 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
         return slam, again
-    return replace(slam, factors=(*slam.factors, _in_its_unit(tie_between(found, again), slam))), again
-
-
-def _in_its_unit(tie: MeasuredRelativePose, slam: Slam) -> MeasuredRelativePose:
-    """What a tracked motion says: its length only where depth is measured."""
-    return tie if slam.metric else tie.of_free_length()
+    return replace(slam, factors=(*slam.factors, tie_between(found, again))), again
 
 
 def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | None:

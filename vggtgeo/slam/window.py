@@ -77,7 +77,7 @@ def _compile_marginalisation(problem: Problem, initial: State) -> None:
 
 @in_double_precision
 def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, State]:
-    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric)))
+    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric), metric=metric))
     return smallest_problem(window_size(settings), settings, terms)
 
 
@@ -189,7 +189,7 @@ def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) 
         size=window_size(settings),
         camera=CameraPrior(slam.given_intrinsics, _camera_sigma(slam, settings)),
         fixed_pose=_held(numbers, slam),
-        terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric))),
+        terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric), metric=slam.metric)),
     )
     problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(members), slam.metric)
     return replace(adjustment, problem=problem), gauge
