@@ -24,6 +24,7 @@ from vggtgeo.slam.trust.islands import check_islands
 from vggtgeo.slam.trust.pace import pace
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
+from vggtgeo.slam.trust.scale_hand_over import check_hand_over
 from vggtgeo.slam.trust.sensor_drift import check_sensors
 from vggtgeo.slam.trust.shutter import check_shutter, corners_at_once
 from vggtgeo.slam.trust.speed import check_speed
@@ -50,6 +51,8 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     found += check_extent(estimate, None if known is None else known.translation)
     if estimate.started and estimate.metric:
         found += check_surfaces(slam.keyframes, estimate.intrinsics)
+    if estimate.started:
+        found += check_hand_over(slam)
     for piece in pieces_by_size(slam) if estimate.started and not estimate.metric else ():  # with depth: the surfaces
         own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]
         found += check_matches(own, estimate.intrinsics, estimate.pieces == 1)
