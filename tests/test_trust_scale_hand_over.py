@@ -11,11 +11,11 @@ from test_keyframe_depth import SIZE, keyframe
 from vggtgeo.models.roles import PointMatches
 
 from vggtgeo.slam.covisibility import Pair, without_matches
-from vggtgeo.slam.factors import FREE_LENGTH, MeasuredRelativePose
+from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Slots
 from vggtgeo.slam.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.trust.scale_hand_over import check_hand_over, hand_over_sigma
+from vggtgeo.slam.trust.scale_hand_over import ALONE, check_hand_over, hand_over_sigma
 
 K = np.array([500.0, 500.0, 320.0, 240.0])
 POINTS, REACH = 60, 3
@@ -62,7 +62,7 @@ def test_the_scale_of_two_stereo_pairs_is_handed_on_as_well_as_stated() -> None:
     slam = _walk([0.2, 0.05, 0.1])
     sigma = hand_over_sigma(slam)
     assert np.isnan(sigma[[0, 2]]).all()  # one keyframe has no scale
-    matches = SHARED_ERRORS * (sigma[1] ** -2 - FREE_LENGTH**-2)  # without the tracked motion, each for itself
+    matches = SHARED_ERRORS * (sigma[1] ** -2 - ALONE**-2)  # without the tracked motion, each for itself
     rng, inverse = np.random.default_rng(1), slam.keyframes[0].points.inverse_depth
     before, after = (K[0] * base * inverse for base in (0.2, 0.1))
     noisy = [np.log(one + rng.normal(0, 1, (4000, POINTS))) - np.log(one) for one in (before, after)]
@@ -76,7 +76,7 @@ def test_a_scale_that_little_hands_on_is_told(across: dict[int, int], told: bool
     """Nineteen keyframes that stand nearly still for eight, and share two points from the ninth to the next ones: told,
     with where that is. Where they share sixty it is not.
     """
-    slam = _walk([0.1] * 5 + [0.02] * 8 + [0.1] * 5, across)
+    slam = _walk([0.1] * 5 + [0.03] * 8 + [0.1] * 5, across)
     found = check_hand_over(slam)
     assert [finding.check for finding in found] == ["scale"] * told
     # The next keyframes know the depth of those two alone, too.
