@@ -8,7 +8,7 @@ match across hands the scale on with the variance `v_before + v_after + FLOOR^2`
 
 It is what a count of inliers cannot tell: frames that turn on the spot, or come out of a white wall, have seventeen
 matches of hardly any parallax. Building-walk without depth, frames 160 to 239, had 29.9 cm where lengths halve at frame
-215: there this says 34 % for one step, and nowhere else more than 9 %.
+215: there this says 28 % for one step, and nowhere else more than 9 %.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from vggtgeo.slam.trust.finding import Finding
 
 MOST_DRIFT = 0.15
 """Expected relative drift of the scale over the run. Pieces of redkitchen have 0.03, of corridor-office 0.09 to 0.12;
-of building-walk 0.05 to 0.12 and, across its white walls, 0.19 to 0.22, where they drift by as much, 3 to 11 cm off; those
-that were 16 to 30 cm off have 0.26 to 0.36."""
+of building-walk 0.05 to 0.12 and, across its white walls, 0.19 to 0.22, where they drift by as much, 3 to 11 cm off;
+those that were 16 to 30 cm off have 0.26 to 0.36."""
 LEAST_SHARE = 0.1
 """Of the frames, on the shorter side of a step: what fewer have of a wrong length moves the path by little."""
 LEAST_OF_BOTH = 0.5
