@@ -28,7 +28,7 @@ MOST_DRIFT = 0.15
 of building-walk 0.05 to 0.12 and, across its white walls, 0.19 to 0.22, where they drift by as much, 3 to 11 cm off;
 those that were 16 to 30 cm off have 0.26 to 0.36."""
 LEAST_SHARE = 0.1
-"""Of the frames, on the shorter side of a step: what fewer have of a wrong length moves the path by little."""
+"""Of the way, on the shorter side of a step: who stands still behind it has no use for a scale."""
 LEAST_OF_BOTH = 0.5
 """Of all matches: those of key points in either keyframe."""
 PIXELS = 1.0
@@ -50,10 +50,11 @@ def check_hand_over(slam: Slam) -> list[Finding]:
     if slam.metric or not of_both or not slam.frames or np.concatenate(of_both).mean() < LEAST_OF_BOTH:
         return []
     sigma = hand_over_sigma(slam)
-    frames, last = np.array([keyframe.frame for keyframe in slam.keyframes]), slam.frames[-1].frame
-    first = slam.frames[0].frame
-    shorter = np.minimum(frames[:-1] - first + 1, last - frames[:-1])
-    inner = np.isfinite(sigma) & (shorter >= LEAST_SHARE * (last - first + 1))
+    frames = np.array([keyframe.frame for keyframe in slam.keyframes])
+    centres = np.array([rigid.centre(keyframe.pose) for keyframe in slam.keyframes])
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1)))
+    shorter = np.minimum(way[:-1], way[-1] - way[1:])
+    inner = np.isfinite(sigma) & (shorter >= LEAST_SHARE * way[-1])
     drift = float(np.sqrt(np.sum(sigma[inner] ** 2)))
     if drift <= MOST_DRIFT:
         return []
