@@ -63,14 +63,14 @@ def test_a_keyframe_that_begins_a_piece_keeps_its_pose_and_begins_its_own_share(
     assert np.allclose(poses[:4], _straight(1.0)[:4], atol=1e-12)
 
 
-@pytest.mark.parametrize(("sigma", "length"), [(0.5, 1.5), (0.05, 1.0)])
+@pytest.mark.parametrize(("sigma", "metric", "length"), [(0.5, True, 1.5), (0.05, True, 1.0), (0.05, False, 1.5)])
 def test_a_keyframe_that_was_tracked_wrongly_leaves_the_frames_before_it_where_they_are(
-    sigma: float, length: float
+    sigma: float, metric: bool, length: float
 ) -> None:
     """2.3 m between a keyframe as tracked and as adjusted are drift where its tracking left them open, and an error of
-    that frame alone where it did not. Oracle: the straight paths.
+    that frame alone where it did not; without depth they are another unit. Oracle: the straight paths.
     """
-    slam = _walked(begins=(0,))
+    slam = replace(_walked(begins=(0,)), metric=metric)
     known = np.diag(np.repeat([sigma, 0.1], 3) ** -2.0)
     arrivals = [record for record in slam.frames if record.arrival is not None]
     ties = tuple(MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known) for r in arrivals if r.arrival)

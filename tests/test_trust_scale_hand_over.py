@@ -15,6 +15,7 @@ from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.keyframe import Slots
 from vggtgeo.slam.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.scale_hand_over import ALONE, check_hand_over, hand_over_sigma
 
 K = np.array([500.0, 500.0, 320.0, 240.0])
@@ -81,6 +82,7 @@ def test_a_scale_that_little_hands_on_is_told(across: dict[int, int], told: bool
     assert [finding.check for finding in found] == ["scale"] * told
     # The next keyframes know the depth of those two alone, too.
     assert all(re.search("fewest at frame (8|9|10):", finding.text) for finding in found)
+    assert any("is handed on by few" in reason for reason in judge(slam).reasons) == told
     assert check_hand_over(replace(slam, metric=True)) == []
 
 

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.models import pinhole
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.rolling_shutter import camera_motions, image_shift
+from vggtgeo.slam.state import Readout
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.sensor_drift import MOST_ZOOM, Change, DepthPair, change, compare, depth_pairs, stretches
@@ -176,6 +178,23 @@ def test_a_run_whose_sensors_change_is_told(
     assert told([replace(noted, depth_median=float("nan")) for noted in recorder.frames]) == []
     monkeypatch.setattr(drift, lambda slam, stretch: _run(*curves, noise=0.1))
     assert told(recorder.frames) == [], "steps forward past depth that is noise look like a zoom"
+
+
+def test_pairs_are_without_the_rolling_shutter_that_was_found() -> None:
+    """Oracle: each match of a simulated run, moved by the time of its row."""
+    slam = recorded_run().slam
+    number = len(slam.keyframes)
+    rolled = replace(slam, readout=Readout(0.03, False, 1.0))
+    pairs, still = (list(depth_pairs(state, range(number))) for state in (slam, rolled))
+    motions, camera, size = camera_motions(slam, number), np.asarray(slam.intrinsics), slam.keyframes[0].size
+    moved = 0.0
+    for pair, found in zip(pairs, still, strict=True):
+        motion = motions[pair.numbers[0]]
+        shift = image_shift(pair.before[None], 1 / pair.depth[None], motion[None], camera, size, columns=False)[0]
+        assert np.allclose(found.before, pair.before - 0.03 * shift)
+        assert not np.array_equal(found.after, pair.after)
+        moved = max(moved, float(np.abs(found.before - pair.before).max()))
+    assert moved > 0.1
 
 
 def test_depth_that_is_the_same_everywhere_tells_of_no_lens() -> None:

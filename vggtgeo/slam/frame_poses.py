@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import lie, rigid
 from vggtgeo.slam.factors import MeasuredRelativePose
 from vggtgeo.slam.frame_refinement import by_both
 from vggtgeo.slam.fusion import AGREEMENT_GATE
@@ -36,8 +35,10 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             continue
         if record.arrival is not None:
             reference, tracked = record.arrival
-            change = poses[row] @ rigid.invert(tracked @ slam.keyframes[reference].pose)
-            gross = _is_gross(change, ties.get((reference, record.reference)))
+            arrived = tracked @ slam.keyframes[reference].pose
+            change = poses[row] @ rigid.invert(arrived)
+            tie = ties.get((reference, record.reference))
+            gross = tie is not None and _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
             between = [] if gross else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
             span = max(times[row] - times[last], 1e-9)
             for k in between:
@@ -46,11 +47,9 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     return times, by_both(slam, poses)
 
 
-def _is_gross(change: np.ndarray, tie: MeasuredRelativePose | None) -> bool:
-    """Whether an adjustment changed a keyframe [4, 4] by more than its tracking left open."""
-    if tie is None:
-        return False
-    off = np.append(change[:3, 3], Rotation.from_matrix(change[:3, :3]).as_rotvec())
+def _is_gross(arrived: np.ndarray, adjusted: np.ndarray, tie: MeasuredRelativePose) -> bool:
+    """Whether an adjustment moved a keyframe [4, 4] by more than its tracking left open."""
+    off = lie.steps(arrived[None], adjusted[None])[0]
     return bool(off @ tie.information @ off > GROSS)
 
 

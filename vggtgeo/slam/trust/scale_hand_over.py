@@ -46,8 +46,10 @@ def check_hand_over(slam: Slam) -> list[Finding]:
 
     Of a matcher whose targets are no key points nothing is said: its matches are of no landmark of the other keyframe.
     """
-    of_both = [pair.points.index_j >= 0 for pair in slam.pairs]
-    if slam.metric or not of_both or not slam.frames or np.concatenate(of_both).mean() < LEAST_OF_BOTH:
+    if slam.metric:
+        return []
+    of_both = sum(np.count_nonzero(pair.points.index_j >= 0) for pair in slam.pairs)
+    if of_both < LEAST_OF_BOTH * sum(len(pair.points) for pair in slam.pairs):
         return []
     sigma = hand_over_sigma(slam)
     frames = np.array([keyframe.frame for keyframe in slam.keyframes])
