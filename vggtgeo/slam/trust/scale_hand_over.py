@@ -7,8 +7,8 @@ match across hands the scale on with the variance `v_before + v_after + FLOOR^2`
 `ALONE^2`. Matches that share errors count as fewer. Steps add up as a random walk.
 
 It is what a count of inliers cannot tell: frames that turn on the spot, or come out of a white wall, have seventeen
-matches of hardly any parallax. Building-walk without depth, frames 160 to 239, had 29.9 cm where lengths halve at frame
-215: there this says 28 % for one step, and nowhere else more than 9 %.
+matches of hardly any parallax. Frames 160 to 239 of building-walk without depth were 29.9 cm off where lengths halve at
+frame 215: there this says 28 % for one step, and nowhere else more than 9 %.
 """
 
 from __future__ import annotations
