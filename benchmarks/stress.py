@@ -111,9 +111,9 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     done: list[Outcome] = []
     with ThreadPoolExecutor(options.jobs) as pool:
-        for outcome in pool.map(lambda case: _run(case, options), cases):
+        for outcome in pool.map(lambda case: run_case(case, options), cases):
             done.append(outcome)
-            print(_row(outcome, judge(outcome, _base(done, outcome.source))), flush=True)
+            print(row(outcome, judge(outcome, _base(done, outcome.source))), flush=True)
     text = _page(done, options)
     (options.out / "stress.md").write_text(text)
     if options.page:
@@ -136,7 +136,8 @@ def judge(outcome: Outcome, base: float) -> str:
     return "mild" if complete and outcome.ate <= max(3 * base, 0.08) else "SILENT"
 
 
-def _run(case: Case, options: argparse.Namespace) -> Outcome:
+def run_case(case: Case, options: argparse.Namespace) -> Outcome:
+    """What comes of it; kept in `options.out`, and read there where it was run before."""
     kept = options.out / f"{case.source}.{case.name}.json"
     if kept.is_file() and not options.fresh:
         return Outcome(**json.loads(kept.read_text()))
@@ -146,7 +147,7 @@ def _run(case: Case, options: argparse.Namespace) -> Outcome:
     began, said = time.perf_counter(), ""
     try:
         ended = subprocess.run(
-            [options.program, "run", str(folder), "-o", str(work / "run"), "--quiet"],
+            [options.program, "run", str(folder), "-o", str(work / "run"), "--dense", options.dense, "--quiet"],
             capture_output=True,
             text=True,
             timeout=options.timeout,
@@ -238,7 +239,8 @@ def _base(outcomes: list[Outcome], source: str) -> float:
     return found[0] if found and found[0] < 0.1 else 0.01
 
 
-def _row(outcome: Outcome, word: str) -> str:
+def row(outcome: Outcome, word: str) -> str:
+    """A line of the table."""
     reasons = "; ".join(outcome.reasons)
     reasons = reasons if len(reasons) < 160 else reasons[:157] + "..."
     name = f"**{word}**" if word in ("SILENT", "crash", "hang") else word
@@ -269,7 +271,7 @@ def _page(outcomes: list[Outcome], options: argparse.Namespace) -> str:
         "| source | variant | outcome | verdict | SE(3) cm | Sim(3) cm | tracked | reasons |",
         "|---" * 8 + "|",
     ]
-    lines += [_row(outcome, word) for outcome, word in zip(outcomes, words, strict=True)]
+    lines += [row(outcome, word) for outcome, word in zip(outcomes, words, strict=True)]
     return "\n".join(lines) + "\n"
 
 
@@ -283,6 +285,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument(
+        "--dense", default="auto", help="as of `vggtgeo run`; the verdict does not look at the dense map"
+    )
     parser.add_argument("--timeout", type=float, default=240.0, help="seconds a run may take")
     parser.add_argument("--program", default=str(Path(sys.executable).parent / "vggtgeo"))
     parser.add_argument("--out", type=Path, default=Path("runs/stress"))

@@ -53,6 +53,15 @@ def test_a_camera_of_other_images_is_told_by_its_middle(healthy: Walk) -> None:
     assert not any("cut, turned or scaled" in text for text in confirmed), "the images know their camera"
 
 
+def test_what_images_want_must_be_a_camera(healthy: Walk) -> None:
+    """A search that ran away says nothing, however sure it is; an image that was cut at its corner does."""
+    sure = np.diag([0.01, 1.0, 1.0, 0.01]) ** 2
+    away = CameraOpinion(np.array([1.2, 30.0, -1.5 * SIZE[1], 0.0]), sure, 12)
+    assert check_camera(healthy.estimate, away, SIZE) == []
+    cut = CameraOpinion(np.array([0.0, 0.6 * SIZE[0], 0.6 * SIZE[1], 0.0]), sure, 12)
+    assert ["principal point" in found.text for found in check_camera(healthy.estimate, cut, SIZE)] == [True]
+
+
 def test_a_zoom_halfway_is_told() -> None:
     """Pictures that are enlarged by 1.3 in the second half of a long walk are told as a zoom, though half of the pairs
     fit the given camera. Oracle: the enlargement, and the frames that it was made in.

@@ -42,3 +42,18 @@ def test_a_room_that_ends_at_arms_length_is_told(healthy: Walk) -> None:
     assert "19 in 20 are within 0.9 m" in check_range(healthy.estimate, small)[0].text
     desk = with_depth(healthy.evidence, lambda f: np.where(np.arange(len(f.depth)) % 12 == 0, 2.0, 0.6))
     assert check_range(healthy.estimate, desk) == []
+
+
+def test_holes_are_far_where_a_sensor_ends(healthy: Walk) -> None:
+    """Of a wide view from near a table, a sensor that ends early leaves the table; that is no wrong unit. Without the
+    holes as many depths that near are told.
+    """
+    order = lambda f: np.arange(len(f.depth))
+    near = lambda f: np.where(order(f) % 20 == 0, 0.18, np.where(order(f) % 3 == 0, 1.5, np.nan))
+    cut = with_depth(healthy.evidence, near)
+    cut = [replace(frame, depth_median=1.5) for frame in cut]
+    blank = [replace(frame, depth=np.full_like(frame.depth, np.nan)) for frame in cut]  # every second image has depth
+    mixed = [a if number % 2 else b for number, (a, b) in enumerate(zip(cut, blank, strict=True))]
+    assert check_range(healthy.estimate, mixed) == []
+    filled = with_depth(healthy.evidence, lambda f: np.where(order(f) % 6 == 0, 0.18, 1.5))
+    assert "a tenth of the corners is within 0.18 m" in check_range(healthy.estimate, filled)[0].text

@@ -40,7 +40,7 @@ def dirty_lens(recording: Recording, rng: np.random.Generator) -> Recording:
         rng.integers(0, width, 12), rng.integers(0, height, 12), rng.integers(12, 36, 12), strict=True
     ):
         cv2.ellipse(mask, (int(x), int(y)), (int(size), int(size) // 2), float(rng.uniform(0, 180)), 0, 360, 255, -1)
-    return _images(recording, lambda image, row: np.where(mask[..., None] > 0, image // 5, image))
+    return with_images(recording, lambda image, row: np.where(mask[..., None] > 0, image // 5, image))
 
 
 def bars(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -53,7 +53,7 @@ def bars(recording: Recording, rng: np.random.Generator) -> Recording:
         image[:height] = image[-height:] = 0
         return image
 
-    return _images(recording, paint)
+    return with_images(recording, paint)
 
 
 def text(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -70,7 +70,7 @@ def text(recording: Recording, rng: np.random.Generator) -> Recording:
             cv2.putText(image, line, corner, cv2.FONT_HERSHEY_SIMPLEX, size, (255, 255, 255), 2)
         return image
 
-    return _images(recording, paint)
+    return with_images(recording, paint)
 
 
 def board(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -80,7 +80,7 @@ def board(recording: Recording, rng: np.random.Generator) -> Recording:
     pattern = cv2.resize(pattern, (width, height), interpolation=cv2.INTER_CUBIC)
     top = round(0.7 * height)
     below = np.arange(height)[:, None] >= top
-    painted = _images(recording, lambda image, row: np.where(below[..., None], pattern, image))
+    painted = with_images(recording, lambda image, row: np.where(below[..., None], pattern, image))
     return with_depths(painted, lambda depth, row: np.where(below, 0.45, depth))
 
 
@@ -103,13 +103,13 @@ def person(recording: Recording, rng: np.random.Generator) -> Recording:
         depth[height // 5 :, place(row)] = 1.2
         return depth
 
-    return with_depths(_images(recording, paint), near)
+    return with_depths(with_images(recording, paint), near)
 
 
 def dark(recording: Recording, rng: np.random.Generator) -> Recording:
     """A twelfth of the light, with the noise of a camera in it."""
     change = lambda image, row: np.clip(image / 12.0 + rng.normal(0, 2.0, image.shape), 0, 255).astype(np.uint8)
-    return _images(recording, change)
+    return with_images(recording, change)
 
 
 def centimetres(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -149,7 +149,7 @@ def barrel(recording: Recording, rng: np.random.Generator) -> Recording:
     grid = np.stack([x, y], -1).reshape(-1, 1, 2)
     source = cv2.undistortPoints(grid, camera.matrix, np.array([-0.3, 0, 0, 0.0]), P=camera.matrix)
     u, v = np.asarray(source, np.float32).reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
-    bent = _images(recording, lambda image, row: cv2.remap(image, u, v, cv2.INTER_LINEAR))
+    bent = with_images(recording, lambda image, row: cv2.remap(image, u, v, cv2.INTER_LINEAR))
     nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
     return with_depths(bent, lambda depth, row: cv2.remap(depth, u, v, cv2.INTER_NEAREST, **nothing))
 
@@ -189,7 +189,7 @@ def covered(recording: Recording, rng: np.random.Generator) -> Recording:
     middle = len(recording.frames) // 2
     noise = lambda image: rng.normal(12, 2.0, image.shape).clip(0, 255).astype(np.uint8)
     inside = lambda row: middle <= row < middle + 10
-    blind = _images(recording, lambda image, row: noise(image) if inside(row) else image)
+    blind = with_images(recording, lambda image, row: noise(image) if inside(row) else image)
     return with_depths(blind, lambda depth, row: np.full_like(depth, np.nan) if inside(row) else depth)
 
 
@@ -220,11 +220,12 @@ def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recor
     def depth_through(depth: np.ndarray, row: int) -> np.ndarray:
         return cv2.warpAffine(depth, grown(row), depth.shape[::-1], flags=cv2.INTER_NEAREST, **nothing)
 
-    seen = _images(recording, lambda image, row: cv2.warpAffine(image, grown(row), image.shape[1::-1]))
+    seen = with_images(recording, lambda image, row: cv2.warpAffine(image, grown(row), image.shape[1::-1]))
     return with_depths(seen, depth_through)
 
 
-def _images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
+def with_images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
+    """The recording with each image, uint8 [H, W, 3], changed, given its row too."""
     frames = [replace(frame, image=change(frame.image, row)) for row, frame in enumerate(recording.frames)]
     return replace(recording, frames=frames)
 

@@ -71,6 +71,10 @@ that were cut, turned or scaled after their calibration are beyond."""
 MOST_FOUND_ASIDE = 0.1
 """The same of a camera that the run found for itself: five standard deviations of what such a one has before anything
 is seen (`camera.guessed_centre_sigma`). 0.13 where a rolling shutter had bent everything, 86 cm in building-walk."""
+NO_CAMERA = 1.0
+"""The same of the camera that images want, beyond which it is none: a cut image can have its principal point outside,
+but not by so much. Pictures with a mark in the corner, of a camera that hardly moved, "wanted" it 549 px above the
+middle of 480 rows (every step of the search was the longest one), and 1551 px of focal length for 481."""
 MOST_BY_LENS = 0.1
 """By how much a lens that a run found for itself may have changed its focal length, logarithm. A bedroom filmed by a
 phone: 0.22 (792 px, 989 with a lens, 803 by all of the video), and the camera turned by 15 degrees too little, called
@@ -92,6 +96,8 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
     """
     if not estimate.calibrated:
         return [*_check_guess(estimate), *_check_lens(estimate), *_check_found_middle(estimate.intrinsics, size)]
+    if opinion is not None and _is_no_camera(estimate.intrinsics[2:] + opinion.value[1:3], size):
+        opinion = None
     middle = _check_middle(estimate.intrinsics, opinion, size)
     moved = bool(np.any(np.abs(estimate.intrinsics - estimate.given) > MOST_MOVED * estimate.given[0]))
     much = 0.5 if moved else 1.0
@@ -123,6 +129,11 @@ def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[
         )
         found.append(Finding("calibration", "degraded", text))
     return found
+
+
+def _is_no_camera(centre: np.ndarray, size: tuple[int, int]) -> bool:
+    sides = np.array(size, np.float64)
+    return bool(np.any(np.abs(centre - (sides - 1.0) / 2.0) > NO_CAMERA * sides))
 
 
 def _check_focal(estimate: Estimate, most: float) -> list[Finding]:

@@ -25,7 +25,7 @@ LEAST_CHANGED = 0.02
 """Share of pixels of a depth image that a moving camera changes at least, quantisation to 5 cm included (0.7)."""
 LEAST_FRAMES = 3
 NEAREST = 0.2
-"""Metres: at most a tenth of a room sensor's depths at corners is nearer."""
+"""Metres: at most a tenth of the corners is nearer to a sensor for rooms."""
 SMALLEST_ROOM = 1.0
 """Metres: of the depths at corners, over the whole run, more than a twentieth is farther."""
 PLAUSIBLE = (0.5, 6.5)
@@ -62,9 +62,13 @@ def check_range(estimate: Estimate, evidence: Evidence) -> list[Finding]:
     middle = float(np.median(medians))
     corners = np.concatenate([frame.depth for frame in evidence])
     corners = corners[np.isfinite(corners)]
-    near = float(np.quantile(corners, 0.1)) if len(corners) else NEAREST
+    # A hole counts as far: where a sensor ends at 1.7 m, say, what is left of a wide view is what is near.
+    with_depth = [np.where(np.isfinite(d), d, np.inf) for d in (f.depth for f in evidence) if np.isfinite(d).any()]
+    near = float(np.quantile(np.concatenate(with_depth), 0.1)) if with_depth else NEAREST
     if near < NEAREST:
-        text = f"a tenth of the depths is below {near:.2g} m, nearer than sensors for rooms can see: is the unit right?"
+        text = (
+            f"a tenth of the corners is within {near:.2g} m, nearer than sensors for rooms can see: is the unit right?"
+        )
         return [Finding("depth range", "degraded", text, scale=True)]
     far = float(np.quantile(corners, 0.95)) if len(corners) else SMALLEST_ROOM
     if PLAUSIBLE[0] <= middle and far < SMALLEST_ROOM:
