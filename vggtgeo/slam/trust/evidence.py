@@ -37,8 +37,9 @@ LIGHT_REMOVED = 0.8
 DARKEST = 0.3
 """Of the mean brightness: darker surroundings are not made brighter than this allows; they are noise."""
 BANDS = 8.0
-"""Grey levels of these images, root mean square over the rows, by which two in a row must differ in what is common to
-a row for bands of light to be looked for. Without any: 0.6 to 5.5 in the middle of a clip, 16 in turns; with: 11 to 40."""
+"""Grey levels of these images by which two in a row must differ (root mean square over the rows) in what is common to
+a row, for bands of light to be looked for. Without any: 0.6 to 5.5 in the middle of a clip, 16 in turns; with: 11 up.
+"""
 MORE = 1.2
 """Times as many corners come back without them: then these are bands."""
 ROUND_TRIP = 0.5
