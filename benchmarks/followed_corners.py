@@ -14,6 +14,7 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 import vggtgeo as vg
@@ -83,6 +84,7 @@ LIGHTS = {
     "bands of 300 rows, 30 %": _bands(0.3, 300, 90),
     "bands of 100 rows, 30 %": _bands(0.3, 100, 40),
     "bands of 60 rows, 15 %": _bands(0.15, 60, 25),
+    "smeared over 31 px, 8 of 20 frames": lambda image, number: cv2.blur(image, (31, 1)) if number % 20 < 8 else image,
     "swings by half in 12 frames": lambda image, number: _whole(image * (1 + 0.5 * np.sin(2 * np.pi * number / 12))),
     "15 % of the contrast": lambda image, number: _whole(128 + (image - 128.0) * 0.15),
     "noise of 15 levels": lambda image, number: _whole(

@@ -30,10 +30,11 @@ LEAST_CORNER = 2e-5
 """Smallest eigenvalue of the structure tensor (OpenCV's unit). White noise of 3 grey levels gives 1e-5."""
 CONTRAST = 50.0
 """Grey levels, standard deviation."""
-AROUND = 11
+AROUND = 19
 """Pixels of these images, side of the square (twice) whose mean is the brightness around a pixel."""
-LIGHT_REMOVED = 0.8
-"""Share of that brightness that is taken away. Without all of it, white walls have no corner: their shades are soft."""
+LIGHT_REMOVED = 0.7
+"""Share of that brightness that is taken away. With more, or a smaller square, little is left to follow on white walls,
+whose shades are soft, and in pictures that are smeared (`benchmarks/followed_corners.py`)."""
 DARKEST = 0.3
 """Of the mean brightness: darker surroundings are not made brighter than this allows; they are noise."""
 BANDS = 8.0
@@ -280,7 +281,7 @@ def _small_grey(image: np.ndarray) -> tuple[np.ndarray, float]:
     around = cv2.blur(cv2.blur(levels, square), square)
     detail = levels - LIGHT_REMOVED * around - (1 - LIGHT_REMOVED) * mean
     detail *= mean / np.maximum(around, DARKEST * mean)
-    gain = min(CONTRAST / max(float(detail.std()), 1e-3), 4.0)
+    gain = min(CONTRAST / max(deviation, 1e-3), 4.0)
     return np.clip(gain * detail + 128.0, 0, 255).astype(np.uint8), deviation
 
 
