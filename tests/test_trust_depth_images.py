@@ -22,6 +22,9 @@ def test_a_frozen_depth_image_is_told(healthy: Walk) -> None:
     assert [(f.start, f.end) for f in check_frozen(healthy.estimate, frozen, harmless=False)] == [(9, 20)]
     assert [(f.local, f.scale) for f in check_frozen(healthy.estimate, frozen, harmless=True)] == [(True, False)]
     assert check_frozen(replace(healthy.estimate, metric=False), frozen, harmless=False) == []
+    always = [replace(f, depth_changed=0.0) for f in healthy.evidence]
+    told = check_frozen(healthy.estimate, always, harmless=True)
+    assert [(f.local, f.scale) for f in told] == [(False, True)], "poses that such depth made agree with it"
     still = [replace(healthy.evidence[0], frame=k, depth_changed=0.0) for k in range(20)]
     assert check_frozen(healthy.estimate, still, harmless=False) == []
 

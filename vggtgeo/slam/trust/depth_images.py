@@ -24,6 +24,10 @@ MOVED = 2.0
 LEAST_CHANGED = 0.02
 """Share of pixels of a depth image that a moving camera changes at least, quantisation to 5 cm included (0.7)."""
 LEAST_FRAMES = 3
+MOSTLY = 0.8
+"""Share of the frames: where as many show one depth image while the picture moves, poses that agree with it were made
+by it. Depth at a fifth of the rate of the images repeats itself in as many, and no sensor is slower. 40 frames of
+building-walk, all of them 1 m away, 34 cm off, agreed with themselves and were called good."""
 NEAREST = 0.2
 """Metres: at most a tenth of the corners is nearer to a sensor for rooms."""
 SMALLEST_ROOM = 1.0
@@ -36,7 +40,7 @@ def check_frozen(estimate: Estimate, evidence: Evidence, harmless: bool) -> list
     """Depth images that are repeated while the picture moves, where they were used.
 
     harmless: whether depth and motion agree all the same, as they do where the camera hardly moves: then it marks the
-    segment only.
+    segment only, if most frames have a depth image of their own.
     """
     if not estimate.metric:  # all beyond its range, say, which is the same all the time
         return []
@@ -45,6 +49,7 @@ def check_frozen(estimate: Estimate, evidence: Evidence, harmless: bool) -> list
         frozen = (np.array([frame.depth_changed for frame in evidence]) < LEAST_CHANGED) & (moved > MOVED)
     if np.count_nonzero(frozen) < LEAST_FRAMES:
         return []
+    harmless = harmless and bool(np.mean(frozen) < MOSTLY)
     found = []
     for first, last in spans(frozen, join=3):
         start, end = evidence[max(first - 1, 0)].frame, evidence[last].frame
