@@ -13,7 +13,14 @@ from vggtgeo.models.roles import Features
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.trust.contradicted import APART, FAR_APART, LEAST_FAR_PAIRS, LEAST_PAIRS, check_matches
+from vggtgeo.slam.trust.contradicted import (
+    APART,
+    FAR_APART,
+    LEAST_FAR_PAIRS,
+    LEAST_PAIRS,
+    check_matches,
+    check_matches_with_depth,
+)
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
 STEP = np.array([0.08, 0.01, 0.03, 0.005, 0.02, -0.004])
@@ -59,6 +66,20 @@ def test_poses_that_images_contradict_are_told() -> None:
     assert "contradict the poses" in finding.text
     (finding,) = check_matches(bent(keyframes, 0, 10), INTRINSICS, alone=False)
     assert (finding.start, finding.end) == (0, 90)
+
+
+def test_poses_that_wrong_depth_made_are_told() -> None:
+    """The same with depth, of a map of ten keyframes, and of one of four, which has neighbours only; two say nothing.
+    Oracle: how the poses were made.
+    """
+    for count in (10, 4):
+        assert list(check_matches_with_depth(seen(count), INTRINSICS)) == []
+        (finding,) = check_matches_with_depth(bent(seen(count), 0, count), INTRINSICS)
+        assert (finding.level, finding.scale, finding.start) == ("degraded", True, None)
+        assert "look at the depth images" in finding.text
+        (finding,) = check_matches_with_depth(bent(seen(count), 0, count), INTRINSICS, alone=False)
+        assert finding.start == 0
+    assert list(check_matches_with_depth(bent(seen(3), 0, 3), INTRINSICS)) == []
 
 
 def test_a_slow_bend_is_told_by_pairs_farther_apart() -> None:
