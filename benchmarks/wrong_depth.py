@@ -5,8 +5,9 @@
 
 The first 40 frames of each clip with the faults that programs and people make: turned images, distances along the
 ray in place of depth, the inverse, files paired by names sorted as text, a lower rate, a filter over time, each image
-scaled to one range, answers of a network (another scale in each image, smooth errors), other resolutions and ranges, an
-offset, a power. ATE after SE(3) and Sim(3), cm. Oracle: what was done. No image tells of a factor on all depth.
+scaled to one range, answers of a network (another scale in each image, smooth errors), other resolutions and ranges,
+a wall in place of the scene, an offset, a power. ATE after SE(3) and Sim(3), cm. Oracle: what was done. No image tells
+of a factor on all depth.
 """
 
 from __future__ import annotations
@@ -75,6 +76,13 @@ def smooth_errors(frames: Sequence[Frame], camera: tuple[float, ...], rng: np.ra
     return [frame.depth * np.exp(field()) for frame in frames]
 
 
+def wall(metres: float) -> Degradation:
+    """The same depth everywhere and always, with 1 % of noise: a sensor before glass, a network that says one thing."""
+    return of_frames(
+        lambda frames, camera, rng: [metres * (1 + rng.normal(0, 0.01, frame.depth.shape)) for frame in frames]
+    )
+
+
 def from_an_eighth(depth: np.ndarray) -> np.ndarray:
     """Of an eighth of the resolution, jumps smoothed; none as zero, as an interpolation takes it."""
     small = cv2.resize(np.nan_to_num(depth), None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA)
@@ -97,6 +105,9 @@ CHANGES: dict[str, Degradation] = {
     "smooth 10 %": of_frames(smooth_errors),
     "from an eighth": of_depth(from_an_eighth),
     "up to 2 m": of_depth(lambda depth: np.where(depth < 2.0, depth, np.nan)),
+    "a wall at 1 m": wall(1.0),
+    "a wall at 2 m": wall(2.0),
+    "middle of each": of_depth(lambda depth: np.where(np.isfinite(depth), np.nanmedian(depth), np.nan)),
     "30 cm more": of_depth(lambda depth: depth + 0.3),
     "power 1.15": of_depth(lambda depth: depth**1.15),
 }
