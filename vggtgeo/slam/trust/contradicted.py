@@ -93,10 +93,11 @@ def check_matches_with_depth(
     keyframes: Sequence[Keyframe], intrinsics: np.ndarray, alone: bool = True
 ) -> Iterator[Finding]:
     """As `check_matches`, of the median pair of a map that measured depth made."""
-    shares = [(_shares(keyframes, intrinsics, apart, MOST_PAIRS_WITH_DEPTH), *bounds) for apart, *bounds in WITH_DEPTH]
+    shares_of = lambda apart: _shares(keyframes, intrinsics, apart, MOST_PAIRS_WITH_DEPTH)
+    shares = [(shares_of(apart), least, pairs) for apart, least, pairs in WITH_DEPTH]
     if len(shares[0][0]) < WITH_DEPTH[0][2]:
-        apart, *bounds = WITH_DEPTH_AND_FEW
-        shares = [(_shares(keyframes, intrinsics, apart, MOST_PAIRS_WITH_DEPTH), *bounds)]
+        apart, least, pairs = WITH_DEPTH_AND_FEW
+        shares = [(shares_of(apart), least, pairs)]
     for known, least, pairs in shares:
         middle = float(np.median([share for *_, share in known])) if len(known) >= pairs else 1.0
         if middle < least:
