@@ -4,13 +4,14 @@
 
 A row for each clip and light: how many corners two neighbouring frames share (median, least), the share of them that
 the true poses and depths explain (median, lowest twentieth), and steps that would be called contradicted. No run takes
-part: what is wrong here is a false alarm of `vggtgeo/slam/trust/steps.py`; fewer than 8 corners say nothing.
+part: what is wrong here is a false alarm of `vggtgeo/slam/trust/steps.py`; fewer than 8 corners say nothing. Bands:
+grey levels, root mean square, by which two images differ in what is common to a row (median, highest twentieth).
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,7 +20,8 @@ import numpy as np
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.simulation.degradations import Recording, with_images
+from vggtgeo.simulation.degradations import Recording, in_bands_of_light, with_images
+from vggtgeo.slam.trust.evidence import common_to_rows
 from vggtgeo.slam.trust.steps import LEAST_CORNERS, Step, compare
 
 
@@ -29,7 +31,9 @@ def main() -> None:
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=120)
     options = parser.parse_args()
-    print("| clip | light | corners | least | agree | lowest 5 % | contradicted | too few |\n" + "|---" * 8 + "|")
+    print(
+        "| clip | light | corners | least | agree | lowest 5 % | contradicted | too few | bands |\n" + "|---" * 9 + "|"
+    )
     for folder in options.clips:
         if not folder.is_dir():
             continue
@@ -39,40 +43,33 @@ def main() -> None:
             raise SystemExit(f"`{folder}` has no truth, or no depth")
         recording = Recording(list(clip.frames(0, options.frames)), clip.camera, truth)
         for name, light in LIGHTS.items():
-            found = _steps(with_images(recording, light))
+            found, bands = _steps(with_images(recording, light))
             counts, shares = np.array([len(s.agrees) for s in found]), np.array([_share(s) for s in found])
             few, wrong = np.count_nonzero(counts < LEAST_CORNERS), sum(step.contradicted for step in found)
             print(
                 f"| {clip.name} | {name} | {np.median(counts):.0f} | {counts.min()} | {np.nanmedian(shares):.2f} | "
-                f"{np.nanquantile(shares, 0.05):.2f} | {wrong} | {few} |",
+                f"{np.nanquantile(shares, 0.05):.2f} | {wrong} | {few} | "
+                f"{np.median(bands):.1f}, {np.quantile(bands, 0.95):.1f} |",
                 flush=True,
             )
 
 
-def _steps(recording: Recording) -> list[Step]:
-    """The true steps against the corners."""
-    recorder = vg.EvidenceRecorder(recording.camera)
+def _steps(recording: Recording) -> tuple[list[Step], list[float]]:
+    """The true steps against the corners, and the bands of light from image to image."""
+    recorder, images = vg.EvidenceRecorder(recording.camera), []
     for frame in recording.frames:
         recorder.add(frame)
+        images.append(recorder.so_far().image)
     times = recording.truth.timestamps
     nearest = [int(np.abs(times - frame.timestamp).argmin()) for frame in recording.frames]
     poses, inner = rigid.invert(recording.truth.poses[nearest]), np.array(recording.camera.intrinsics)
     pairs = pairwise(zip(recorder.frames, poses, strict=True))
-    return [compare(a, b, after @ rigid.invert(before), inner) for (a, before), (b, after) in pairs]
+    taken = [compare(a, b, after @ rigid.invert(before), inner) for (a, before), (b, after) in pairs]
+    return taken, [float(np.sqrt(np.mean(common_to_rows(*pair) ** 2))) for pair in pairwise(images)]
 
 
 def _share(step: Step) -> float:
     return float(np.mean(step.agrees)) if len(step.agrees) else float("nan")
-
-
-def _bands(share: float, period: float, speed: float) -> Callable[[np.ndarray, int], np.ndarray]:
-    """Light that flickers while a camera reads its rows: brightness of a row, as a function of image and number."""
-
-    def change(image: np.ndarray, number: int) -> np.ndarray:
-        rows = np.arange(len(image))[:, None, None]
-        return _whole(image * (1 + share * np.sin(2 * np.pi * (rows + speed * number) / period)))
-
-    return change
 
 
 def _whole(image: np.ndarray) -> np.ndarray:
@@ -81,9 +78,9 @@ def _whole(image: np.ndarray) -> np.ndarray:
 
 LIGHTS = {
     "as it is": lambda image, number: image,
-    "bands of 300 rows, 30 %": _bands(0.3, 300, 90),
-    "bands of 100 rows, 30 %": _bands(0.3, 100, 40),
-    "bands of 60 rows, 15 %": _bands(0.15, 60, 25),
+    "bands of 300 rows, 30 %": partial(in_bands_of_light, share=0.3, period=300, speed=90),
+    "bands of 100 rows, 30 %": partial(in_bands_of_light, share=0.3, period=100, speed=40),
+    "bands of 60 rows, 15 %": partial(in_bands_of_light, share=0.15, period=60, speed=25),
     "smeared over 31 px, 8 of 20 frames": lambda image, number: cv2.blur(image, (31, 1)) if number % 20 < 8 else image,
     "swings by half in 12 frames": lambda image, number: _whole(image * (1 + 0.5 * np.sin(2 * np.pi * number / 12))),
     "15 % of the contrast": lambda image, number: _whole(128 + (image - 128.0) * 0.15),

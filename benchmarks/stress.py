@@ -234,9 +234,13 @@ def _scene_cases(options: argparse.Namespace) -> Iterator[Case]:
 
 
 def _base(outcomes: list[Outcome], source: str) -> float:
-    """ATE of the recording undisturbed; 1 cm where that itself went wrong, so that it excuses nothing."""
-    found = [o.ate for o in outcomes if o.source == source and o.name == "base" and o.level == "good"]
-    return found[0] if found and found[0] < 0.1 else 0.01
+    found = [outcome for outcome in outcomes if (outcome.source, outcome.name) == (source, "base")]
+    return excused(found[0] if found else None)
+
+
+def excused(base: Outcome | None) -> float:
+    """ATE of the recording undisturbed, metres; 1 cm where that itself went wrong, so that it excuses nothing."""
+    return base.ate if base is not None and base.level == "good" and base.ate < 0.1 else 0.01
 
 
 def row(outcome: Outcome, word: str) -> str:
@@ -284,17 +288,22 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
+    add_run_options(parser, out="runs/stress", timeout=240.0, dense="auto")
+    parser.add_argument("--page", type=Path, help="file that gets the table, too")
+    return parser.parse_args()
+
+
+def add_run_options(parser: argparse.ArgumentParser, out: str, timeout: float, dense: str) -> None:
+    """What `run_case` asks for, with these defaults."""
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument(
-        "--dense", default="auto", help="as of `vggtgeo run`; the verdict does not look at the dense map"
+        "--dense", default=dense, help="as of `vggtgeo run`; the verdict does not look at the dense map"
     )
-    parser.add_argument("--timeout", type=float, default=240.0, help="seconds a run may take")
+    parser.add_argument("--timeout", type=float, default=timeout, help="seconds a run may take")
     parser.add_argument("--program", default=str(Path(sys.executable).parent / "vggtgeo"))
-    parser.add_argument("--out", type=Path, default=Path("runs/stress"))
-    parser.add_argument("--page", type=Path, help="file that gets the table, too")
+    parser.add_argument("--out", type=Path, default=Path(out))
     parser.add_argument("--keep", action="store_true", help="keep recordings and runs")
     parser.add_argument("--fresh", action="store_true", help="run again what is done")
-    return parser.parse_args()
 
 
 if __name__ == "__main__":

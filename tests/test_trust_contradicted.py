@@ -13,14 +13,7 @@ from vggtgeo.models.roles import Features
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.trust.contradicted import (
-    APART,
-    FAR_APART,
-    LEAST_FAR_PAIRS,
-    LEAST_PAIRS,
-    check_matches,
-    check_matches_with_depth,
-)
+from vggtgeo.slam.trust.contradicted import FAR, NEAR, check_matches
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
 STEP = np.array([0.08, 0.01, 0.03, 0.005, 0.02, -0.004])
@@ -73,13 +66,13 @@ def test_poses_that_wrong_depth_made_are_told() -> None:
     Oracle: how the poses were made.
     """
     for count in (10, 4):
-        assert list(check_matches_with_depth(seen(count), INTRINSICS)) == []
-        (finding,) = check_matches_with_depth(bent(seen(count), 0, count), INTRINSICS)
+        assert list(check_matches(seen(count), INTRINSICS, metric=True)) == []
+        (finding,) = check_matches(bent(seen(count), 0, count), INTRINSICS, metric=True)
         assert (finding.level, finding.scale, finding.start) == ("degraded", True, None)
         assert "look at the depth images" in finding.text
-        (finding,) = check_matches_with_depth(bent(seen(count), 0, count), INTRINSICS, alone=False)
+        (finding,) = check_matches(bent(seen(count), 0, count), INTRINSICS, alone=False, metric=True)
         assert finding.start == 0
-    assert list(check_matches_with_depth(bent(seen(3), 0, 3), INTRINSICS)) == []
+    assert list(check_matches(bent(seen(3), 0, 3), INTRINSICS, metric=True)) == []
 
 
 def test_a_slow_bend_is_told_by_pairs_farther_apart() -> None:
@@ -89,7 +82,7 @@ def test_a_slow_bend_is_told_by_pairs_farther_apart() -> None:
     keyframes = bent(seen(16), 0, 16, 0.15)
     (finding,) = check_matches(keyframes, INTRINSICS)
     assert (finding.level, finding.start) == ("degraded", None)
-    assert list(check_matches(keyframes[: FAR_APART + LEAST_FAR_PAIRS - 1], INTRINSICS)) == []
+    assert list(check_matches(keyframes[: FAR.apart + FAR.pairs - 1], INTRINSICS)) == []
 
 
 def test_a_part_that_is_wrong_is_told_by_its_frames() -> None:
@@ -97,8 +90,8 @@ def test_a_part_that_is_wrong_is_told_by_its_frames() -> None:
     (finding,) = check_matches(bent(seen(30), 9, 17), INTRINSICS)
     assert finding.start is not None
     assert finding.end is not None
-    assert 90 - 10 * (APART + 3) <= finding.start <= 90
-    assert 120 <= finding.end <= 170 + 10 * (APART + 3)
+    assert 90 - 10 * (NEAR.apart + 3) <= finding.start <= 90
+    assert 120 <= finding.end <= 170 + 10 * (NEAR.apart + 3)
 
 
 def test_a_whole_map_that_turned_is_the_same_map() -> None:
@@ -111,7 +104,7 @@ def test_a_whole_map_that_turned_is_the_same_map() -> None:
 def test_nothing_is_said_of_few_keyframes_few_matches_or_other_descriptors() -> None:
     """Oracle: no finding, of poses that would be told."""
     wrong = bent(seen(10), 0, 10)
-    assert list(check_matches(wrong[: APART + LEAST_PAIRS - 1], INTRINSICS)) == []
+    assert list(check_matches(wrong[: NEAR.apart + NEAR.pairs - 1], INTRINSICS)) == []
     others = [replace(k, features=Features(k.features.pixels, k.features.scores, "learned")) for k in wrong]
     assert list(check_matches(others, INTRINSICS)) == []
     few = [replace(k, features=_some(k.features, 20)) for k in wrong]

@@ -13,6 +13,7 @@ from trust_checks import found_by_camera, found_by_depth, found_by_parts, found_
 from witness import walk, with_depth
 
 from vggtgeo.results.result import Result
+from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.trust import judge as judge_module
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.estimate import Estimate
@@ -63,6 +64,19 @@ def test_a_run_is_judged_as_a_whole() -> None:
     assert stirred.level != "good"
     again = Verdict.from_dict(json.loads(json.dumps(stirred.to_dict())), stirred.metric)
     assert again == stirred
+
+
+def test_matches_are_asked_with_depth_and_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all keyframes, by the bounds of the kind of map. Oracle: a check in its place that says what it was given."""
+
+    def says(keyframes: list[Keyframe], _: np.ndarray, alone: bool, metric: bool) -> list[Finding]:
+        return [Finding("matches", "degraded", f"{len(keyframes)} keyframes, {alone=}, {metric=}")]
+
+    slam = recorded_run().slam
+    monkeypatch.setattr(judge_module, "check_matches", says)
+    for metric in (True, False):
+        reasons = judge(replace(slam, metric=metric)).reasons
+        assert f"{len(slam.keyframes)} keyframes, alone=True, {metric=}" in reasons
 
 
 def test_a_check_that_fails_loses_no_result(monkeypatch: pytest.MonkeyPatch) -> None:

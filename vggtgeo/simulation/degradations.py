@@ -230,6 +230,20 @@ def with_images(recording: Recording, change: Callable[[np.ndarray, int], np.nda
     return replace(recording, frames=frames)
 
 
+def in_bands_of_light(image: np.ndarray, row: int, share: float, period: float, speed: float) -> np.ndarray:
+    """The image, uint8 [H, W, 3], under lamps that flicker while its rows are read one after another: `share` more and
+    less light in bands of `period` rows, which wander by `speed` rows from image to image; row: of this one.
+    """
+    phase = 2 * np.pi * (np.arange(len(image))[:, None, None] + speed * row) / period
+    return np.clip(image * (1 + share * np.sin(phase)), 0, 255).astype(np.uint8)
+
+
+def compressed(image: np.ndarray, quality: int) -> np.ndarray:
+    """The image, uint8 [H, W, 3], RGB, as JPEG once more, with this quality."""
+    _, code = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.ascontiguousarray(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])
+
+
 def with_depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
     """The recording with each depth image, float32 [H, W], changed, given its row too."""
     frames = [

@@ -14,6 +14,7 @@ with the images: there the same is asked of nearer keyframes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +25,34 @@ from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.trust.finding import Finding, spans
 
-APART = 3
-"""Keyframes between the two of a pair: nearer ones are explained by more than one motion, farther ones share less."""
+
+class Bound(NamedTuple):
+    """apart: keyframes from one of a pair to the other. share: of the matches of the median pair that have to agree.
+    pairs: fewer say nothing.
+    """
+
+    apart: int
+    share: float
+    pairs: int
+
+
+NEAR = Bound(3, 0.8, 4)
+"""Nearer pairs are explained by more than one motion, farther ones share less. Of 23 pieces of four clips, 60 and 80
+frames without depth, 0.88 and more in those that began rightly, 0.56 and 0.74 in two that did not (38 and 8 cm off)."""
+FAR = Bound(5, 0.84, 6)
+"""Pairs over which a wrong turn has added up: 0.91 and more in 16 pieces of three clips, and
+0.87 and 0.88 in redkitchen with every other frame, all of which began rightly; 0.75 in a desk that the map turned by 69
+degrees in place of 42, whose nearer pairs have 0.86, and 0.80 in 40 frames of corridor-office with a focal length 20 %
+too long, 25 cm off."""
+WITHOUT_DEPTH = NEAR, FAR
+WITH_DEPTH = (Bound(2, 0.9, 6), Bound(3, 0.8, 6))
+"""Pieces of the four clips as they are have 0.95 and 0.88 at least (`benchmarks/starts.py --depth`), 40 frames of
+building-walk with a wall 2 m away in place of their depth 0.88 and 0.78, with one at 1 m 0.62 and 0.58 (23 and 19 cm
+off, called good; `benchmarks/wrong_depth.py`)."""
+WITH_DEPTH_AND_FEW = Bound(1, 0.65, 3)
+"""Where there are too few pairs for that, so that one smeared picture counts: 0.96 at least in those pieces, 0.80 and
+0.69 in 40 frames of redkitchen of which 6 and 8 in 20 are smeared by 15 and 31 px (`benchmarks/stress.py`), 0.59 with
+the middle of each depth image in its place (6 cm, called good)."""
 MOST_PAIRS = 96
 """Evenly spread; 20 ms each."""
 LEAST_MATCHES = 30
@@ -33,30 +60,11 @@ RATIO = 0.85
 """Lowe's, as in `SiftMatcher`."""
 OFF = 3.0
 """Pixels from the epipolar line: the verifier's threshold, and half as much for what the poses are off."""
-LEAST_AGREEING = 0.8
-"""Share of the median pair: of 23 pieces of four clips, 60 and 80 frames without depth, 0.88 and more in those that
-began rightly, 0.56 and 0.74 in two that did not (38 cm and 8 cm off)."""
-LEAST_PAIRS = 4
-"""Fewer say nothing of a map."""
-FAR_APART, LEAST_FAR_AGREEING, LEAST_FAR_PAIRS = 5, 0.84, 6
-"""The same of pairs farther apart, over which a wrong turn has added up: 0.91 and more in 16 pieces of three clips, and
-0.87 and 0.88 in redkitchen with every other frame, all of which began rightly; 0.75 in a desk that the map turned by 69
-degrees in place of 42, whose nearer pairs have 0.86, and 0.80 in 40 frames of corridor-office with a focal length 20 %
-too long, 25 cm off."""
-WITH_DEPTH = ((2, 0.9, 6), (3, 0.8, 6))
-"""With depth: keyframes apart, share of the median pair, and pairs that there must be. 13 pieces of four clips have
-0.95 to 0.98 and 0.88 to 0.97; a wall 2 m away, with 2 cm of noise, in place of the depth of 40 frames of building-walk
-(23 cm off, called good) 0.88 and 0.78, one 1 m away (19 cm, called good) 0.62 and 0.58."""
-WITH_DEPTH_AND_FEW = (1, 0.65, 3)
-"""The same where there are too few pairs for that, so that one smeared picture counts: 0.96 and more in those pieces,
-0.80 and 0.69 in 40 frames of redkitchen of which 6 and 8 in 20 are smeared by 15 and 31 px, 0.59 with the middle of
-each depth image in its place (6 cm, called good)."""
 MOST_PAIRS_WITH_DEPTH = 16
 IN_A_ROW, LEAST_IN_PART = 7, 0.65
 """Pairs whose median counts, where not the whole run is wrong, and how many matches have to agree there: fewer pairs
 have a lower lowest median, 0.77 in redkitchen and in building-walk as a whole, both right, and 0.56 where a map began
 38 cm off."""
-
 
 WRONG_START = (
     "without depth a map may begin wrongly, of a wall above all: begin at another frame (`--start`), or give depth"
@@ -67,45 +75,40 @@ WRONG_DEPTH = (
 )
 
 
-def check_matches(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, alone: bool = True) -> Iterator[Finding]:
-    """The median pair, of all and of each few in a row. keyframes: of one piece of the map, in the order of time, poses
-    world -> camera. intrinsics: fx, fy, cx, cy, pixels. alone: whether there is no other piece.
+def check_matches(
+    keyframes: Sequence[Keyframe], intrinsics: np.ndarray, alone: bool = True, metric: bool = False
+) -> Iterator[Finding]:
+    """The median pair, and without depth that of each few in a row. keyframes: of one piece of the map, in the order of
+    time, poses world -> camera. intrinsics: fx, fy, cx, cy, pixels. alone: whether there is no other piece. metric:
+    whether measured depth made the map.
     """
-    known = _shares(keyframes, intrinsics, APART)
-    if len(known) < LEAST_PAIRS:
-        return
-    far = _shares(keyframes, intrinsics, FAR_APART)
-    values = np.array([share for *_, share in known])
-    middles = [(float(np.median(values)), LEAST_AGREEING)]
-    if len(far) >= LEAST_FAR_PAIRS:
-        middles.append((float(np.median([share for *_, share in far])), LEAST_FAR_AGREEING))
-    for middle, least in middles:
-        if middle < least:
-            yield _finding(middle, *((None, None) if alone else (known[0][0].frame, known[-1][1].frame)))
+    most = MOST_PAIRS_WITH_DEPTH if metric else MOST_PAIRS
+    shares_of = lambda bound: _shares(keyframes, intrinsics, bound.apart, most)
+    asked = [(bound, shares_of(bound)) for bound in (WITH_DEPTH if metric else WITHOUT_DEPTH)]
+    if metric and len(asked[0][1]) < WITH_DEPTH[0].pairs:
+        asked = [(WITH_DEPTH_AND_FEW, shares_of(WITH_DEPTH_AND_FEW))]
+    for bound, known in asked:
+        middle = _median(known)
+        if len(known) >= bound.pairs and middle < bound.share:
+            yield _finding(middle, metric, *((None, None) if alone else (known[0][0].frame, known[-1][1].frame)))
             return
+    if metric:
+        return
+    known = asked[0][1]
+    values = np.array([share for *_, share in known])
     parts = np.array([np.median(values[row : row + IN_A_ROW]) for row in range(len(values) - IN_A_ROW + 1)])
     for first, last in spans(parts < LEAST_IN_PART, join=IN_A_ROW):
         start, end = known[first][0].frame, known[last + IN_A_ROW - 1][1].frame
-        yield _finding(float(parts[first : last + 1].min()), start, end)
+        yield _finding(float(parts[first : last + 1].min()), metric, start, end)
 
 
-def check_matches_with_depth(
-    keyframes: Sequence[Keyframe], intrinsics: np.ndarray, alone: bool = True
-) -> Iterator[Finding]:
-    """As `check_matches`, of the median pair of a map that measured depth made."""
-    shares_of = lambda apart: _shares(keyframes, intrinsics, apart, MOST_PAIRS_WITH_DEPTH)
-    shares = [(shares_of(apart), least, pairs) for apart, least, pairs in WITH_DEPTH]
-    if len(shares[0][0]) < WITH_DEPTH[0][2]:
-        apart, least, pairs = WITH_DEPTH_AND_FEW
-        shares = [(shares_of(apart), least, pairs)]
-    for known, least, pairs in shares:
-        middle = float(np.median([share for *_, share in known])) if len(known) >= pairs else 1.0
-        if middle < least:
-            start, end = (None, None) if alone else (known[0][0].frame, known[-1][1].frame)
-            yield Finding(
-                "matches", "degraded", f"{_contradiction(middle, start, end)}: {WRONG_DEPTH}", start, end, scale=True
-            )
-            return
+def median_shares(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> str:
+    """What the bounds rest on, for the tables of benchmarks: the median of pairs 1, 2, 3 and 5 apart."""
+    return " / ".join(f"{_median(_shares(keyframes, intrinsics, apart)):.2f}" for apart in (1, 2, 3, 5))
+
+
+def _median(known: list[tuple[Keyframe, Keyframe, float]]) -> float:
+    return float(np.median([share for *_, share in known])) if known else float("nan")
 
 
 def _shares(
@@ -131,13 +134,11 @@ def agreeing_share(first: Keyframe, second: Keyframe, intrinsics: np.ndarray) ->
     return float(np.mean(off < OFF))
 
 
-def _finding(share: float, start: int | None, end: int | None) -> Finding:
-    return Finding("matches", "degraded", f"{_contradiction(share, start, end)}; {WRONG_START}", start, end)
-
-
-def _contradiction(share: float, start: int | None, end: int | None) -> str:
+def _finding(share: float, metric: bool, start: int | None, end: int | None) -> Finding:
     where = "" if start is None else f"frames {start} to {end}: "
-    return (
+    text = (
         f"{where}the images contradict the poses: of the matches of neighbouring keyframes, which agree with one "
-        f"another, {100 * (1 - share):.0f} % do not agree with how the cameras stand"
+        f"another, {100 * (1 - share):.0f} % do not agree with how the cameras stand; "
+        f"{WRONG_DEPTH if metric else WRONG_START}"
     )
+    return Finding("matches", "degraded", text, start, end, scale=metric)

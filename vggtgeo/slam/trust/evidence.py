@@ -39,8 +39,8 @@ DARKEST = 0.3
 """Of the mean brightness: darker surroundings are not made brighter than this allows; they are noise."""
 BANDS = 8.0
 """Grey levels of these images by which two in a row must differ (root mean square over the rows) in what is common to
-a row, for bands of light to be looked for. Without any: 0.6 to 5.5 in the middle of a clip, 16 in turns; with: 11 up.
-"""
+a row, for bands of light to be looked for. Without any 0.5 to 4.6 in the middle of a clip, 13 in turns; with 10 to 28
+(`benchmarks/followed_corners.py`)."""
 MORE = 1.2
 """Times as many corners come back without them: then these are bands."""
 ROUND_TRIP = 0.5
@@ -226,14 +226,19 @@ def _follow_through_bands(before: np.ndarray, after: np.ndarray, pixels: np.ndar
     without what most of a row has in common with the change, if that helps.
     """
     moved, kept = follow(before, after, pixels)
-    along = 1 if after.shape[1] >= after.shape[0] else 0
-    some = (slice(None), slice(None, None, 4)) if along else (slice(None, None, 4), slice(None))
-    bands = np.median(after[some].astype(np.int16) - before[some], axis=along, keepdims=True)
+    bands = common_to_rows(before, after)
     if np.sqrt(np.mean(bands**2)) <= BANDS:
         return moved, kept
     steady = np.clip(after - bands, 0, 255).astype(np.uint8)
     others, again = follow(before, steady, pixels)
     return (others, again) if np.count_nonzero(again) > MORE * np.count_nonzero(kept) else (moved, kept)
+
+
+def common_to_rows(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """By how much most of each row (column, of an upright picture) became brighter: float64 [h, 1] ([1, w])."""
+    along = 1 if after.shape[1] >= after.shape[0] else 0
+    some = (slice(None), slice(None, None, 4)) if along else (slice(None, None, 4), slice(None))
+    return np.asarray(np.median(after[some].astype(np.int16) - before[some], axis=along, keepdims=True))
 
 
 def one_a_cell(ids: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -270,8 +275,8 @@ def _small_grey(image: np.ndarray) -> tuple[np.ndarray, float]:
     """The image that corners are followed in, uint8, and the standard deviation of its grey levels before.
 
     Lucas and Kanade compare grey levels, and a camera changes its exposure, a lamp flickers: so each pixel is compared
-    with the brightness around it. (With that of its row, too, bands of light are gone, but what moves past a row then
-    moves its corners: icl-office "wanted" a focal length 26 % longer, as sure as seven deviations.)
+    with the brightness around it. Not with that of its row, which bands of light would call for: what enters a row far
+    away would then move its corners.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(grey, _small_size(grey.shape), interpolation=cv2.INTER_AREA)

@@ -12,7 +12,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.blind import check_blind, cuts
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
 from vggtgeo.slam.trust.change_of_sides import check_sides
-from vggtgeo.slam.trust.contradicted import check_matches, check_matches_with_depth
+from vggtgeo.slam.trust.contradicted import check_matches
 from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.enlargement import check_enlargements
@@ -55,8 +55,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
         found += check_hand_over(slam)
     for piece in pieces_by_size(slam) if estimate.started else ():
         own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]
-        by_matches = check_matches_with_depth if estimate.metric else check_matches
-        found += by_matches(own, estimate.intrinsics, estimate.pieces == 1)
+        found += check_matches(own, estimate.intrinsics, estimate.pieces == 1, estimate.metric)
     if estimate.started and len(estimate) > 1 and len(aligned) == len(estimate):
         height, width = slam.keyframes[0].size
         found += _images(slam, estimate, aligned, (width, height))
