@@ -15,7 +15,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.mapping.consistency import PosedDepth, confirm
 from vggtgeo.mapping.dense import check_dense, dense_depths
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.mapping.plane_sweep import Photo, plane_homography
+from vggtgeo.mapping.plane_sweep import Photo, plane_homographies
 from vggtgeo.mapping.semi_global import EDGE, semi_global
 from vggtgeo.mapping.stereo import StereoSettings, stereo_depths
 from vggtgeo.slam.keyframe import Keyframe, Slots
@@ -137,7 +137,8 @@ def test_a_plane_is_carried_where_its_points_project() -> None:
     second = Photo(grey, pose, np.array([70.0, 66.0, 21.0, 13.0]))
     pixels = rng.uniform(0, 30, (20, 2))
     world = rigid.unproject(pixels, np.full(20, 0.4), first.pose, first.intrinsics)
-    mapped = np.column_stack([pixels, np.ones(20)]) @ plane_homography(first, second, 0.4).T
+    far, by_depth = plane_homographies(first, second)
+    mapped = np.column_stack([pixels, np.ones(20)]) @ (far + 0.4 * by_depth).T
     expected = rigid.project(world, second.pose, second.intrinsics)
     np.testing.assert_allclose(mapped[:, :2] / mapped[:, 2:], expected, atol=1e-9)
 

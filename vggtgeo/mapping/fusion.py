@@ -12,9 +12,21 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.mapping.tsdf import BATCH, Block, View, around, blocks_of, joined, meshes_of, together, without_crumbs
+from vggtgeo.mapping.tsdf import (
+    BATCH,
+    GROUP,
+    Block,
+    View,
+    around,
+    blocks_of,
+    joined,
+    meshes_of,
+    together,
+    without_crumbs,
+)
 from vggtgeo.models import pinhole
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.threads import map_in_threads
 
 
 def fused_mesh(
@@ -156,9 +168,10 @@ class SurfaceFusion:
             if not self._touched[block]:
                 del self._touched[block]
         todo = [block for block in near if block in self._touched and len(seen_by[block]) >= least]
-        for first in range(0, len(todo), BATCH):
-            batch = todo[first : first + BATCH]
-            parts = meshes_of(batch, seen_by, views, self._voxel, least)
+        count = max(-(-len(todo) // BATCH), min(2, -(-len(todo) // GROUP)))  # two at least, for two threads
+        batches = [todo[len(todo) * i // count : len(todo) * (i + 1) // count] for i in range(count)]
+        meshes = lambda batch: meshes_of(batch, seen_by, views, self._voxel, least)
+        for batch, parts in zip(batches, map_in_threads(meshes, batches), strict=True):
             self._parts |= {block: part for block, part in zip(batch, parts, strict=True) if part is not None}
         return len(todo)
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +37,8 @@ TRUNCATION = 4.0
 """Of the distance, in voxels."""
 FREE = 4.0
 """As far in front of a surface a view says that nothing is there, in truncations: a block at most, see `together`."""
-BATCH = 1024
-"""Blocks held at a time: 100 MB."""
+BATCH = 512
+"""Blocks that a thread holds at a time: 60 MB."""
 GROUP = 32
 """Blocks that one compiled call works on."""
 LEAST_CONFIDENCE = 0.5
@@ -92,22 +93,26 @@ def meshes_of(
     voxel: float,
     least: int,
 ) -> list[Mesh | None]:
-    """The mesh of each block, None where there is none."""
-    volume = np.zeros((len(blocks), SIDE + 1, SIDE + 1, SIDE + 1, 6), np.float32)
+    """The mesh of each block, at most `BATCH` of them, None where there is none."""
+    # Always as many rows, so that one compiled function serves; the last is where the filling of a group goes to.
+    sums = jnp.zeros((BATCH + 1, SIDE + 1, SIDE + 1, SIDE + 1, 6), jnp.float32)
     rows_of: dict[int, list[int]] = defaultdict(list)
     for row, block in enumerate(blocks):
         for number in seen_by[block]:
             rows_of[number].append(row)
-    corners = np.array(blocks, np.int32).reshape(-1, 3) * SIDE
+    corners = np.zeros((BATCH + 1, 3), np.int32)
+    corners[: len(blocks)] = np.array(blocks, np.int32).reshape(-1, 3) * SIDE
     for number, rows in sorted(rows_of.items()):
         view = views[number]
         pixels, intrinsics = _packed(view), jnp.asarray(view.intrinsics, jnp.float32)
         motion = jnp.asarray(view.pose[:3] * [voxel, voxel, voxel, 1.0], jnp.float32)
         for first in range(0, len(rows), GROUP):
+            group = np.full(GROUP, BATCH, np.int32)
             chosen = rows[first : first + GROUP]
-            padded = jnp.asarray(corners[np.resize(chosen, GROUP)])
-            added = np.asarray(_measured(padded, motion, pixels, intrinsics, np.float32(TRUNCATION * voxel)))
-            volume[chosen] += added[: len(chosen)]
+            group[: len(chosen)] = chosen
+            reach = np.float32(TRUNCATION * voxel)
+            sums = _with_view(sums, group, corners[group], motion, pixels, intrinsics, reach)
+    volume = np.asarray(sums)
     return [_surface(volume[row], corners[row], voxel, least) for row in range(len(blocks))]
 
 
@@ -121,7 +126,20 @@ def _packed(view: View) -> Array:
     return jnp.asarray(np.concatenate([depth[..., None], weight[..., None], view.image], axis=2), jnp.float32)
 
 
-@jax.jit
+@partial(jax.jit, donate_argnums=0)
+def _with_view(
+    sums: Float[Array, "n i j k 6"],
+    rows: Int[Array, " b"],
+    corners: Int[Array, "b 3"],
+    motion: Float[Array, "3 4"],
+    pixels: Float[Array, "h w 5"],
+    intrinsics: Float[Array, " 4"],
+    reach: float | Float[Array, ""],
+) -> Float[Array, "n i j k 6"]:
+    """The sums, in place, with what one view adds to some rows of them; the rest as of `_measured`."""
+    return sums.at[rows].add(_measured(corners, motion, pixels, intrinsics, reach), mode="promise_in_bounds")
+
+
 def _measured(
     corners: Int[Array, "b 3"],
     motion: Float[Array, "3 4"],
