@@ -9,6 +9,7 @@ once. `associated.txt`, the pairs that ETH3D SLAM comes with, is read where `rgb
 
 import itertools
 import math
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,9 @@ MAX_DEPTH_DELAY = 0.02
 MOST_LETTERS = 200
 LATEST = 1e11
 """Seconds of a time stamp, 3,000 years: nanoseconds since 1970 are 1e18."""
+LEAST_FALLING, LEAST_LINES = 0.1, 10
+"""Share of the lines at which the first column of a list falls, and lines, for it to be no time: lists that two
+processes wrote have a line out of order now and then, and what frames took to come falls at every second line."""
 _TRUTH = "groundtruth.txt"
 _PAIRS = "associated.txt"
 _Entry = tuple[float, Path]
@@ -40,8 +44,9 @@ class TumRgbd(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has an `rgb.txt`, or an `associated.txt`."""
-        return (folder / "rgb.txt").is_file() or (folder / _PAIRS).is_file()
+        """Whether `folder` has an `rgb.txt` of times, or an `associated.txt`."""
+        file = folder / "rgb.txt"
+        return (file.is_file() and not lists_no_times(file)) or (folder / _PAIRS).is_file()
 
     @classmethod
     def open(cls, folder: Path) -> Self:
@@ -62,6 +67,25 @@ class TumRgbd(FolderSequence):
         """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
         file = self.folder / _TRUTH
         return Trajectory.load_tum(file) if file.exists() else None
+
+
+def lists_no_times(file: Path) -> bool:
+    """Whether the first column of a list is no time: it falls again and again, while the files are numbered in the
+    order of the list. Scripts write what each frame took in place of when it came; sorted by that, frames are shuffled.
+    """
+    try:
+        lines = [line.split("#", 1)[0].split() for line in whole_text(file, "utf-8-sig").splitlines()]
+        times, names = zip(*((float(words[0]), words[1]) for words in lines if words), strict=True)
+    except (InputError, ValueError, IndexError):  # told where it is read
+        return False
+    falling = np.count_nonzero(np.diff(times) < 0)
+    if max(map(len, names)) > MOST_LETTERS:
+        return False
+    numbered = [re.fullmatch(r"(.*?)(\d+)(\.\w+)?", name) for name in names]
+    if len(times) < LEAST_LINES or falling < LEAST_FALLING * len(times) or None in numbered:
+        return False
+    one_name = len({found.expand(r"\1") for found in numbered if found}) == 1
+    return one_name and bool(np.all(np.diff([int(found.group(2)) for found in numbered if found]) > 0))
 
 
 def _recording(folder: Path) -> str:

@@ -1,0 +1,66 @@
+"""Lists `rgb.txt` whose first column is no time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_sequences
+
+from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets.tum import lists_no_times
+from vggtgeo.io.errors import InputWarning
+
+COUNT = 12
+
+
+def _folder(folder: Path, times: list[float], name: str = "rgb/rgb{:05d}.png") -> Path:
+    lines = [f"{time:.6f} {name.format(number)}" for number, time in enumerate(times)]
+    for number in range(COUNT):
+        tiny_sequences.write_image(folder / name.format(number), tiny_sequences.image(number))
+        tiny_sequences.write_image(folder / f"depth/depth{number:05d}.png", tiny_sequences.depth_codes(number))
+    (folder / "rgb.txt").write_text("# timestamp filename\n" + "\n".join(lines) + "\n")
+    (folder / "depth.txt").write_text("\n".join(lines).replace("rgb", "depth") + "\n")
+    tiny_sequences.write_calibration(folder, tiny_sequences.INTRINSICS)
+    return folder
+
+
+def test_frames_come_in_their_order_where_the_list_says_what_each_took(tmp_path: Path) -> None:
+    # Proves that a column that falls beside numbers that rise is not taken for times, and that this is said. Oracle:
+    # what was written: an image tells which it is.
+    took = np.random.default_rng(0).normal(0.016, 0.001, COUNT).tolist()
+    folder = _folder(tmp_path / "own", took)
+    with pytest.warns(InputWarning, match=r"rgb.txt`: its first column is no time"):
+        sequence = open_sequence(folder)
+    frames = list(sequence.frames())
+    assert [int(frame.name[-9:-4]) for frame in frames] == list(range(COUNT))
+    np.testing.assert_allclose(np.diff([frame.timestamp for frame in frames]), 1 / 30)
+    assert [frame.depth[3, 7] for frame in frames[:2]] == pytest.approx([1.007, 1.017])
+    with pytest.warns(InputWarning, match="sorted by time"):  # whoever asks for that reader gets it
+        assert type(open_sequence(folder, kind="tum")).__name__ == "TumRgbd"
+
+
+@pytest.mark.parametrize(
+    ("places", "name"),
+    [
+        ((0, 1, 2, 4, 3, 5, 6, 7, 8, 9, 10, 11), "rgb/rgb{:05d}.png"),  # one line out of order
+        ((5, 1, 9, 0, 7, 3, 2, 8, 4, 11, 6, 10), "rgb/{:x}b.png"),  # names that are no numbers
+        ((5, 1, 9), "rgb/rgb{:05d}.png"),  # too few to tell
+        ((5, 1, 9, 0, 7, 3, 2, 8, 4, 11, 6, 10), "rgb/1305031102.{}75304.png"),  # names that are times
+    ],
+)
+def test_what_may_be_times_is_taken_for_times(tmp_path: Path, places: tuple[int, ...], name: str) -> None:
+    # Proves that a list out of order stays a list of times as long as its column can be times: of few lines, of names
+    # that say nothing, in any order.
+    file = tmp_path / "rgb.txt"
+    numbers = places if "1305" in name else range(len(places))
+    lines = [f"{0.1 * place} {name.format(number)}" for place, number in zip(places, numbers, strict=True)]
+    file.write_text("\n".join(lines))
+    assert not lists_no_times(file)
+
+
+def test_names_of_any_length_are_looked_at_quickly(tmp_path: Path) -> None:
+    # Proves that a hostile name, of which a search tries every part, is not searched.
+    file = tmp_path / "rgb.txt"
+    long = "\n".join(f"{time} rgb/{'1' * 200_000}x" for time in [1.0, 0.5] * COUNT)
+    file.write_text(long)
+    assert not lists_no_times(file)
