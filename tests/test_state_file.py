@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS, recorded_run
 from same_leaves import differences
+from vggtgeo.models.roles import LineMatches
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.bundle.marginalisation import no_prior
@@ -27,7 +29,8 @@ from vggtgeo.io.records import by_name
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRotation
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.keyframe_images import CompressedImage
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.state import PendingWindow, Readout, Slam, Waiting
@@ -273,18 +276,70 @@ def test_every_flipped_bit_of_the_content_is_noticed(tmp_path: Path) -> None:
         assert list(differences(Box((np.arange(3.0), 1.5)), read)) == [], place
 
 
-def test_states_whose_parts_do_not_belong_together(tmp_path: Path) -> None:
-    """A file whose window names a keyframe that is not there is refused; oracle: the sentence."""
-    slam = recorded_run().states[1]
+def _first(slam: Slam, **changes: Any) -> Slam:
+    """The state with another first keyframe."""
+    return replace(slam, keyframes=(replace(slam.keyframes[0], **changes), *slam.keyframes[1:]))
+
+
+def _cut(slots: Slots) -> Slots:
+    return Slots(*(getattr(slots, field.name)[1:] for field in dataclasses.fields(slots)))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda slam: replace(slam, window=(7,)), "names keyframes that are not there"),
+        (lambda slam: replace(slam, keyframes=()), "names keyframes that are not there"),
+        (lambda slam: replace(slam, intrinsics=np.ones(3)), "`intrinsics` has shape [3], expected [4]"),
+        (lambda slam: replace(slam, given_intrinsics=-slam.intrinsics), "expected positive pixels"),
+        (lambda slam: _first(slam, number=1), "not numbered one after the other"),
+        (lambda slam: _first(slam, pose=2.0 * np.eye(4)), "`pose` is not a rigid motion"),
+        (lambda slam: _first(slam, pose=np.full((4, 4), np.nan)), "`pose` has 16 values that are not finite"),
+        (lambda slam: _first(slam, points=_cut(slam.keyframes[0].points)), "`pixels of points` has shape"),
+        (lambda slam: _first(slam, samples=_cut(slam.keyframes[0].samples)), "`pixels of samples` has shape"),
+        (lambda slam: _first(slam, sample_segment=slam.keyframes[0].sample_segment + 10_000), "`sample_segment` has"),
+        (lambda slam: _first(slam, line_depths=np.zeros((0, 2))), "`line_depths` has shape"),
+        (
+            lambda slam: _first(slam, images=replace(slam.keyframes[0].images, depth=np.zeros((2, 2), np.float16))),
+            "expected four of one size",
+        ),
+        (
+            lambda slam: replace(slam, pairs=(replace(slam.pairs[0], second=9), *slam.pairs[1:])),
+            "names keyframes that are not there",
+        ),
+        (lambda slam: Evidence(), "holds a Evidence; expected the state of a run"),
+    ],
+)
+def test_states_whose_parts_do_not_belong_together(
+    tmp_path: Path, change: Callable[[Slam], Any], sentence: str
+) -> None:
+    """A file of parts that do not fit is refused, not found at the end of a run; oracle: the sentence."""
+    STATE.write(tmp_path / "state.npz", change(settled(recorded_run().states[-1])))
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        load_state(tmp_path / "state.npz")
+
+
+def test_matches_of_key_points_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    """Rows of matches are looked at, those of points and those of lines; oracle: the sentence."""
+    slam = settled(recorded_run().states[-1])
+    pair = slam.pairs[0]
+    points = replace(pair.points, index_j=pair.points.index_j + 10_000)
+    lines = LineMatches(np.array([0]), np.array([10_000]), np.array([1.0]))
     for wrong, sentence in (
-        (replace(slam, window=(7,)), "names keyframes that are not there"),
-        (replace(slam, keyframes=()), "names keyframes that are not there"),
-        (replace(slam, intrinsics=np.ones(3)), "its camera has another shape"),
-        (Evidence(), "holds a Evidence; expected the state of a run"),
+        (replace(pair, points=points), "index_j of points"),
+        (replace(pair, lines=lines), "of lines"),
     ):
-        STATE.write(tmp_path / "state.npz", wrong)
+        STATE.write(tmp_path / "state.npz", replace(slam, pairs=(wrong, *slam.pairs[1:])))
         with pytest.raises(InputError, match=sentence):
             load_state(tmp_path / "state.npz")
+
+
+def test_a_damaged_image_of_a_keyframe_is_told() -> None:
+    """Bytes that are no image, or one of another size, are an error that says whose they are; oracle: the sentence."""
+    whole = CompressedImage.of(np.zeros((6, 8, 3), np.uint8))
+    for wrong in (replace(whole, data=b""), replace(whole, data=bytes(50)), replace(whole, shape=(6, 9, 3))):
+        with pytest.raises(InputError, match="an image of a keyframe is damaged"):
+            wrong.array()
 
 
 def test_reading_keeps_the_callers_precision(saved: Path) -> None:

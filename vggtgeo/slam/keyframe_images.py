@@ -7,11 +7,14 @@ colours serve a coarse alignment and the map), depth and its deviation as PNG, w
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Self
 
 import cv2
 import numpy as np
+
+from vggtgeo.io.errors import InputError
 
 JPEG = (".jpg", (cv2.IMWRITE_JPEG_QUALITY, 95))
 PNG = (".png", (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP))
@@ -39,8 +42,9 @@ class CompressedImage:
     def array(self) -> np.ndarray:
         """The image again."""
         # Colours are as they were given: encoded and decoded without a change of their order.
-        image = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_UNCHANGED)
-        assert image is not None
+        image = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_UNCHANGED) if self.data else None
+        if image is None or image.nbytes != math.prod(self.shape) * self.dtype.itemsize:
+            raise InputError("an image of a keyframe is damaged; make the map, or the run, that it was read from again")
         return image.view(self.dtype).reshape(self.shape)
 
 

@@ -41,6 +41,7 @@ from vggtgeo.slam.keyframe_images import CompressedImage, KeyframeImages
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import Points, RgbdView
 from vggtgeo.slam.state import FramePose, PendingWindow, Readout, SecondMotion, Slam, Waiting
+from vggtgeo.slam.state_checks import check_state
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
@@ -160,22 +161,7 @@ def checked_state(path: Path, found: object) -> Slam:
     if not isinstance(found, Slam):
         raise InputError(f"`{path}` holds a {type(found).__name__}; expected the state of a run")
     try:
-        wrong = _disagreement(found)
+        check_state(found)
     except (TypeError, AttributeError, ValueError, IndexError) as error:
-        wrong = str(error)
-    if wrong:
-        raise InputError(f"`{path}` is no state that vggtgeo wrote, or was changed since: {wrong}")
+        raise InputError(f"`{path}` is no state that vggtgeo wrote, or was changed since: {error}") from None
     return found
-
-
-def _disagreement(slam: Slam) -> str | None:
-    """What does not belong together in a state, if anything."""
-    count = len(slam.keyframes)
-    if [keyframe.number for keyframe in slam.keyframes] != list(range(count)):
-        return "its keyframes are not numbered one after the other"
-    if any(keyframe.pose.shape != (4, 4) for keyframe in slam.keyframes) or slam.intrinsics.shape != (4,):
-        return "a pose or its camera has another shape"
-    named = [number for pair in slam.pairs for number in pair.key]
-    named += [number for factor in slam.factors for number in factor.keyframes]
-    named += [*slam.window, *slam.origins, *slam.held, *(record.reference for record in slam.frames)]
-    return None if all(0 <= number < count for number in named) else "it names keyframes that are not there"

@@ -1,0 +1,104 @@
+"""Whether the parts of a state that was read belong together: a map may come from anybody, and what does not fit would
+end a run with an error of NumPy's, after all its work.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from vggtgeo.models.checks import check_array, check_confidence, check_index, check_pose
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
+from vggtgeo.models.roles import Features
+from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.state import Slam
+
+
+def check_state(slam: Slam) -> None:
+    """Raises ValueError, TypeError, AttributeError or IndexError, with what does not belong together."""
+    count = len(slam.keyframes)
+    if [keyframe.number for keyframe in slam.keyframes] != list(range(count)):
+        raise ValueError("its keyframes are not numbered one after the other")
+    for name in ("intrinsics", "given_intrinsics", "intrinsics_sigma"):
+        values = getattr(slam, name)
+        check_array(name, values, (4,))
+        if not (values[:2] > 0).all():
+            raise ValueError(f"`{name}` begins with {values[:2].tolist()}, expected positive pixels")
+    for keyframe in slam.keyframes:
+        _check_keyframe(keyframe)
+    for one, other in pairwise(slam.keyframes):
+        if one.size != other.size:
+            raise ValueError(f"its images are of {other.size} and of {one.size} pixels, expected one size")
+    for pair in slam.pairs:
+        _check_pair(pair, slam)
+    named = [number for factor in slam.factors for number in factor.keyframes]
+    named += [*slam.window, *slam.origins, *slam.held, *(record.reference for record in slam.frames)]
+    if not all(0 <= number < count for number in named):
+        raise ValueError("it names keyframes that are not there")
+
+
+def _check_keyframe(keyframe: Keyframe) -> None:
+    check_pose("pose", keyframe.pose)
+    height, width = keyframe.size
+    images = keyframe.images
+    parts = (images.colour, images.depth, images.depth_sigma, images.depth_confidence)
+    shapes = ((height, width, 3), *[(height, width)] * 3)
+    kinds = (np.uint8, np.float16, np.float16, np.uint8)
+    if min(height, width) < 1 or any(
+        part.shape != shape or part.dtype != kind for part, shape, kind in zip(parts, shapes, kinds, strict=True)
+    ):
+        found = ", ".join(f"{part.dtype} {part.shape}" for part in parts)
+        raise ValueError(f"the images of keyframe {keyframe.number} are {found}, expected four of one size")
+    _check_features(keyframe.features, (height, width))
+    _check_slots("points", keyframe.points, len(keyframe.features))
+    segments = keyframe.lines.segments
+    check_array("endpoints", segments.endpoints, (None, 2, 2))
+    check_array("line_depths", keyframe.line_depths, (len(segments.endpoints), 2), finite=False)
+    _check_rows("sample_segment", keyframe.sample_segment, len(segments.endpoints))
+    _check_slots("samples", keyframe.samples, len(keyframe.sample_segment))
+    if keyframe.place is not None:
+        check_array("place", keyframe.place, (None,))
+
+
+def _check_features(features: Features, shape: tuple[int, int]) -> None:
+    count = len(features.pixels)
+    check_array("pixels", features.pixels, (count, 2))
+    check_array("scores", features.scores, (count,))
+    described = features.descriptors
+    if isinstance(described, PixelDescriptors):
+        check_array("vectors", described.vectors, (count, None))
+        check_array("gray", described.gray, shape)
+
+
+def _check_slots(name: str, slots: Slots, count: int) -> None:
+    check_array(f"pixels of {name}", slots.pixels, (count, 2))
+    for field in ("inverse_depth", "prior", "sigma"):
+        check_array(f"{field} of {name}", getattr(slots, field), (count,), finite=False)
+    for field in ("prior_confidence", "confidence"):
+        check_confidence(f"{field} of {name}", getattr(slots, field), (count,))
+
+
+def _check_pair(pair: Pair, slam: Slam) -> None:
+    if not all(0 <= number < len(slam.keyframes) for number in pair.key):
+        raise ValueError("it names keyframes that are not there")
+    first, second = (slam.keyframes[number] for number in pair.key)
+    points, lines = pair.points, pair.lines
+    count = len(points.index_i)
+    _check_rows("index_i of points", points.index_i, len(first.features))
+    _check_rows("index_j of points", points.index_j, len(second.features), lowest=-1)
+    for name in ("pixels_i", "pixels_j"):
+        check_array(name, getattr(points, name), (count, 2))
+    check_array("index_j of points", points.index_j, (count,))
+    check_confidence("confidence of points", points.confidence, (count,))
+    _check_rows("index_i of lines", lines.index_i, len(first.lines))
+    _check_rows("index_j of lines", lines.index_j, len(second.lines))
+    check_array("index_j of lines", lines.index_j, (len(lines.index_i),))
+    check_confidence("confidence of lines", lines.confidence, (len(lines.index_i),))
+
+
+def _check_rows(name: str, rows: np.ndarray, count: int, lowest: int = 0) -> None:
+    check_index(name, rows, len(rows), lowest)
+    if len(rows) and rows.max() >= count:
+        raise ValueError(f"`{name}` has the value {rows.max()}, expected less than {count}")
