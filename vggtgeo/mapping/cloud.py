@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -24,14 +24,29 @@ STEEP = 0.1
 """Relative difference of depth of pixels `STEP` apart above which they are no one surface and have no normal."""
 
 
+TOGETHER = 64
+"""Keyframes whose points are averaged before those of others are made: all points of one take 2 MB."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Points, colours, normals (0 = not known), weights."""
+    """Points, colours, normals (0 = not known), weights, and of how many points of keyframes each is the mean."""
 
     points: np.ndarray
     colours: np.ndarray
     normals: np.ndarray
     weight: np.ndarray
+    count: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, colours: np.ndarray, normals: np.ndarray, weight: np.ndarray) -> _Points:
+        """Of single points."""
+        return cls(points, colours, normals, np.maximum(weight.astype(np.float64), 1e-6), np.ones(len(points)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Points]) -> _Points:
+        """One after the other."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
 def map_points(
@@ -61,9 +76,20 @@ def map_points(
         around = [j for j in (i - 2, i - 1, i + 1, i + 2) if 0 <= j < len(keyframes) and depth_maps[j] is not None]
         return _dense_points(keyframes, depth_maps, i, around, intrinsics)
 
-    parts = map_in_threads(part, range(len(keyframes)))
-    columns = [[getattr(part, name) for part in parts] for name in ("points", "colours", "normals", "weight")]
-    return _average_in_voxels(_Points(*(np.concatenate(column) for column in columns)), voxel)
+    groups = [range(len(keyframes))[first : first + TOGETHER] for first in range(0, len(keyframes), TOGETHER)]
+    # Where there are points of several groups in a cell, their means are averaged once more.
+    means = [_means_in_cells(_Points.joined(map_in_threads(part, group)), voxel) for group in groups]
+    if not means or not sum(len(mean.points) for mean in means):
+        nothing = np.zeros((0, 3))
+        return PointCloud(nothing, nothing.astype(np.uint8), np.zeros(0, np.float32), nothing.astype(np.float32))
+    found = means[0] if len(means) == 1 else _means_in_cells(_Points.joined(means), voxel)
+    length = np.linalg.norm(found.normals, axis=1, keepdims=True)
+    return PointCloud(
+        found.points,
+        found.colours.round().astype(np.uint8),
+        (1 - 0.5**found.count).astype(np.float32),
+        np.divide(found.normals, length, out=np.zeros_like(found.normals), where=length > 1e-6).astype(np.float32),
+    )
 
 
 def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray) -> _Points:
@@ -71,7 +97,7 @@ def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray) -> _Points:
     known = np.isfinite(slots.inverse_depth) & (slots.inverse_depth > 0.02)
     points = rigid.unproject(slots.pixels[known], slots.inverse_depth[known], keyframe.pose, intrinsics)
     colours = read_at(keyframe.image, slots.pixels[known])
-    return _Points(points, colours, np.zeros((len(points), 3)), slots.confidence[known])
+    return _Points.of(points, colours, np.zeros((len(points), 3)), slots.confidence[known])
 
 
 def _dense_points(
@@ -84,6 +110,7 @@ def _dense_points(
     """Points of keyframe i, those that a neighbour confirms where there is one."""
     keyframe, own = keyframes[i], depth_maps[i]
     assert own is not None
+    own = own.opened()
     depth = own.depth[STEP // 2 :: STEP, STEP // 2 :: STEP]
     rows, columns = np.mgrid[STEP // 2 : own.depth.shape[0] : STEP, STEP // 2 : own.depth.shape[1] : STEP]
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
@@ -101,7 +128,7 @@ def _dense_points(
     rows, columns = rows[good], columns[good]
     sigma = np.maximum(own.sigma[rows, columns] * own.depth[rows, columns], 1e-3).astype(np.float64)
     weight = own.confidence[rows, columns] / sigma**2
-    return _Points(points[good], keyframe.image[rows, columns], normals[good], weight)
+    return _Points.of(points[good], keyframe.image[rows, columns], normals[good], weight)
 
 
 def _normals(points: np.ndarray, depth: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -129,21 +156,11 @@ def _agrees(points: np.ndarray, keyframe: Keyframe, depth: np.ndarray, intrinsic
     return inside
 
 
-def _average_in_voxels(given: _Points, voxel: float) -> PointCloud:
-    if not len(given.points):
-        nothing = np.zeros((0, 3))
-        return PointCloud(nothing, nothing.astype(np.uint8), np.zeros(0, np.float32), nothing.astype(np.float32))
+def _means_in_cells(given: _Points, voxel: float) -> _Points:
+    """The mean of each cell, by weight."""
     cells = np.floor(given.points / voxel).astype(np.int64)
     _, group = np.unique(cell_numbers(cells), return_inverse=True)
-    weight = np.maximum(given.weight.astype(np.float64), 1e-6)
-    total = np.bincount(group, weight)
-    mean = lambda values: np.column_stack([np.bincount(group, weight * column) / total for column in values.T])
-    count = np.bincount(group)
-    normals = mean(given.normals)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return PointCloud(
-        mean(given.points),
-        mean(given.colours.astype(np.float64)).round().astype(np.uint8),
-        (1 - 0.5**count).astype(np.float32),
-        np.divide(normals, length, out=np.zeros_like(normals), where=length > 1e-6).astype(np.float32),
-    )
+    total = np.bincount(group, given.weight)
+    mean = lambda values: np.column_stack([np.bincount(group, given.weight * column) / total for column in values.T])
+    count = np.bincount(group, given.count)
+    return _Points(mean(given.points), mean(given.colours.astype(np.float64)), mean(given.normals), total, count)

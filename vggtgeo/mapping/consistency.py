@@ -32,7 +32,7 @@ def confirm(own: PosedDepth, others: Sequence[PosedDepth], least: int) -> DepthM
     errors of views of one surface have images in common, so that the mean is taken for as sure as the best of them, not
     surer. Confidence is 1 - 2^-n of n confirming views.
     """
-    depth_map = own.depth_map
+    depth_map = own.depth_map.opened()
     depth, variance = depth_map.depth, (depth_map.sigma * depth_map.depth) ** 2
     rays = pinhole.grid_rays((depth.shape[0], depth.shape[1]), own.intrinsics, np.float32)
     weight = 1.0 / variance
@@ -66,7 +66,7 @@ def _seen_by(own: PosedDepth, other: PosedDepth, depth: np.ndarray, rays: np.nda
     relative = (other.pose @ np.linalg.inv(own.pose)).astype(np.float32)
     local = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
     flat = local.reshape(-1, 3)
-    inside, rows, columns = pinhole.visible(flat, other.intrinsics, other.depth_map.depth.shape)
+    inside, rows, columns = pinhole.visible(flat, other.intrinsics, other.depth_map.shape)
     z, variance = np.full(len(flat), np.nan, np.float32), np.full(len(flat), np.nan, np.float32)
     seen, sigma = other.depth_map.depth[rows, columns], other.depth_map.sigma[rows, columns]
     z[inside] = depth.reshape(-1)[inside] * seen / flat[inside, 2]

@@ -13,7 +13,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
-from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.depth_map import MANY, DepthMap
 from vggtgeo.mapping.fusion import fused_mesh, measured_depth
 from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
@@ -21,6 +21,7 @@ from vggtgeo.models.classical import NoDepth, SensorDepth
 from vggtgeo.models.roles import MetricDepth
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.keyframe_images import array_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 
@@ -119,15 +120,17 @@ def dense_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: st
     check_dense(mode, measured)
     if mode == "none":
         return [None] * len(keyframes)
-    own = map_in_threads(_measured, zip(keyframes, fused_depths(keyframes, intrinsics), strict=True))
+    fused = fused_depths(keyframes, intrinsics)
+
+    def measured_of(i: int) -> DepthMap | None:
+        depth, fused[i] = fused[i], None  # what was used is not held
+        found = None if depth is None else measured_depth(keyframes[i], array_of(depth).astype(np.float32))
+        return found if found is None or len(keyframes) < MANY else found.compressed()
+
+    own = map_in_threads(measured_of, range(len(keyframes)))
     if mode in ("sensor", "network") or (mode == "auto" and measured):
         return own
     return [filled(*pair) for pair in zip(own, stereo_depths(keyframes, intrinsics), strict=True)]
-
-
-def _measured(pair: tuple[Keyframe, np.ndarray | None]) -> DepthMap | None:
-    keyframe, depth = pair
-    return None if depth is None else measured_depth(keyframe, depth)
 
 
 def filled(measured: DepthMap | None, other: DepthMap | None) -> DepthMap | None:
@@ -135,6 +138,7 @@ def filled(measured: DepthMap | None, other: DepthMap | None) -> DepthMap | None
     if measured is None or other is None:
         return other if measured is None else measured
     hole = ~np.isfinite(measured.depth)
-    return DepthMap(
+    both = DepthMap(
         *(np.where(hole, getattr(other, name), getattr(measured, name)) for name in ("depth", "sigma", "confidence"))
     )
+    return both.compressed() if measured.is_compressed else both

@@ -39,10 +39,10 @@ def rendered_depth(pose: np.ndarray, intrinsics: np.ndarray, views: Sequence[Pos
         views: at least one, near `pose`.
 
     """
-    height, width = views[0].depth_map.depth.shape
+    height, width = views[0].depth_map.shape
     coarse = np.full((-(-height // COARSE), -(-width // COARSE)), np.inf, np.float32)
     for view in views:
-        depth_map = view.depth_map
+        depth_map = view.depth_map.opened()
         rows, columns = np.nonzero(np.isfinite(depth_map.depth) & (depth_map.confidence >= LEAST_CONFIDENCE))
         pixels = np.column_stack([columns, rows]).astype(np.float32)
         local = pinhole.rays(pixels, view.intrinsics) * depth_map.depth[rows, columns, None]

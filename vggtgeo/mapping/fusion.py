@@ -11,7 +11,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
-from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.depth_map import MANY, DepthMap
 from vggtgeo.mapping.tsdf import (
     BATCH,
     GROUP,
@@ -130,6 +130,7 @@ class SurfaceFusion:
             stale |= self._without(keyframe.number)
             own = measured_depth(keyframe) if depth_maps is None else depth_map
             if own is not None and not own.empty:
+                own = own.compressed() if len(keyframes) >= MANY else own
                 stale |= self._with(keyframe, own, source)
         return self._fuse(stale)
 
@@ -148,7 +149,7 @@ class SurfaceFusion:
         return set(before.blocks)
 
     def _with(self, keyframe: Keyframe, depth_map: DepthMap, source: object) -> set[Block]:
-        view = View(depth_map, keyframe.image, keyframe.pose, self._intrinsics)
+        view = View(depth_map, keyframe.images.colour, keyframe.pose, self._intrinsics)
         blocks = tuple(blocks_of(view, self._voxel))
         self._fused[keyframe.number] = _Fused(view, blocks, _corners(view), source)
         for block in blocks:

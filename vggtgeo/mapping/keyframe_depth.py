@@ -20,8 +20,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from vggtgeo.geometry import rigid
+from vggtgeo.mapping.depth_map import MANY
 from vggtgeo.models import pinhole
 from vggtgeo.slam.keyframe import Keyframe, read_at
+from vggtgeo.slam.keyframe_images import CompressedImage, array_of
 from vggtgeo.slam.threads import map_in_threads
 
 CELL = 24.0
@@ -104,7 +106,7 @@ def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray,
     return slots.pixels[good], correction[good], slots.confidence[good] * slots.prior_confidence[good]
 
 
-def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[np.ndarray | None]:
+def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[np.ndarray | CompressedImage | None]:
     """Dense depth of each keyframe, corrected by its slots and averaged with its neighbours' views.
 
     Args:
@@ -112,66 +114,71 @@ def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[
         intrinsics: float64 [4], pixels.
 
     Returns:
-        float32 [H, W] metres for each keyframe, NaN where it has no depth; None where it has none at all.
+        float32 [H, W] metres for each keyframe, NaN where it has no depth, of many keyframes compressed; None where it
+        has none at all.
 
     """
+    many = len(keyframes) >= MANY
+    held = lambda depth: CompressedImage.of(depth.astype(np.float16)) if many else depth
 
-    def measured(keyframe: Keyframe) -> np.ndarray | None:
-        depth = keyframe.depth
-        return depth.astype(np.float32) if np.any(np.isfinite(depth)) else None
+    def measured(keyframe: Keyframe) -> np.ndarray | CompressedImage | None:
+        return keyframe.images.depth if np.isfinite(keyframe.depth).any() else None
 
-    depths = map_in_threads(measured, keyframes)
+    def correct(i: int) -> np.ndarray | None:
+        """Its points, once it is corrected."""
+        if (depth := depths[i]) is None:
+            return None
+        corrected = optimised_depth(keyframes[i], array_of(depth).astype(np.float32))
+        depths[i] = held(corrected)
+        return _points(corrected, intrinsics)
+
+    def average(i: int) -> None:
+        if (depth := depths[i]) is not None:
+            around = _around(clouds, keyframes, i)
+            depths[i] = held(_averaged(array_of(depth).astype(np.float32), around, intrinsics))
+
+    depths, numbers = map_in_threads(measured, keyframes), range(len(keyframes))
     for _ in range(ROUNDS):
-        depths = _one_round(keyframes, depths, intrinsics)
+        clouds = map_in_threads(correct, numbers)
+        map_in_threads(average, numbers)
     return depths
 
 
-def _one_round(
-    keyframes: Sequence[Keyframe], depths: Sequence[np.ndarray | None], intrinsics: np.ndarray
-) -> list[np.ndarray | None]:
-    def correct(i: int) -> np.ndarray | None:
-        depth = depths[i]
-        return None if depth is None else optimised_depth(keyframes[i], depth)
-
-    def average(i: int) -> np.ndarray | None:
-        depth = corrected[i]
-        return None if depth is None else _averaged(depth, keyframes[i], _around(clouds, i), intrinsics)
-
-    def points(i: int) -> np.ndarray | None:
-        depth = corrected[i]
-        return None if depth is None else _world_points(depth, keyframes[i], intrinsics)
-
-    numbers = range(len(keyframes))
-    corrected = map_in_threads(correct, numbers)
-    clouds = map_in_threads(points, numbers)
-    return map_in_threads(average, numbers)
-
-
-def _around(clouds: Sequence[np.ndarray | None], i: int) -> list[np.ndarray]:
-    """The neighbours' points, of those that have any."""
+def _around(
+    clouds: Sequence[np.ndarray | None], keyframes: Sequence[Keyframe], i: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The neighbours' points, of those that have any, each with the motion from there to keyframe i."""
     numbers = [i + sign * offset for offset in OFFSETS for sign in (-1, 1)]
-    return [cloud for j in numbers if 0 <= j < len(clouds) and (cloud := clouds[j]) is not None]
+    return [
+        (cloud, keyframes[i].pose @ rigid.invert(keyframes[j].pose))
+        for j in numbers
+        if 0 <= j < len(clouds) and (cloud := clouds[j]) is not None
+    ]
 
 
-def _world_points(depth: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> np.ndarray:
+def _points(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """What a keyframe contributes elsewhere, in its own frame: float32 [3, n], metres."""
     rows, columns = np.mgrid[STEP // 2 : depth.shape[0] : STEP, STEP // 2 : depth.shape[1] : STEP].reshape(2, -1)
-    z = depth[rows, columns].astype(np.float64)
+    z = depth[rows, columns]
     known = np.isfinite(z)
-    pixels = np.column_stack([columns[known], rows[known]]).astype(np.float64)
-    return rigid.unproject(pixels, 1.0 / z[known], keyframe.pose, intrinsics)
+    pixels = np.column_stack([columns[known], rows[known]]).astype(np.float32)
+    return np.ascontiguousarray((pinhole.rays(pixels, intrinsics) * z[known, None]).T, np.float32)
 
 
-def _averaged(depth: np.ndarray, keyframe: Keyframe, others: list[np.ndarray], intrinsics: np.ndarray) -> np.ndarray:
+def _averaged(depth: np.ndarray, others: list[tuple[np.ndarray, np.ndarray]], intrinsics: np.ndarray) -> np.ndarray:
+    """The depth after the mean of what other keyframes measured of it; others: see `_around`."""
     height, width = depth.shape
     cells = (-(-height // STEP), -(-width // STEP))
     total, views = np.zeros(cells), np.ones(cells)  # the keyframe's own view, with no correction, counts as one
-    for points in others:
-        local = points @ keyframe.pose[:3, :3].T + keyframe.pose[:3, 3]
-        inside, rows, columns = pinhole.visible(local, intrinsics, (height, width))
-        difference = np.log(local[inside, 2] / depth[rows, columns])
+    for points, motion in others:
+        # In single precision, and by the motion between the two: far from the origin it loses nothing.
+        near = motion.astype(np.float32)
+        local = near[:3, :3] @ points + near[:3, 3:]
+        inside, rows, columns = pinhole.visible(local.T, intrinsics, (height, width))
+        difference = np.log(local[2, inside] / depth[rows, columns])
         same = np.abs(difference) < GATE  # false where the depth is NaN
         cell = (rows[same] // STEP) * cells[1] + columns[same] // STEP
-        mass, moment = (_smoothed(cell, weights, cells) for weights in (np.ones(len(cell)), difference[same]))
+        mass, moment = (_smoothed(cell, weights, cells) for weights in (None, difference[same]))
         seen = mass > LEAST_MASS
         total[seen] += moment[seen] / mass[seen]
         views[seen] += 1
@@ -179,6 +186,6 @@ def _averaged(depth: np.ndarray, keyframe: Keyframe, others: list[np.ndarray], i
     return depth * np.exp(correction[:height, :width])
 
 
-def _smoothed(cell: np.ndarray, weights: np.ndarray, cells: tuple[int, int]) -> np.ndarray:
+def _smoothed(cell: np.ndarray, weights: np.ndarray | None, cells: tuple[int, int]) -> np.ndarray:
     grid = np.bincount(cell, weights, cells[0] * cells[1]).reshape(cells).astype(np.float32)
     return cv2.GaussianBlur(grid, (0, 0), SPREAD, borderType=cv2.BORDER_CONSTANT)

@@ -28,6 +28,7 @@ from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
+from vggtgeo.slam.keyframe_images import CompressedImage, array_of
 
 Block = tuple[int, int, int]
 """Corner of a block of voxels, in blocks."""
@@ -51,10 +52,12 @@ LEAST_PART = 200
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A depth map with its picture and camera. pose: world -> camera; intrinsics: of both."""
+    """A depth map with its picture (uint8 [H, W, 3], perhaps compressed) and camera. pose: world -> camera; intrinsics:
+    of both.
+    """
 
     depth_map: DepthMap
-    image: np.ndarray
+    image: np.ndarray | CompressedImage
     pose: np.ndarray
     intrinsics: np.ndarray
 
@@ -118,12 +121,12 @@ def meshes_of(
 
 def _packed(view: View) -> Array:
     """Depth (0 = none), weight and colour of each pixel, float32 [H, W, 5]: one read a voxel."""
-    depth_map = view.depth_map
+    depth_map = view.depth_map.opened()
     sigma = np.maximum(depth_map.sigma * depth_map.depth, 1e-3)
     good = np.isfinite(depth_map.depth) & (depth_map.confidence >= LEAST_CONFIDENCE)
     weight = np.where(good, depth_map.confidence / sigma**2, 0.0)
     depth = np.where(good, depth_map.depth, 0.0)
-    return jnp.asarray(np.concatenate([depth[..., None], weight[..., None], view.image], axis=2), jnp.float32)
+    return jnp.asarray(np.concatenate([depth[..., None], weight[..., None], array_of(view.image)], axis=2), jnp.float32)
 
 
 @partial(jax.jit, donate_argnums=0)

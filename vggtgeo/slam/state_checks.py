@@ -31,6 +31,8 @@ def check_state(slam: Slam) -> None:
     for one, other in pairwise(slam.keyframes):
         if one.size != other.size:
             raise ValueError(f"its images are of {other.size} and of {one.size} pixels, expected one size")
+        if one.place is not None and other.place is not None:
+            check_array("place", other.place, one.place.shape)
     for pair in slam.pairs:
         _check_pair(pair, slam)
     named = [number for factor in slam.factors for number in factor.keyframes]

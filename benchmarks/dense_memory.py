@@ -1,0 +1,86 @@
+"""How much memory the dense map of a long run takes, and how long it takes to make.
+
+    .venv/bin/python benchmarks/dense_memory.py ../shared/data/redkitchen --keyframes 64 192 384
+    .venv/bin/python benchmarks/dense_memory.py ../shared/data/building-walk --rgb-only --keyframes 160 480
+
+A clip is run once; its keyframes are set beside themselves, 30 m apart, until there are so many, as a building that is
+walked through would have them. Each row is a process of its own. Memory: of the process with its keyframes alone, and
+at most while depth, cloud and mesh are made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import time
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+import vggtgeo as vg
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.io.process_settings import program_settings
+from vggtgeo.mapping.dense import dense_map
+from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.state_file import load_state, save_state
+
+APART = 30.0
+"""Metres, or units of a map without depth: beyond what is seen."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clip", type=Path)
+    parser.add_argument("--rgb-only", action="store_true")
+    parser.add_argument("--keyframes", type=int, nargs="+", default=[64, 192, 384])
+    given = parser.parse_args()
+    clip = vg.read(given.clip)
+    result = vg.reconstruct(SequenceView(clip, clip.camera, clip.has_depth and not given.rgb_only), dense="none")
+    assert result.record is not None
+    print(
+        "| keyframes | memory before, MB | at most, MB | depth and cloud, s | mesh, s | points | faces |\n"
+        + "|---" * 7
+        + "|"
+    )
+    with TemporaryDirectory() as folder:
+        state = Path(folder) / "state.npz"
+        save_state(state, result.record.slam)
+        for count in given.keyframes:
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                cells = pool.apply(_row, (state, count))
+            print(f"| {count} | {' | '.join(cells)} |", flush=True)
+
+
+def _row(state: Path, count: int) -> list[str]:
+    slam = load_state(state)
+    own = slam.keyframes
+    keyframes = tuple(_beside(own[row % len(own)], row, row // len(own)) for row in range(count))
+    longer = replace(slam, keyframes=keyframes, pairs=(), factors=(), frames=(), origins=(0,))
+    before = _megabytes()
+    with program_settings():
+        began = time.perf_counter()
+        built = dense_map(longer)
+        middle = time.perf_counter()
+        mesh = built.mesh
+        end = time.perf_counter()
+    faces = 0 if mesh is None else len(mesh.faces)
+    times = (f"{middle - began:.1f}", f"{end - middle:.1f}")
+    return [f"{before:.0f}", f"{_megabytes():.0f}", *times, str(len(built.cloud)), str(faces)]
+
+
+def _beside(keyframe: Keyframe, number: int, turn: int) -> Keyframe:
+    away = np.eye(4)
+    away[0, 3] = -APART * turn
+    return replace(keyframe, number=number, pose=keyframe.pose @ away).compressed()
+
+
+def _megabytes() -> float:
+    """The most that this process has had so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()
