@@ -14,7 +14,8 @@ from recorded_run import ROLES, SETTINGS
 from same_leaves import differences
 from test_state_file import rewritten
 from typer.testing import CliRunner
-from vggtgeo.models.classical import NoDepth
+from vggtgeo.models.classical import NoDepth, OrbMatcher, SiftMatcher
+from vggtgeo.models.roles import Features
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
@@ -68,6 +69,26 @@ def worst_error(slam: Slam) -> float:
     places = [rigid.invert(slam.pose(record))[:3, 3] for record in slam.frames if record.tracked]
     true = [(rigid.invert(truth[0]) @ truth[record.frame])[:3, 3] for record in slam.frames if record.tracked]
     return float(np.linalg.norm(np.array(places) - true, axis=1).max())
+
+
+class Squared(SiftMatcher):
+    """SIFT's key points with other vectors of the same length, as those of another network have."""
+
+    def describe(self, image: np.ndarray) -> Features:
+        found = super().describe(image)
+        vectors = found.descriptors.vectors[:, ::-1] ** 4
+        vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        return replace(found, descriptors=replace(found.descriptors, vectors=vectors))
+
+
+@pytest.mark.parametrize("points", [OrbMatcher(), Squared()])
+def test_a_map_of_another_matcher_is_refused_at_once(known: Slam, points: Any) -> None:
+    """Vectors of another length (a product of matrices that does not fit, before) or meaning; oracle: the sentence."""
+    roles = replace(ROLES, points=points)
+    with pytest.raises(vg.InputError, match="`known_map` has key points of another matcher than this run's"):
+        next(vg.run(sequence(), roles, SETTINGS, start=HALF, known_map=known))
+    with pytest.raises(vg.InputError, match="use it with the points"):
+        vg.reconstruct(sequence(), roles, SETTINGS, start=HALF, known_map=known)
 
 
 def test_a_map_comes_back_to_the_bit(known: Slam) -> None:

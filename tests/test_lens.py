@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS
 from vggtgeo.models import pinhole
-from vggtgeo.models.classical import NoDepth
+from vggtgeo.models.classical import NoDepth, SiftMatcher
 
 import vggtgeo as vg
 from vggtgeo.datasets import Frame
@@ -204,11 +204,11 @@ def test_a_camera_that_was_found_goes_with_its_map() -> None:
     guess = np.array([160.0, 160.0, 79.5, 59.5])
     known = as_map(undistorted(run_of_room(), LENS))
     known = replace(known, given_intrinsics=guess, intrinsics_sigma=np.full(4, 48.0))
-    within = entered(known, replace(LENS, known=True))
+    within = entered(known, replace(LENS, known=True), SiftMatcher())
     assert within.camera_found
     assert within.given_intrinsics.tolist() == list(LENS.intrinsics)
     with pytest.raises(vg.InputError, match=r"is of a camera with fx, fy, cx, cy = 140\.0, 140\.0, 80\.0, 58\.0 px"):
-        entered(known, Camera((160.0, 160.0, 79.5, 59.5), 160, 120))
+        entered(known, Camera((160.0, 160.0, 79.5, 59.5), 160, 120), SiftMatcher())
 
 
 class Bent:

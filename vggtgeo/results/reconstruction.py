@@ -118,7 +118,7 @@ def reconstruct(
         perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric, perception.roles.depth)
         selection = (start, end, stride)
-        first = _first_state(known_map, source, settings)
+        first = _first_state(known_map, source, settings, perception.roles)
         wanted = identity(
             *(settings, perception.roles, source.known(selection)),
             {name: session.digest for name, session in perception.networks.items()},
@@ -231,12 +231,14 @@ def _concluded(
     return Result.assemble(RunRecord(slam, built, tuple(windows), run.truth, notices, run.title), verdict, summary)
 
 
-def _first_state(known: Slam | None, source: Source, settings: SlamSettings) -> Slam | None:
-    """Before the first frame, in a map that is known; InputError for one of another camera, or where one is needed."""
+def _first_state(known: Slam | None, source: Source, settings: SlamSettings, roles: Roles) -> Slam | None:
+    """Before the first frame, in a map that is known; InputError for one of another camera or matcher, or where one is
+    needed.
+    """
     if known is not None:
         if source.has_depth and not known.metric:
             warnings.warn(FREE_MAP, InputWarning, stacklevel=4)
-        return entered(known, source.camera)
+        return entered(known, source.camera, roles.points)
     if settings.keyframes.localise_only:
         raise InputError("`keyframes.localise_only` needs a map to place frames in: give `known_map` (`--map FILE`)")
     return None

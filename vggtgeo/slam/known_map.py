@@ -18,12 +18,19 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.record_file import Layout
 from vggtgeo.io.records import by_name
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
+from vggtgeo.models.roles import PointMatcher
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
 
 MAP = Layout("map", VERSION, by_name(STATE_CLASSES), UPGRADES)
+LEAST_KNOWN = 0.2
+"""Share of a keyframe's key points that its own picture, described once more as it is kept, must match: 0.71 and more
+of SIFT's, 0.92 of ORB's (13 keyframes of redkitchen and building-walk); descriptors of another kind hardly any."""
+FEW = 20
+"""Key points of which nothing is asked."""
 SAME_CAMERA = 0.02
 """Relative difference of focal lengths and principal point up to which a calibration is that of a map's camera: two
 calibrations of one camera differ by up to 1.6 % (redkitchen: 525 px as given, 534 as adjusted)."""
@@ -90,11 +97,11 @@ def load_map(path: str | os.PathLike[str]) -> Slam:
     return known
 
 
-def entered(known: Slam, camera: Camera) -> Slam:
-    """The state before the first frame of a run with this camera in a known map.
+def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
+    """The state before the first frame of a run with this camera and matcher in a known map.
 
     Raises:
-        InputError: the map is of another camera.
+        InputError: the map is of another camera, or its key points are another matcher's.
 
     """
     height, width = known.keyframes[0].size
@@ -111,7 +118,25 @@ def entered(known: Slam, camera: Camera) -> Slam:
             f"`known_map` is of a camera with fx, fy, cx, cy = {cameras[0]} px; that of this run has {cameras[1]} px: "
             "a map is used with the camera that it was made with"
         )
+    _check_matcher(known, points)
     if known.calibrated:
         return replace(known, lost=1)
     # Its own run found it, and its keyframes stand as that camera sees them.
     return replace(known, lost=1, given_intrinsics=known.intrinsics, camera_found=True)
+
+
+def _check_matcher(known: Slam, points: PointMatcher) -> None:
+    """InputError where a run's matcher does not know a picture of the map by the key points that the map has of it."""
+    keyframe = max(known.keyframes, key=lambda keyframe: len(keyframe.features))
+    if len(keyframe.features) < FEW:
+        return
+    before, again = keyframe.features, points.describe(keyframe.image)
+    ours, theirs = again.descriptors, before.descriptors
+    alike = type(ours) is type(theirs)
+    if isinstance(ours, PixelDescriptors) and isinstance(theirs, PixelDescriptors):
+        alike = ours.vectors.shape[1] == theirs.vectors.shape[1]
+    if not alike or len(points.match(before, again)) < LEAST_KNOWN * min(len(before), len(again)):
+        raise InputError(
+            "`known_map` has key points of another matcher than this run's, which does not find a picture of the map "
+            "in the map: use it with the points (`--points`, `--preset`) that it was made with, or begin a new map"
+        )

@@ -84,7 +84,7 @@ def run(
     settings, clock = settings or SlamSettings(), clock or Clock()
     source = reduced(source, settings.camera.most_pixels)
     selected = source.frames(start, end, stride)
-    known = None if known_map is None else entered(known_map, source.camera)
+    known = None if known_map is None else entered(known_map, source.camera, roles.points)
     yield from run_frames(selected, source.camera, roles, settings, clock, known)
 
 
