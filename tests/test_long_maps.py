@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from recorded_run import recorded_run
 
-import vggtgeo as vg
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping import cloud, dense, fusion, keyframe_depth, stereo
 from vggtgeo.mapping.depth_map import DepthMap
@@ -46,10 +46,7 @@ def test_parts_of_two_shapes_are_no_depth_map() -> None:
 def test_the_map_of_many_keyframes_is_that_of_few(monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
     # Proves that cloud, mesh and depth images are the same, to the rounding, where depth maps are compressed and points
     # of groups of keyframes are averaged apart. Oracle: the map made at once.
-    settings = vg.SlamSettings(window=vg.WindowSettings(size=3, point_slots=64, line_slots=24))
-    result = vg.reconstruct(vg.simulate("room", 10, size=(160, 120)), settings=settings, dense="none")
-    assert result.record is not None
-    slam = result.record.slam
+    slam = recorded_run().slam
     few = dense.dense_map(slam, mode)
     for module in (dense, fusion, keyframe_depth, stereo):
         monkeypatch.setattr(module, "MANY", 2)
