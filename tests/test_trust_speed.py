@@ -49,3 +49,14 @@ def test_nobody_moves_across_a_cut(healthy: Walk) -> None:
     away[30:, 0, 3] += 5
     twice = replace(leap, poses=rigid.invert(away))
     assert [20 <= start <= 29 < end for start, end in found(twice, cut)] == [True]
+
+
+def test_nobody_moves_from_where_a_lost_frame_is_said_to_be(healthy: Walk) -> None:
+    """The first two frames of a run in a known map stand where that map begins, 5 m away, until the third is found: no
+    speed. Told where they were tracked.
+    """
+    away = rigid.invert(healthy.estimate.poses)
+    away[:2, 0, 3] += 5
+    leap = healthy.with_poses(rigid.invert(away))
+    assert check_speed(replace(leap, tracked=np.arange(40) >= 2)) == []
+    assert [(f.start, f.end >= 2) for f in check_speed(leap)] == [(0, True)]

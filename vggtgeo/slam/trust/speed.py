@@ -41,7 +41,8 @@ def check_speed(estimate: Estimate, cuts: np.ndarray | None = None) -> list[Find
 
 def speeds(estimate: Estimate, cuts: np.ndarray) -> np.ndarray:
     """From each frame to the first one at least `SPAN` later (or the last, or the last before a cut), m/s, float64
-    [n - 1]; 0 where the cut comes next.
+    [n - 1]; 0 where the cut comes next, and to and from a lost frame, whose pose is only predicted (the first frames of
+    a run in a known map stand where that map begins).
     """
     rows = np.arange(len(estimate) - 1)
     later = np.minimum(np.searchsorted(estimate.times, estimate.times[:-1] + SPAN - 1e-9), len(estimate) - 1)
@@ -49,4 +50,5 @@ def speeds(estimate: Estimate, cuts: np.ndarray) -> np.ndarray:
     before_cut = np.append(np.nonzero(cuts)[0], len(estimate) - 1)
     later = np.minimum(later, before_cut[np.searchsorted(before_cut, rows)])
     distance = np.linalg.norm(estimate.centres[later] - estimate.centres[rows], axis=1)
+    distance = np.where(estimate.tracked[rows] & estimate.tracked[later], distance, 0.0)
     return np.asarray(distance / np.maximum(estimate.times[later] - estimate.times[rows], min(SPAN, 0.03)))
