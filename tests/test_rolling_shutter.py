@@ -311,7 +311,7 @@ def test_corners_that_judge_are_of_the_middle_of_the_image() -> None:
     assert off(corners_at_once(slam, recorder.frames)) < 0.6 * off(recorder.frames)
 
 
-@pytest.mark.long
+@pytest.mark.slow  # two runs whose cameras are compiled anew: two minutes
 def test_a_run_finds_the_shutter_of_its_camera() -> None:
     """A whole run by the simulated camera that reads its rows over 30 ms says so, and its path is better for it.
     Oracles: the camera, the truth, and the same run without the search (0.85 and 0.20 cm).
