@@ -3,7 +3,7 @@
     .venv/bin/python benchmarks/changed_maps.py --count 200 --seed 1     # exit code 1 if a run ended in a crash
 
 A simulated map is saved, changed at a place and in a way drawn by the seed (NaN, 1e30, the negative, zeros, any bits, a
-row less, no row; for numbers of the header other numbers, for arrays other arrays of the file), and the next frames of
+row less, no row; for numbers of the header, among them which array stands where, others), and the next frames of
 the walk are placed in it. Oracle: the run ends with a result, or an `InputError` says why not. Counted besides: results
 that are called good and more than 5 cm off. A map whose places were changed is another map, which nothing can tell.
 """

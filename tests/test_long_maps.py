@@ -5,7 +5,7 @@ import pytest
 from recorded_run import recorded_run
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.mapping import cloud, dense, fusion, keyframe_depth, stereo
+from vggtgeo.mapping import cloud, dense, depth_map, keyframe_depth
 from vggtgeo.mapping.depth_map import DepthMap
 
 
@@ -48,7 +48,7 @@ def test_the_map_of_many_keyframes_is_that_of_few(monkeypatch: pytest.MonkeyPatc
     # of groups of keyframes are averaged apart. Oracle: the map made at once.
     slam = recorded_run().slam
     few = dense.dense_map(slam, mode)
-    for module in (dense, fusion, keyframe_depth, stereo):
+    for module in (depth_map, keyframe_depth):
         monkeypatch.setattr(module, "MANY", 2)
     monkeypatch.setattr(cloud, "TOGETHER", 2)
     many = dense.dense_map(slam, mode)

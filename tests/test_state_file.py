@@ -314,14 +314,14 @@ def test_states_whose_parts_do_not_belong_together(
     tmp_path: Path, change: Callable[[Slam], Any], sentence: str
 ) -> None:
     """A file of parts that do not fit is refused, not found at the end of a run; oracle: the sentence."""
-    STATE.write(tmp_path / "state.npz", change(settled(recorded_run().states[-1])))
+    STATE.write(tmp_path / "state.npz", change(recorded_run().slam))
     with pytest.raises(InputError, match=re.escape(sentence)):
         load_state(tmp_path / "state.npz")
 
 
 def test_matches_of_key_points_that_are_not_there_are_refused(tmp_path: Path) -> None:
     """Rows of matches are looked at, those of points and those of lines; oracle: the sentence."""
-    slam = settled(recorded_run().states[-1])
+    slam = recorded_run().slam
     pair = slam.pairs[0]
     points = replace(pair.points, index_j=pair.points.index_j + 10_000)
     lines = LineMatches(np.array([0]), np.array([10_000]), np.array([1.0]))

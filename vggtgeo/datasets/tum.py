@@ -79,13 +79,11 @@ def lists_no_times(file: Path) -> bool:
     except (InputError, ValueError, IndexError):  # told where it is read
         return False
     falling = np.count_nonzero(np.diff(times) < 0)
-    if max(map(len, names)) > MOST_LETTERS:
+    if len(times) < LEAST_LINES or falling < LEAST_FALLING * len(times) or max(map(len, names)) > MOST_LETTERS:
         return False
-    numbered = [re.fullmatch(r"(.*?)(\d+)(\.\w+)?", name) for name in names]
-    if len(times) < LEAST_LINES or falling < LEAST_FALLING * len(times) or None in numbered:
-        return False
-    one_name = len({found.expand(r"\1") for found in numbered if found}) == 1
-    return one_name and bool(np.all(np.diff([int(found.group(2)) for found in numbered if found]) > 0))
+    numbered = [found for name in names if (found := re.fullmatch(r"(.*?)(\d+)(\.\w+)?", name))]
+    one_name = len(numbered) == len(names) and len({found.group(1) for found in numbered}) == 1
+    return one_name and bool(np.all(np.diff([int(found.group(2)) for found in numbered]) > 0))
 
 
 def _recording(folder: Path) -> str:

@@ -22,8 +22,6 @@ AGREE = 0.04
 """Largest relative difference of a point's depth from what another keyframe sees there."""
 STEEP = 0.1
 """Relative difference of depth of pixels `STEP` apart above which they are no one surface and have no normal."""
-
-
 TOGETHER = 64
 """Keyframes whose points are averaged before those of others are made: all points of one take 2 MB."""
 

@@ -13,7 +13,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
-from vggtgeo.mapping.depth_map import MANY, DepthMap
+from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.fusion import fused_mesh, measured_depth
 from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
@@ -125,7 +125,7 @@ def dense_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: st
     def measured_of(i: int) -> DepthMap | None:
         depth, fused[i] = fused[i], None  # what was used is not held
         found = None if depth is None else measured_depth(keyframes[i], array_of(depth).astype(np.float32))
-        return found if found is None or len(keyframes) < MANY else found.compressed()
+        return None if found is None else found.held_by(len(keyframes))
 
     own = map_in_threads(measured_of, range(len(keyframes)))
     if mode in ("sensor", "network") or (mode == "auto" and measured):

@@ -89,6 +89,10 @@ class DepthMap:
         small._parts = tuple(CompressedImage.of(image) for image in (*scaled, shades))
         return small
 
+    def held_by(self, keyframes: int) -> Self:
+        """As a map of so many keyframes holds it."""
+        return self.compressed() if keyframes >= MANY else self
+
     def opened(self) -> Self:
         """The same as arrays, for several looks."""
         return self if self._known is None else type(self)(self.depth, self.sigma, self.confidence)

@@ -11,7 +11,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
-from vggtgeo.mapping.depth_map import MANY, DepthMap
+from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.tsdf import (
     BATCH,
     GROUP,
@@ -130,7 +130,7 @@ class SurfaceFusion:
             stale |= self._without(keyframe.number)
             own = measured_depth(keyframe) if depth_maps is None else depth_map
             if own is not None and not own.empty:
-                own = own.compressed() if len(keyframes) >= MANY else own
+                own = own.held_by(len(keyframes))
                 stale |= self._with(keyframe, own, source)
         return self._fuse(stale)
 

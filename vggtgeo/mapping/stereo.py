@@ -16,7 +16,7 @@ import numpy as np
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.consistency import PosedDepth, confirm
-from vggtgeo.mapping.depth_map import MANY, DepthMap
+from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.plane_sweep import Photo, matching_cost
 from vggtgeo.mapping.semi_global import semi_global
 from vggtgeo.mapping.stereo_views import choose_views, known_points
@@ -74,19 +74,25 @@ def stereo_depths(
     views = choose_views(keyframes, intrinsics, settings.views)
     photos = [_photo(keyframe, intrinsics, settings.size) for keyframe in keyframes]
     points = [known_points(keyframe, intrinsics) for keyframe in keyframes]
-    held = lambda depth_map: depth_map.compressed() if len(keyframes) >= MANY else depth_map
 
     def search(i: int) -> PosedDepth | None:
         around = np.concatenate([points[j] for j in (i, *views[i])])
         depth_map = _search(around, photos[i], [photos[j] for j in views[i]], settings)
-        return None if depth_map is None else PosedDepth(held(depth_map), photos[i].pose, photos[i].intrinsics)
+        return (
+            None
+            if depth_map is None
+            else PosedDepth(depth_map.held_by(len(photos)), photos[i].pose, photos[i].intrinsics)
+        )
 
     found = map_in_threads(search, range(len(photos)))  # a search holds some 150 MB
     result: list[DepthMap | None] = []
     for i, own in enumerate(found):
         others = [other for j in views[i] if (other := found[j]) is not None]
         confirmed = None if own is None else confirm(own, others, settings.least_views)
-        result.append(None if confirmed is None or confirmed.empty else held(enlarged(confirmed, keyframes[i].size)))
+        if confirmed is None or confirmed.empty:
+            result.append(None)
+        else:
+            result.append(enlarged(confirmed, keyframes[i].size).held_by(len(keyframes)))
     return result
 
 

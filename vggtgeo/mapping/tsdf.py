@@ -139,21 +139,11 @@ def _with_view(
     intrinsics: Float[Array, " 4"],
     reach: float | Float[Array, ""],
 ) -> Float[Array, "n i j k 6"]:
-    """The sums, in place, with what one view adds to some rows of them; the rest as of `_measured`."""
-    return sums.at[rows].add(_measured(corners, motion, pixels, intrinsics, reach), mode="promise_in_bounds")
+    """The sums of blocks, in place, with what one view adds to the voxels of some rows of them: weight times distance
+    and colour, the weight, and 1.
 
-
-def _measured(
-    corners: Int[Array, "b 3"],
-    motion: Float[Array, "3 4"],
-    pixels: Float[Array, "h w 5"],
-    intrinsics: Float[Array, " 4"],
-    reach: float | Float[Array, ""],
-) -> Float[Array, "b i j k 6"]:
-    """What one view adds to the voxels of blocks: weight times distance and colour, the weight, and 1.
-
-    corners: of the blocks, in voxels. motion: from places in voxels to the view's frame. A voxel that two blocks share
-    is computed from the same numbers in the same order, so that both find the same.
+    corners: of those blocks, in voxels. motion: from places in voxels to the view's frame. A voxel that two blocks
+    share is computed from the same numbers in the same order, so that both find the same.
     """
     steps = (corners[:, :, None] + jnp.arange(SIDE + 1)).astype(jnp.float32)
     x, y, z = (
@@ -174,7 +164,8 @@ def _measured(
     # In front it is free, to a limit beyond which a view says nothing: whether a block asks it depends on the block.
     weight = jnp.where(inside[..., None] & (distance >= -reach) & (distance <= FREE * reach), seen[..., 1:2], 0.0)
     values = jnp.concatenate([jnp.minimum(distance / reach, 1.0), seen[..., 2:]], axis=-1)
-    return jnp.concatenate([weight * values, weight, (weight > 0).astype(jnp.float32)], axis=-1)
+    added = jnp.concatenate([weight * values, weight, (weight > 0).astype(jnp.float32)], axis=-1)
+    return sums.at[rows].add(added, mode="promise_in_bounds")
 
 
 def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -> Mesh | None:
