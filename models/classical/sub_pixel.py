@@ -78,46 +78,60 @@ def patch_correlation(
 class _Template:
     """The normalised patches of view i and what an alignment needs of them.
 
-    patch: float32 [n, P]. descent: float32 [n, 6, P], its derivatives by shift and by the four entries of the warp, as
-    they come from the image. inverse: [n, 6, 6] of their normal equations after the patch was normalised.
+    patch: float32 [n, P]. across, down: float32 [n, P], its derivatives by a shift, as they come from the image; those
+    by the four entries of the warp are these times an offset. inverse: [n, 6, 6] of the normal equations of all six,
+    after the patch was normalised.
     """
 
     patch: np.ndarray
-    descent: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
     inverse: np.ndarray
     _along: np.ndarray
     """float32 [n, 6]: what of each derivative normalising the patch takes away."""
+    _offsets: np.ndarray
+    """float32 [P, 3]: one, and both offsets from the centre in half sides."""
 
     @classmethod
     def of(cls, gray: np.ndarray, pixels: np.ndarray, radius: int) -> _Template:
         side, halves = _side(radius), np.arange(-radius - 0.5, radius + 1, dtype=np.float32)
-        raw = _upright(gray, pixels, side, side)
-        patch = _normalised(raw)
-        count, width = len(raw), len(side)
-        size = np.maximum(np.linalg.norm(raw - raw.mean(axis=1, keepdims=True), axis=1, keepdims=True), 1e-3)
-        across = _upright(gray, pixels, halves, side).reshape(count, width, width + 1)
-        down = _upright(gray, pixels, side, halves).reshape(count, width + 1, width)
-        descent = np.empty((count, 6, width, width), np.float32)
-        scale = 1 / size[:, :, None]
-        np.multiply(across[:, :, 1:] - across[:, :, :-1], scale, out=descent[:, 0])
-        np.multiply(down[:, 1:] - down[:, :-1], scale, out=descent[:, 1])
-        unit = side / radius
-        for row, (of, along) in enumerate(((0, unit), (0, unit[:, None]), (1, unit), (1, unit[:, None])), 2):
-            np.multiply(descent[:, of], along, out=descent[:, row])
-        flat = descent.reshape(count, 6, -1)
+        patch, size = _centred(_upright(gray, pixels, side, side))
+        patch /= size
+        count, width = len(patch), len(side)
+        across = np.diff(_upright(gray, pixels, halves, side).reshape(count, width, width + 1), axis=2)
+        down = np.diff(_upright(gray, pixels, side, halves).reshape(count, width + 1, width), axis=1)
+        across, down = across.reshape(count, -1) / size, down.reshape(count, -1) / size
+        offsets = np.column_stack([np.ones(width * width, np.float32), _grid(radius) / radius])
         # Normalising a patch removes its mean and its length, and so does the derivative of that; written with the few
         # numbers that it takes away, the derivatives stay as they are: D - mean(D) - (D . t) t.
-        along = (flat @ patch[..., None])[..., 0]
-        mean = flat.mean(axis=2)
-        normal = flat @ flat.transpose(0, 2, 1)
-        normal -= flat.shape[2] * mean[:, :, None] * mean[:, None] + along[:, :, None] * along[:, None]
+        along = _by_warp((across * patch) @ offsets, (down * patch) @ offsets)
+        mean = _by_warp(across @ offsets, down @ offsets) / (width * width)
+        normal = _normal_equations(across, down, offsets)
+        normal -= width * width * mean[:, :, None] * mean[:, None] + along[:, :, None] * along[:, None]
         normal = normal + 1e-3 * np.eye(6) * np.trace(normal, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9 * np.eye(6)
-        return cls(patch, flat, np.linalg.inv(normal), along)
+        return cls(patch, across, down, np.linalg.inv(normal), along, offsets)
 
     def product(self, difference: np.ndarray) -> np.ndarray:
         """Derivatives of the normalised patch times a difference of two such patches [n, P]; [n, 6]."""
-        along = (self.patch * difference).sum(axis=1)
-        return np.asarray((self.descent @ difference[..., None])[..., 0] - self._along * along[:, None])
+        along = np.einsum("np,np->n", self.patch, difference)
+        by_shift = ((side * difference) @ self._offsets for side in (self.across, self.down))
+        return np.asarray(_by_warp(*by_shift) - self._along * along[:, None])
+
+
+def _by_warp(across: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """By shift and the four entries of the warp, [n, 6], from the sums [n, 3] of either derivative with `_offsets`."""
+    return np.column_stack([across[:, 0], down[:, 0], across[:, 1:], down[:, 1:]])
+
+
+def _normal_equations(across: np.ndarray, down: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """[n, 6, 6]: products of the six derivatives, in the order of `_by_warp`, summed over the patch."""
+    first, second = np.triu_indices(3)
+    of_both = offsets[:, first] * offsets[:, second]
+    place = np.empty((3, 3), int)
+    place[first, second] = place[second, first] = np.arange(6)
+    order = np.array([0, 3, 1, 2, 4, 5])  # those of `_by_warp` in (across, down) x (1, x, y)
+    sums = [(one @ of_both)[:, place] for one in (across * across, across * down, down * down)]
+    return np.block([[sums[0], sums[1]], [sums[1], sums[2]]])[:, order[:, None], order]
 
 
 def _side(radius: int) -> np.ndarray:
@@ -153,15 +167,24 @@ def _looked_up(gray: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndar
 
 
 def _normalised(patch: np.ndarray) -> np.ndarray:
+    centred, size = _centred(patch)
+    centred /= size
+    return centred
+
+
+def _centred(patch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Patches [n, P] without their mean, and the length of each [n, 1], at least a thousandth."""
     centred = patch - patch.mean(axis=1, keepdims=True)
-    return centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-3)
+    return centred, np.maximum(np.sqrt(np.einsum("np,np->n", centred, centred))[:, None], 1e-3)
 
 
 def _compose(warp: np.ndarray, target: np.ndarray, step: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:
     """The warp after the inverse of the template's increment: W <- W o dW^-1."""
-    change = np.tile(np.eye(2), (len(step), 1, 1))
-    change += step[:, 2:].reshape(-1, 2, 2) / radius
-    bad = np.abs(np.linalg.det(change)) < 0.1
-    change[bad] = np.eye(2)
-    warp = warp @ np.linalg.inv(change)
+    a, b, c, d = (step[:, 2:] / radius).T
+    a, d = 1 + a, 1 + d
+    determinant = a * d - b * c
+    bad = np.abs(determinant) < 0.1
+    inverse = np.array([[d, -b], [-c, a]]).transpose(2, 0, 1) / np.where(bad, 1.0, determinant)[:, None, None]
+    inverse[bad] = np.eye(2)
+    warp = warp @ inverse
     return warp, target - np.einsum("nab,nb->na", warp, np.where(bad[:, None], 0, step[:, :2]))

@@ -124,9 +124,11 @@ def _packed(view: View) -> Array:
     depth_map = view.depth_map.opened()
     sigma = np.maximum(depth_map.sigma * depth_map.depth, 1e-3)
     good = np.isfinite(depth_map.depth) & (depth_map.confidence >= LEAST_CONFIDENCE)
-    weight = np.where(good, depth_map.confidence / sigma**2, 0.0)
-    depth = np.where(good, depth_map.depth, 0.0)
-    return jnp.asarray(np.concatenate([depth[..., None], weight[..., None], array_of(view.image)], axis=2), jnp.float32)
+    packed = np.zeros((*depth_map.depth.shape, 5), np.float32)
+    np.copyto(packed[..., 0], depth_map.depth, where=good)
+    np.copyto(packed[..., 1], depth_map.confidence / sigma**2, where=good)
+    packed[..., 2:] = array_of(view.image)
+    return jnp.asarray(packed)
 
 
 @partial(jax.jit, donate_argnums=0)

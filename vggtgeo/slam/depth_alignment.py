@@ -20,14 +20,14 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.slam.factors import surface_term
 from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.threads import map_in_threads
 
 CELL = 4
 """Pixels a side of the blocks whose median depth makes one surface point."""
 FARTHEST = 0.10
 """Metres between surfaces that can be one."""
 LEAST_COSINE = 0.8
-LEAST_POINTS = 300
+LEAST_POINTS = 150
+"""Of the source's samples, that a surface of the target is near."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +68,10 @@ class Surface:
         return SurfaceRows(points, normals, self.sigma.ravel())
 
     @cached_property
-    def known(self) -> SurfaceRows:
-        """The cells that have a normal."""
-        good = np.flatnonzero(np.isfinite(self.rows.normals[0]))
+    def samples(self) -> SurfaceRows:
+        """Every other cell, as on a chessboard, of those that have a normal: neighbours share their errors."""
+        rows, columns = np.indices(self.sigma.shape)
+        good = np.flatnonzero(np.isfinite(self.rows.normals[0]) & ((rows + columns) % 2 == 0).ravel())
         return SurfaceRows(self.rows.points[:, good], self.rows.normals[:, good], self.rows.sigma[good])
 
 
@@ -92,7 +93,7 @@ def align(
 
     Neighbouring depths share their errors: however many points there are, they count as `effective` ones.
     """
-    source, target = surfaces[first].known, surfaces[second]
+    source, target = surfaces[first].samples, surfaces[second]
     turn = relative[:3, :3]
     points = turn @ source.points + relative[:3, 3:]
     inside, rows, columns = pinhole.visible(points.T, target.intrinsics, target.sigma.shape)
@@ -133,17 +134,18 @@ def align_pairs(
     for row, (i, j) in enumerate(pairs):
         relative[row] = keyframes[j].pose @ rigid.invert(keyframes[i].pose)
     hessians, gradients = np.zeros((room, 6, 6)), np.zeros((room, 6))
-    found = map_in_threads(lambda row: align(*pairs[row], surfaces, relative[row], effective), range(len(pairs)))
-    for row, alignment in enumerate(found):
+    # One after the other: a pair is half a millisecond of short calls, and two threads wait longer for Python's lock.
+    for row, pair in enumerate(pairs):
+        alignment = align(*pair, surfaces, relative[row], effective)
         if alignment is not None:
             hessians[row], gradients[row] = alignment.hessian, alignment.gradient
     return surface_term([*pairs, *[(0, 0)] * (room - len(pairs))], relative, hessians, gradients)
 
 
 def _block_medians(values: np.ndarray) -> np.ndarray:
-    """Medians of blocks of `CELL` x `CELL`, float64 [h, w]; NaN where fewer than half of a block is known."""
+    """Medians of blocks of `CELL` x `CELL`, float32 [h, w]; NaN where fewer than half of a block is known."""
     height, width = values.shape[0] // CELL, values.shape[1] // CELL
-    blocks = values[: height * CELL, : width * CELL].astype(np.float64).reshape(height, CELL, width, CELL)
+    blocks = values[: height * CELL, : width * CELL].astype(np.float32).reshape(height, CELL, width, CELL)
     ordered = np.sort(blocks.transpose(0, 2, 1, 3).reshape(height, width, -1), axis=2)
     count = np.isfinite(ordered).sum(2)
     middle = np.take_along_axis(ordered, (count // 2)[..., None].clip(0, CELL**2 - 1), 2)[..., 0]
