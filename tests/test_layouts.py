@@ -223,6 +223,37 @@ def test_kitti(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.ground_truth().positions[:, 0], [-0.06, 0.94, 1.94])
 
 
+def test_a_part_of_a_drive_of_kitti_keeps_its_times_and_its_truth(tmp_path: Path) -> None:
+    # Proves that an image belongs to the line of its number, not of its place: of a drive with its first image and one
+    # more missing. Oracle: what was written, x grows by a metre a frame.
+    drive = tiny.kitti(tmp_path / "dataset")
+    for number in (2, 1, 0):
+        (drive / f"image_2/{number:06d}.png").rename(drive / f"image_2/{2 * number + 1:06d}.png")
+    (drive / "times.txt").write_text("".join(f"{0.1 * number}\n" for number in range(8)))
+    poses = [" ".join(map(str, [1, 0, 0, number, 0, 1, 0, 0, 0, 0, 1, 0])) for number in range(8)]
+    (tmp_path / "dataset/poses/07.txt").write_text("\n".join(poses))
+    sequence = tiny.quietly_opened(drive)
+    assert [frame.timestamp for frame in sequence.frames()] == pytest.approx([0.1, 0.3, 0.5])
+    np.testing.assert_allclose(sequence.ground_truth().positions[:, 0], [0.94, 2.94, 4.94])
+    (drive / "times.txt").unlink()
+    assert [frame.timestamp for frame in tiny.quietly_opened(drive).frames()] == pytest.approx([0, 0.2, 0.4])
+    (tmp_path / "dataset/poses/07.txt").write_text("\n".join(poses[:5]))
+    assert tiny.quietly_opened(drive).ground_truth().timestamps == pytest.approx([0, 0.2])
+
+
+def test_a_part_of_a_room_of_replica_keeps_its_truth(tmp_path: Path) -> None:
+    # Proves the same of Replica: every second frame, from the second on. Oracle: what was written.
+    room = tiny.replica(tmp_path / "room")
+    whole = tiny.quietly_opened(room).ground_truth()
+    lines = (room / "traj.txt").read_text().splitlines()
+    (room / "results/frame000000.jpg").unlink()
+    part = tiny.quietly_opened(room)
+    assert [frame.timestamp for frame in part.frames()] == pytest.approx([0, 1 / 30])
+    np.testing.assert_allclose(part.ground_truth().poses, whole.poses[1:])
+    (room / "traj.txt").write_text("\n".join(lines[1:]) + "\n")  # of the images that are there alone
+    np.testing.assert_allclose(tiny.quietly_opened(room).ground_truth().poses, whole.poses[1:])
+
+
 def test_kitti_raw(tmp_path: Path) -> None:
     # Proves that a raw drive is read with its day's calibration and times, the colour camera first, and says that GPS
     # and IMU are left alone; of an unrectified one, the camera as it was calibrated. Oracle: what was written.

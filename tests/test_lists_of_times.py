@@ -1,4 +1,4 @@
-"""Lists `rgb.txt` whose first column is no time."""
+"""Lists of images whose first column is no time, and lists of pairs as ORB-SLAM2 takes them."""
 
 from pathlib import Path
 
@@ -56,6 +56,47 @@ def test_what_may_be_times_is_taken_for_times(tmp_path: Path, places: tuple[int,
     lines = [f"{0.1 * place} {name.format(number)}" for place, number in zip(places, numbers, strict=True)]
     file.write_text("\n".join(lines))
     assert not lists_no_times(file)
+
+
+def _pairs(folder: Path, times: list[str], name: str = "associations.txt") -> Path:
+    """A recording with one list of pairs in the place of two lists."""
+    _folder(folder, [float(time) for time in times])
+    for other in ("rgb.txt", "depth.txt"):
+        (folder / other).unlink()
+    lines = [f"{t} rgb/rgb{n:05d}.png {t} depth/depth{n:05d}.png" for n, t in enumerate(times)]
+    (folder / name).write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["associations.txt", "association.txt", "associate.txt"])
+def test_a_list_of_pairs_with_times_is_nobody_elses_benchmark(tmp_path: Path, name: str) -> None:
+    # Proves that a recording for ORB-SLAM2 keeps its own camera and times. Oracle: what was written; it was taken for
+    # ICL-NUIM, with the camera of that.
+    times = [f"{1305031102 + 0.04 * number:.6f}" for number in range(COUNT)]
+    sequence = open_sequence(_pairs(tmp_path / "own", times, name))
+    assert type(sequence).__name__ == "TumRgbd"
+    np.testing.assert_allclose(sequence.camera.intrinsics, tiny_sequences.INTRINSICS)
+    frames = list(sequence.frames())
+    np.testing.assert_allclose([frame.timestamp for frame in frames], np.float64(times), rtol=0, atol=1e-6)
+    assert [int(frame.name[-9:-4]) for frame in frames] == list(range(COUNT))
+    assert frames[1].depth[3, 7] == pytest.approx(1.017 / 5)  # 1/5000 m
+
+
+def test_a_list_of_pairs_that_counts_frames_has_thirty_a_second(tmp_path: Path) -> None:
+    # Proves that numbers of frames are not taken for seconds, and that this is said. Oracle: 1/30 s.
+    folder = _pairs(tmp_path / "own", [str(number) for number in range(1, COUNT + 1)])
+    with pytest.warns(InputWarning, match=r"associations.txt`: its first column counts frames; 30 a second"):
+        sequence = open_sequence(folder)
+    assert type(sequence).__name__ == "TumRgbd"
+    np.testing.assert_allclose(np.diff([frame.timestamp for frame in sequence.frames()]), 1 / 30)
+
+
+def test_a_list_of_pairs_of_no_times_leaves_the_order_to_the_names(tmp_path: Path) -> None:
+    # Proves that frames are not shuffled by a first column that says what each took. Oracle: what was written.
+    took = np.random.default_rng(0).normal(0.016, 0.001, COUNT)
+    with pytest.warns(InputWarning, match=r"associations.txt`: its first column is no time"):
+        sequence = open_sequence(_pairs(tmp_path / "own", [f"{each:.6f}" for each in took]))
+    assert [int(frame.name[-9:-4]) for frame in sequence.frames()] == list(range(COUNT))
 
 
 def test_names_of_any_length_are_looked_at_quickly(tmp_path: Path) -> None:

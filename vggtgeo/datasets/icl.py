@@ -31,8 +31,16 @@ class IclNuim(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `associations.txt`, and no `rgb.txt` as TUM RGB-D has."""
-        return (folder / _LIST).is_file() and not (folder / "rgb.txt").is_file()
+        """Whether `folder` has `associations.txt` and no `rgb.txt`, and this is ICL-NUIM's: beside its truth, or a list
+        that counts frames, depth first. Lists of times are anybody's, as ORB-SLAM2 takes them.
+        """
+        file = folder / _LIST
+        if not file.is_file() or (folder / "rgb.txt").is_file():
+            return False
+        with file.open(encoding="utf-8", errors="replace") as lines:
+            words = lines.readline().split()
+        counted = len(words) == 4 and words[0].isdecimal() and "depth" in words[1]
+        return counted or any(folder.glob("*.gt.freiburg"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:

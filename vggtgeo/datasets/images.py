@@ -15,6 +15,7 @@ from vggtgeo.io.errors import InputError, InputWarning
 FRAMES_PER_SECOND = 30.0
 _SECONDS = re.compile(r"\d+\.\d+")
 _NANOSECONDS = re.compile(r"\d{18,19}")
+_NUMBERED = re.compile(r"[^0-9]*([0-9]{1,15})")
 
 
 @dataclass(frozen=True)
@@ -88,3 +89,16 @@ def times_by_name(images: list[Path]) -> list[float]:
             if len(set(times)) == len(times):
                 return times
     return [index / FRAMES_PER_SECOND for index in range(len(images))]
+
+
+def rows_of(images: list[Path], lines: int | None) -> tuple[int, ...]:
+    """The line of each image in lists of a whole recording: the number that its name ends with, so that a part of the
+    recording, or one with holes, keeps its times and its truth. Its place where names have none, or none that is among
+    so many lines.
+    """
+    found = [_NUMBERED.fullmatch(image.stem) for image in images]
+    numbers = [int(match.group(1)) for match in found if match]
+    apart = len(set(numbers)) == len(images)
+    if apart and (lines is None or max(numbers, default=0) < lines):
+        return tuple(numbers)
+    return tuple(range(len(images)))

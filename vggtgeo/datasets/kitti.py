@@ -13,10 +13,9 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
-from vggtgeo.datasets.images import natural_key
+from vggtgeo.datasets.images import image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, intrinsics_of
-from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of
+from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
@@ -35,6 +34,8 @@ class Kitti(FolderSequence):
 
     baseline: float = 0.0
     """Metres along x from the left grey camera, which the truth belongs to, to this one."""
+    rows: tuple[int, ...] = ()
+    """Of each image the line of the lists of times and true poses."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -44,20 +45,24 @@ class Kitti(FolderSequence):
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Lists the images."""
-        place = next((folder / name for name in _FOLDERS if (folder / name).is_dir()), None)
-        found = [] if place is None else [path for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-        if place is None or not found:
+        places = [folder / name for name in _FOLDERS if (folder / name).is_dir()]
+        images = {place: image_files(place) for place in places}
+        place = max(places, key=lambda each: len(images[each]), default=None)  # colour, where both have as many
+        if place is None or not images[place]:
             raise InputError(f"`{folder}` has no images in {', '.join(_FOLDERS)}; expected a drive of KITTI")
-        images = sorted(found, key=lambda path: natural_key(path.name))
-        times = _times(folder, place, len(images))
-        files = tuple(FrameFile(index, times[index], image) for index, image in enumerate(images))
+        times = _times(folder, place)
+        rows = rows_of(images[place], len(times) if times else None)
+        if times and max(rows) >= len(times):
+            raise InputError(f"`{folder}` has {len(rows)} images and {len(times)} times")
+        every = [times[row] if times else (row - rows[0]) / RATE for row in rows]
+        files = tuple(FrameFile(index, *pair) for index, pair in enumerate(zip(every, images[place], strict=True)))
         width, height = common_size(str(folder), files)
         if (folder / "oxts").is_dir():
             warnings.warn(
                 f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", InputWarning, stacklevel=3
             )
         camera, baseline = _camera(folder, place.relative_to(folder).parts[0], width, height)
-        return cls(folder, folder.resolve().name, camera, files, baseline=baseline)
+        return cls(folder, folder.resolve().name, camera, files, baseline=baseline, rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses of the camera that is read."""
@@ -70,20 +75,16 @@ class Kitti(FolderSequence):
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3] = rows.reshape(-1, 3, 4)
         poses[:, :3, 3] += self.baseline * poses[:, :3, 0]
-        return trajectory_of([one.timestamp for one in self.files], poses[: len(self.files)], file)
+        return trajectory_of_rows([one.timestamp for one in self.files], self.rows, poses, file)
 
 
-def _times(folder: Path, place: Path, count: int) -> list[float]:
+def _times(folder: Path, place: Path) -> list[float]:
+    """Of every line of the drive; none where no list is there."""
     seconds = folder / "times.txt"
     if seconds.is_file():
-        times = read_matrices(seconds, 1)[:, 0].tolist()
-    elif (stamps := place.parent / "timestamps.txt").is_file():
-        times = _moments(stamps)
-    else:
-        return [index / RATE for index in range(count)]
-    if len(times) < count:
-        raise InputError(f"`{folder}` has {count} images and {len(times)} times")
-    return times
+        return read_matrices(seconds, 1)[:, 0].tolist()
+    stamps = place.parent / "timestamps.txt"
+    return _moments(stamps) if stamps.is_file() else []
 
 
 def _moments(file: Path) -> list[float]:

@@ -70,6 +70,14 @@ def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where:
     return Trajectory(times[turned], _orthonormal(poses[turned])) if turned.any() else None
 
 
+def trajectory_of_rows(
+    times: Sequence[float], rows: Sequence[int], poses: np.ndarray, where: Path
+) -> Trajectory | None:
+    """The same of images whose poses are those lines of a file; images beyond its end have none."""
+    there = [place for place, row in enumerate(rows) if row < len(poses)]
+    return trajectory_of([times[place] for place in there], poses[[rows[place] for place in there]], where)
+
+
 def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
     """Matrices of positions [n, 3] and quaternions [n, 4], x y z w; NaN where a quaternion is no rotation."""
     poses = np.tile(np.eye(4), (len(positions), 1, 1))

@@ -11,9 +11,9 @@ from typing import Self
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import DepthFormat
-from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
-from vggtgeo.datasets.pose_files import read_json, read_matrices, trajectory_of
+from vggtgeo.datasets.pose_files import read_json, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -27,6 +27,9 @@ _UNITS = 6553.5
 class Replica(FolderSequence):
     """One room. Truth: `traj.txt`, a matrix camera -> world a line. The files have no times: 30 frames a second."""
 
+    rows: tuple[int, ...] = ()
+    """Of each image the line of `traj.txt`."""
+
     @classmethod
     def matches(cls, folder: Path) -> bool:
         """Whether `folder` has `traj.txt` and `results/frame...`."""
@@ -38,20 +41,30 @@ class Replica(FolderSequence):
         images = sorted((folder / "results").glob("frame*"), key=lambda path: natural_key(path.name))
         if not images:
             raise InputError(f"`{folder}` has no `results/frameXXXXXX.jpg`; expected a room of Replica")
+        rows = rows_of(images, _poses_in(folder / "traj.txt"))
         files = tuple(
-            FrameFile(index, index / FRAMES_PER_SECOND, image, _depth(image)) for index, image in enumerate(images)
+            FrameFile(index, (row - rows[0]) / FRAMES_PER_SECOND, image, _depth(image))
+            for index, (row, image) in enumerate(zip(rows, images, strict=True))
         )
         width, height = common_size(str(folder), files)
         camera, units = _camera(folder, width, height)
         coding = DepthFormat(units)
         has_depth = depth_is_usable(str(folder), files, coding, width, height)
-        return cls(folder, folder.resolve().name, camera, files, coding, has_depth)
+        return cls(folder, folder.resolve().name, camera, files, coding, has_depth, rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses."""
         file = self.folder / "traj.txt"
         poses = read_matrices(file, 16)
-        return trajectory_of([one.timestamp for one in self.files], poses[: len(self.files)], file)
+        return trajectory_of_rows([one.timestamp for one in self.files], self.rows, poses, file)
+
+
+def _poses_in(file: Path) -> int | None:
+    """How many poses there are; None where the file cannot be read, which is told where its poses are asked for."""
+    try:
+        return len(read_matrices(file, 16))
+    except InputError:
+        return None
 
 
 def _depth(image: Path) -> Path | None:

@@ -17,7 +17,7 @@ from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, dept
 from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MILLIMETRES
 from vggtgeo.datasets.images import image_files, times_by_name
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
-from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, lists_no_times, partners_in_time
+from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, list_of, lists_no_times, partners_in_time
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -56,7 +56,7 @@ class RgbdFolders(FolderSequence):
     def open(cls, folder: Path) -> Self:
         """Lists the images and finds their depths; InputError where the two cannot be paired."""
         colour, (images, depths) = _listed(folder)
-        if (file := folder / "rgb.txt").is_file() and lists_no_times(file):
+        if (file := list_of(folder)) and lists_no_times(file):
             _warn(
                 f"`{file}`: its first column is no time, it falls while the files are numbered on; frames are taken in "
                 "the order of their numbers, depth in millimetres"

@@ -4,7 +4,8 @@
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. ETH3D SLAM (whose
 `calibration.txt` is the one read here) and Bonn RGB-D Dynamic have the same layout. Colour and depth
 are taken at different times: an image gets the depth nearest in time, at most 0.02 s away, each depth used
-once. `associated.txt`, the pairs that ETH3D SLAM comes with, is read where `rgb.txt` is not there.
+once. A list of pairs, as ETH3D SLAM comes with and ORB-SLAM2 takes (`associations.txt`), is read where `rgb.txt` is not
+there.
 """
 
 import itertools
@@ -19,6 +20,7 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
+from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
@@ -34,7 +36,9 @@ LEAST_FALLING, LEAST_LINES = 0.1, 10
 """Share of the lines at which the first column of a list falls, and lines, for it to be no time: lists that two
 processes wrote have a line out of order now and then, and what frames took to come falls at every second line."""
 _TRUTH = "groundtruth.txt"
-_PAIRS = "associated.txt"
+_PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")
+MOST_FRAMES = 1e6
+"""Whole numbers up to here are no times, but count frames."""
 _Entry = tuple[float, Path]
 
 
@@ -44,15 +48,15 @@ class TumRgbd(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has an `rgb.txt` of times, or an `associated.txt`."""
-        file = folder / "rgb.txt"
-        return (file.is_file() and not lists_no_times(file)) or (folder / _PAIRS).is_file()
+        """Whether `folder` has an `rgb.txt` of times, or a list of pairs of such."""
+        file = list_of(folder)
+        return file is not None and not lists_no_times(file)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
-        listed = (folder / "rgb.txt").is_file() or not (folder / _PAIRS).is_file()
-        files = _of_lists(folder) if listed else _of_pairs(folder)
+        file = list_of(folder)
+        files = _of_lists(folder) if file is None or file.name == "rgb.txt" else _of_pairs(file)
         width, height = common_size(str(folder), files)
         camera = (
             camera_from_folder(folder, width, height)
@@ -67,6 +71,11 @@ class TumRgbd(FolderSequence):
         """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
         file = self.folder / _TRUTH
         return Trajectory.load_tum(file) if file.exists() else None
+
+
+def list_of(folder: Path) -> Path | None:
+    """The list of images in a folder, with those of depth where `rgb.txt` is not there; None where there is none."""
+    return next((file for name in ("rgb.txt", *_PAIRS) if (file := folder / name).is_file()), None)
 
 
 def lists_no_times(file: Path) -> bool:
@@ -108,11 +117,15 @@ def _of_lists(folder: Path) -> tuple[FrameFile, ...]:
     )
 
 
-def _of_pairs(folder: Path) -> tuple[FrameFile, ...]:
-    file = folder / _PAIRS
-    depths = {}
-    for time, image, depth in read_pairs(file, "TIME"):
-        depths[time, folder / image] = folder / depth
+def _of_pairs(file: Path) -> tuple[FrameFile, ...]:
+    pairs = read_pairs(file, "TIME")
+    counted = all(time.is_integer() and abs(time) < MOST_FRAMES for time, *_ in pairs)
+    if counted:
+        _warn(f"`{file}`: its first column counts frames; {FRAMES_PER_SECOND:g} a second are assumed")
+    depths = {
+        (time / FRAMES_PER_SECOND if counted else time, file.parent / image): file.parent / depth
+        for time, image, depth in pairs
+    }
     images = _in_order(file, list(depths), frames=True)
     return tuple(FrameFile(index, *image, depths[image]) for index, image in enumerate(images))
 
