@@ -140,6 +140,20 @@ def test_missing_files_are_counted_over_all(tmp_path: Path, kind: str, what: str
     assert "none of the 101 depth images is there: " in gone
 
 
+def test_images_that_the_numbers_miss_are_counted(tmp_path: Path) -> None:
+    # Proves that holes in the numbers of images are told, whatever the step between the others; and that numbers
+    # without an order, as of images that somebody chose, are not. Oracle: which are not written.
+    for folder, step in (("every", 1), ("tenth", 10)):
+        for place in (*range(5), *range(7, 15), 16):
+            tiny.write_image(tmp_path / folder / f"img_{100 + step * place:04d}.png", tiny.image(place))
+        last = f"img_{100 + step * 4:04d}.png` and `img_{100 + step * 7:04d}.png"
+        found = [text for text in inspect(tmp_path / folder).problems if text.startswith("by their numbers")]
+        assert found == [f"by their numbers 3 images are missing: between `{last}`, and at 1 more"]
+    for place in np.cumsum([0, 1, 5, 2, 9, 1, 30, 4, 4, 7, 1, 2, 12]):
+        tiny.write_image(tmp_path / f"chosen/{place}.png", tiny.image(int(place)))
+    assert not [text for text in inspect(tmp_path / "chosen").problems if text.startswith("by their numbers")]
+
+
 def test_what_cannot_be_opened_is_told_too(tmp_path: Path) -> None:
     # Proves that a folder that is nothing ends in a sentence, not in a traceback.
     (tmp_path / "x.doc").write_text("")

@@ -11,6 +11,7 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
+from vggtgeo.datasets.images import rows_of
 from vggtgeo.datasets.opening import open_sequence
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
@@ -22,6 +23,8 @@ _NEAR, _FAR = 0.1, 30.0
 _LEAST_DEPTH = 0.2
 """Share of pixels; depth cameras give 0.5 to 0.9 indoors."""
 _DARK = 8.0
+_LEAST_STEPS, _USUAL = 10, 0.75
+"""Of the steps between the numbers of images, and the share that is one: else they were chosen by hand."""
 _GAP = 5.0
 """Times the median step between two frames."""
 _FAST = 5.0
@@ -50,6 +53,7 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
     problems = [
         *_texts(caught),
         *missing,
+        *_of_numbers(sequence),
         *_of_images(frames),
         *_of_times(frames, len(sequence)),
         *_of_depth(sequence, frames),
@@ -116,6 +120,24 @@ def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) ->
     else:
         facts.append("no truth")
     return tuple(facts)
+
+
+def _of_numbers(sequence: Sequence) -> list[str]:
+    """Images that are not there, by the numbers of those that are: nearly all steps are one, and a few are larger."""
+    images = [file.image for file in sequence.files] if isinstance(sequence, FolderSequence) else []
+    steps = np.diff(rows_of(images, None))
+    if len(steps) < _LEAST_STEPS:
+        return []
+    sizes, counts = np.unique(steps, return_counts=True)
+    usual = sizes[np.argmax(counts)]
+    holes = np.flatnonzero(steps > usual)
+    if usual < 1 or len(holes) == 0 or counts.max() < _USUAL * len(steps):
+        return []
+    first, lost = int(holes[0]), int(np.sum(steps[holes] // usual - 1))
+    where = f"`{images[first].name}` and `{images[first + 1].name}`"
+    more = f", and at {len(holes) - 1} more" if len(holes) > 1 else ""
+    images_are = "image is" if lost == 1 else "images are"
+    return [f"by their numbers {lost} {images_are} missing: between {where}{more}"]
 
 
 def _of_images(frames: list[Frame]) -> list[str]:
