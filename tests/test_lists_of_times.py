@@ -82,13 +82,15 @@ def test_a_list_of_pairs_with_times_is_nobody_elses_benchmark(tmp_path: Path, na
     assert frames[1].depth[3, 7] == pytest.approx(1.017 / 5)  # 1/5000 m
 
 
-def test_a_list_of_pairs_that_counts_frames_has_thirty_a_second(tmp_path: Path) -> None:
+def test_a_list_of_pairs_that_counts_frames_has_thirty_a_second_and_millimetres(tmp_path: Path) -> None:
     # Proves that numbers of frames are not taken for seconds, and that this is said. Oracle: 1/30 s.
     folder = _pairs(tmp_path / "own", [str(number) for number in range(1, COUNT + 1)])
-    with pytest.warns(InputWarning, match=r"associations.txt`: its first column counts frames; 30 a second"):
+    with pytest.warns(InputWarning, match=r"counts frames; 30 a second are assumed, and depth in millimetres"):
         sequence = open_sequence(folder)
     assert type(sequence).__name__ == "TumRgbd"
-    np.testing.assert_allclose(np.diff([frame.timestamp for frame in sequence.frames()]), 1 / 30)
+    frames = list(sequence.frames())
+    np.testing.assert_allclose(np.diff([frame.timestamp for frame in frames]), 1 / 30)
+    assert frames[1].depth[3, 7] == pytest.approx(1.017)
 
 
 def test_a_list_of_pairs_of_no_times_leaves_the_order_to_the_names(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
-from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
+from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -56,7 +56,8 @@ class TumRgbd(FolderSequence):
     def open(cls, folder: Path) -> Self:
         """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
         file = list_of(folder)
-        files = _of_lists(folder) if file is None or file.name == "rgb.txt" else _of_pairs(file)
+        listed = file is None or file.name == "rgb.txt"
+        files, coding = (_of_lists(folder), FIVE_THOUSANDTHS) if listed else _of_pairs(file)
         width, height = common_size(str(folder), files)
         camera = (
             camera_from_folder(folder, width, height)
@@ -64,8 +65,8 @@ class TumRgbd(FolderSequence):
             or published_camera(_recording(folder), width, height)
             or guess_with_warning(str(folder), width, height)
         )
-        has_depth = depth_is_usable(str(folder), files, FIVE_THOUSANDTHS, width, height)
-        return cls(folder, folder.resolve().name, camera, files, FIVE_THOUSANDTHS, has_depth)
+        has_depth = depth_is_usable(str(folder), files, coding, width, height)
+        return cls(folder, folder.resolve().name, camera, files, coding, has_depth)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
@@ -117,17 +118,20 @@ def _of_lists(folder: Path) -> tuple[FrameFile, ...]:
     )
 
 
-def _of_pairs(file: Path) -> tuple[FrameFile, ...]:
+def _of_pairs(file: Path) -> tuple[tuple[FrameFile, ...], DepthFormat]:
+    """The frames, and the unit of their depth: who counts frames is no benchmark, and has millimetres."""
     pairs = read_pairs(file, "TIME")
     counted = all(time.is_integer() and abs(time) < MOST_FRAMES for time, *_ in pairs)
     if counted:
-        _warn(f"`{file}`: its first column counts frames; {FRAMES_PER_SECOND:g} a second are assumed")
+        rate = f"{FRAMES_PER_SECOND:g} a second"
+        _warn(f"`{file}`: its first column counts frames; {rate} are assumed, and depth in millimetres")
     depths = {
         (time / FRAMES_PER_SECOND if counted else time, file.parent / image): file.parent / depth
         for time, image, depth in pairs
     }
     images = _in_order(file, list(depths), frames=True)
-    return tuple(FrameFile(index, *image, depths[image]) for index, image in enumerate(images))
+    files = tuple(FrameFile(index, *image, depths[image]) for index, image in enumerate(images))
+    return files, MILLIMETRES if counted else FIVE_THOUSANDTHS
 
 
 def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
