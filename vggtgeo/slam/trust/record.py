@@ -33,7 +33,8 @@ def check_record(estimate: Estimate) -> list[Finding]:
     serious = 1 - share > MOST_LOST or bridging_error(estimate) > MOST_BRIDGED
     for first, last in stretches:
         start, end = int(estimate.frames[first]), int(estimate.frames[last])
-        text = f"frames {start} to {end} were lost; their poses are only predicted"
+        text = f"frames {start} to {end} were lost; they have no pose"
+        text = text if end > start else f"frame {start} was lost; it has no pose"
         found.append(Finding("lost", "degraded", text, start, end, local=not serious))
     if share < LEAST_TRACKED:
         found.append(Finding("lost", "failed", f"only {100 * share:.0f} % of the frames were tracked"))
