@@ -19,8 +19,7 @@ from vggtgeo.io.errors import InputError, InputWarning
 SAMPLES = 20
 """Frames that are decoded."""
 _NEAR, _FAR = 0.5, 6.5
-"""Metres: a room's median depth lies in between, as in the verdict of a run; millimetres taken for fifths of them mostly
-do not."""
+"""Metres: a room's median depth lies in between, as in the verdict; millimetres taken for fifths mostly do not."""
 _LEAST_DEPTH = 0.2
 """Share of pixels; depth cameras give 0.5 to 0.9 indoors."""
 _DARK = 8.0
