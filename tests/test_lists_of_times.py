@@ -73,7 +73,8 @@ def test_a_list_of_pairs_with_times_is_nobody_elses_benchmark(tmp_path: Path, na
     # Proves that a recording for ORB-SLAM2 keeps its own camera and times. Oracle: what was written; it was taken for
     # ICL-NUIM, with the camera of that.
     times = [f"{1305031102 + 0.04 * number:.6f}" for number in range(COUNT)]
-    sequence = open_sequence(_pairs(tmp_path / "own", times, name))
+    with pytest.warns(InputWarning, match=f"{name}`: depth is taken in 1/5000 m, .* millimetres need --depth-scale"):
+        sequence = open_sequence(_pairs(tmp_path / "own", times, name))
     assert type(sequence).__name__ == "TumRgbd"
     np.testing.assert_allclose(sequence.camera.intrinsics, tiny_sequences.INTRINSICS)
     frames = list(sequence.frames())

@@ -125,6 +125,8 @@ def _of_pairs(file: Path) -> tuple[tuple[FrameFile, ...], DepthFormat]:
     if counted:
         rate = f"{FRAMES_PER_SECOND:g} a second"
         _warn(f"`{file}`: its first column counts frames; {rate} are assumed, and depth in millimetres")
+    elif file.name != _PAIRS[0]:
+        _warn(f"`{file}`: depth is taken in 1/5000 m, as TUM RGB-D has it; millimetres need --depth-scale 1000")
     depths = {
         (time / FRAMES_PER_SECOND if counted else time, file.parent / image): file.parent / depth
         for time, image, depth in pairs
