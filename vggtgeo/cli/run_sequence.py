@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import time
 from collections.abc import Iterable, Mapping
@@ -82,7 +81,6 @@ def run_and_write(
         InputError: something that was given is wrong.
 
     """
-    gc.freeze()  # what is loaded lives as long as the program, and searching it for garbage takes 3 % of a run
     silent = output.quiet or output.as_json
     title = (title or sequence.name).encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
     console = Console(stderr=False, quiet=silent)

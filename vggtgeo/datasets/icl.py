@@ -5,6 +5,7 @@ mirrors the world; so the truth is mirrored, too, and errors are what they were.
 for RGB-D visual odometry, 3D reconstruction and SLAM", ICRA 2014.
 """
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -16,7 +17,7 @@ from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of
-from vggtgeo.datasets.tum import read_pairs
+from vggtgeo.datasets.tum import MOST_LETTERS, read_pairs
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 
@@ -38,7 +39,8 @@ class IclNuim(FolderSequence):
         if not file.is_file() or (folder / "rgb.txt").is_file():
             return False
         with file.open(encoding="utf-8", errors="replace") as lines:
-            words = lines.readline().split()
+            head = (line[:MOST_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
+            words = next(filter(None, head), [])
         counted = len(words) == 4 and words[0].isdecimal() and "depth" in words[1]
         return counted or any(folder.glob("*.gt.freiburg"))
 

@@ -55,9 +55,11 @@ class TumRgbd(FolderSequence):
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
-        file = list_of(folder)
-        listed = file is None or file.name == "rgb.txt"
-        files, coding = (_of_lists(folder), FIVE_THOUSANDTHS) if listed else _of_pairs(file)
+        pairs = list_of(folder)
+        if pairs is None or pairs.name == "rgb.txt":
+            files, coding = _of_lists(folder), FIVE_THOUSANDTHS
+        else:
+            files, coding = _of_pairs(pairs)
         width, height = common_size(str(folder), files)
         camera = (
             camera_from_folder(folder, width, height)
