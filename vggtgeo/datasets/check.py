@@ -18,8 +18,8 @@ from vggtgeo.io.errors import InputError, InputWarning
 
 SAMPLES = 20
 """Frames that are decoded."""
-_NEAR, _FAR = 0.5, 6.5
-"""Metres: a room's median depth lies in between, as in the verdict; millimetres taken for fifths mostly do not."""
+PLAUSIBLE = (0.5, 6.5)
+"""Metres, of a room's median depth, for the verdict of a run, too; millimetres taken for fifths mostly have less."""
 _LEAST_DEPTH = 0.2
 """Share of pixels; depth cameras give 0.5 to 0.9 indoors."""
 _DARK = 8.0
@@ -185,7 +185,7 @@ def _of_depth(sequence: Sequence, frames: list[Frame]) -> list[str]:
     if share < _LEAST_DEPTH:
         problems.append(f"only {100 * share:.0f} % of the pixels have depth")
     middle = float(np.median(np.concatenate([depth[np.isfinite(depth)][::7] for depth in depths])))
-    if not _NEAR <= middle <= _FAR:
+    if not PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
         problems.append(f"the median depth is {middle:.3g} m: is the unit of the depth files another one?")
     same = sum(np.array_equal(a, b, equal_nan=True) for a, b in itertools.pairwise(depths))
     if same:

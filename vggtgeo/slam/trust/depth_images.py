@@ -16,6 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from vggtgeo.datasets.check import PLAUSIBLE
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence, FrameEvidence, common
 from vggtgeo.slam.trust.finding import Finding, spans
@@ -32,8 +33,6 @@ NEAREST = 0.2
 """Metres: at most a tenth of the corners is nearer to a sensor for rooms."""
 SMALLEST_ROOM = 1.0
 """Metres: of the depths at corners, over the whole run, more than a twentieth is farther."""
-PLAUSIBLE = (0.5, 6.5)
-"""Metres, of the median over all frames of their median depth."""
 
 
 def check_frozen(estimate: Estimate, evidence: Evidence, harmless: bool) -> list[Finding]:
