@@ -31,6 +31,7 @@ from vggtgeo.slam.trust.speed import check_speed
 from vggtgeo.slam.trust.steps import breaks, check_steps, steps
 from vggtgeo.slam.trust.still_points import check_parts, divide
 from vggtgeo.slam.trust.surfaces import check_surfaces
+from vggtgeo.slam.trust.zoom import check_zoom
 
 
 def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
@@ -53,6 +54,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
         found += check_surfaces(slam.keyframes, estimate.intrinsics)
     if estimate.started:
         found += check_hand_over(slam)
+        found += check_zoom(slam)
     for piece in pieces_by_size(slam) if estimate.started else ():
         own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]
         found += check_matches(own, estimate.intrinsics, estimate.pieces == 1, estimate.metric)

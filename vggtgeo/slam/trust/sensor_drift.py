@@ -9,9 +9,7 @@ warms up. Where the lens zooms, that pose is wrong, and nothing is said of the d
 The logarithm of either factor is fitted to all pairs of a stretch of keyframes by a line over its first and one over
 its second half; the covariance is the sandwich over keyframes.
 
-Without measured depth nothing is asked: a map that was built with one focal length takes a slow zoom up by its depths
-and motions. With three focal lengths free, by time, the last adjustment of building-walk and redkitchen without depth
-found all three 1.05 and 1.16 times the given one where the last pictures are enlarged by 1.3.
+Without measured depth nothing is asked here: see `zoom.py`.
 """
 
 from __future__ import annotations
