@@ -6,8 +6,9 @@
 The first 40 frames of each clip, with depth and without: as they are; enlarged steadily, by 1.3 in the end, depth with
 them; enlarged at once, by 1.7 from the middle on; with depth that is longer and longer, by 1.4 in the end. ATE after
 SE(3) with depth, after Sim(3) without. Oracle: what was done. Lens, unit: the
-logarithms of their changes that the verdict measures, with their standard deviations; at once: of the largest single
-enlargement. They are what the bars of `vggtgeo/slam/trust/sensor_drift.py` and `enlargement.py` rest on.
+logarithms of their changes that the verdict measures, with depth with their standard deviations; at once: of the
+largest single enlargement. They are what the bars of `vggtgeo/slam/trust/sensor_drift.py`, without depth `zoom.py`, and
+`enlargement.py` rest on.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from vggtgeo.simulation.degradations import DEGRADATIONS
 from vggtgeo.slam.trust.enlargement import beyond_neighbours
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.sensor_drift import Change, changes
+from vggtgeo.slam.trust.zoom import largest_change
 
 CHANGES = {name: DEGRADATIONS[name] for name in ("base", "zooming", "changed_lens", "growing_depth")}
 COLUMNS = ("cm", "verdict", "lens", "unit", "at once", "reasons")
@@ -36,7 +38,9 @@ def cells(sequence: SequenceView) -> Iterator[str]:
         slam = result.record.slam
         measured = changes(slam, range(len(slam.keyframes)))
     told = ["" if one is None else f"{one.value:.3f} +- {one.sigma:.3f}" for one in measured]
-    yield from told or ("", "")
+    if not told:
+        told = ["" if result.record is None else f"{largest_change(result.record.slam)[0]:.3f}", ""]
+    yield from told
     recorder = EvidenceRecorder(sequence.camera)
     for frame in sequence.frames():
         recorder.add(frame)

@@ -56,23 +56,28 @@ def check_zoom(slam: Slam) -> list[Finding]:
     """A focal length that changes within some stretch of keyframes, the largest change of all."""
     if slam.metric:
         return []
-    largest: tuple[float, int, int] = (MOST_ZOOM, 0, 0)
-    for stretch in _stretches(slam):
-        lenses = focal_lengths(slam, stretch)
-        if lenses is None:
-            continue
-        change, first, second = lenses.largest_change()
-        if change > largest[0]:
-            frames = sorted((slam.keyframes[stretch[first]].frame, slam.keyframes[stretch[second]].frame))
-            largest = (change, frames[0], frames[1])
-    change, start, end = largest
-    if end == start:
+    change, start, end = largest_change(slam)
+    if change <= MOST_ZOOM:
         return []
     text = (
         f"the lens zooms: the focal length changes by about {100 * np.expm1(change):.0f} % between frames {start} and "
         f"{end}, and one is assumed for all"
     )
     return [Finding("calibration", "degraded", text, start, end)]
+
+
+def largest_change(slam: Slam) -> tuple[float, int, int]:
+    """Of the logarithm of the focal length within a stretch, as far as it is sure, and the frames between which; zero
+    where nothing is.
+    """
+    found = [(0.0, 0, 0)]
+    for stretch in _stretches(slam):
+        lenses = focal_lengths(slam, stretch)
+        if lenses is not None:
+            change, *places = lenses.largest_change()
+            start, end = sorted(slam.keyframes[stretch[place]].frame for place in places)
+            found.append((change, start, end))
+    return max(found)
 
 
 @dataclass(frozen=True, eq=False)
