@@ -109,13 +109,20 @@ def test_noise_is_no_zoom() -> None:
 
 def test_a_difference_must_be_sure_and_known() -> None:
     """Oracle: by hand, from values and covariances."""
-    value = np.array([0.0, 0.1, 0.0, 0.0, 0.3])
-    lenses = FocalLengths(value, np.diag([1e-4, 1e-4, 1e-4, 1e-4, KNOWN**2 * 1.1]))
-    assert lenses.largest_change()[0] == pytest.approx(0.1), "0.3 is of a keyframe that says nothing"
-    assert FocalLengths(value, 4.5 * np.diag([1e-4] * 4 + [1.0])).largest_change() == (0.0, 0, 0), "4.7 deviations"
-    shared = FocalLengths(value, 3.9e-4 * np.ones((5, 5)) + 1e-6 * np.eye(5))
-    assert shared.largest_change()[0] == pytest.approx(0.3), "what all share is no doubt of a difference"
-    assert FocalLengths(value, np.eye(5)).largest_change() == (0.0, 0, 0)
+    value = np.array([0.0, 0.0, 0.0, 0.1, 0.1, 0.3])
+    variance = [1e-4] * 5 + [KNOWN**2 * 1.1]
+    assert FocalLengths(value, np.diag(variance)).largest_change() == (pytest.approx(0.1), 0, 3), "0.3 is not known"
+    assert FocalLengths(value, 2.3 * np.diag(variance)).largest_change() == (0.0, 0, 0), "4.7 standard deviations"
+    shared = 3.9e-4 * np.ones((6, 6)) + 1e-6 * np.eye(6)
+    change = FocalLengths(value, shared).largest_change()[0]
+    assert change == pytest.approx(0.2), "what all share is no doubt of a difference; 0.2: the median of the last two"
+    assert FocalLengths(value, np.eye(6)).largest_change() == (0.0, 0, 0)
+
+
+def test_one_keyframe_is_no_zoom() -> None:
+    """Bad matches of one keyframe; oracle: its neighbours."""
+    value = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
+    assert FocalLengths(value, 1e-6 * np.eye(6)).largest_change()[0] == 0.0
 
 
 def test_few_keyframes_or_matches_say_nothing() -> None:

@@ -101,8 +101,11 @@ def moved(poses: np.ndarray, tangents: np.ndarray) -> np.ndarray:
 
 
 def adjoint(pose: np.ndarray) -> np.ndarray:
-    """`Ad(T)`, float64 [6, 6], tangents translation first."""
-    x, y, z = pose[:3, 3]
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation = pose[:3, :3]
-    return np.block([[rotation, skew @ rotation], [np.zeros((3, 3)), rotation]])
+    """`Ad(T)` of rigid motions [..., 4, 4], float64 [..., 6, 6], tangents translation first."""
+    x, y, z = np.moveaxis(pose[..., :3, 3], -1, 0)
+    none, rotation = np.zeros_like(x), pose[..., :3, :3]
+    skew = np.stack([none, -z, y, z, none, -x, -y, x, none], -1).reshape(rotation.shape)
+    found = np.zeros((*pose.shape[:-2], 6, 6))
+    found[..., :3, :3] = found[..., 3:, 3:] = rotation
+    found[..., :3, 3:] = skew @ rotation
+    return found

@@ -28,9 +28,9 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 
 MOST_ZOOM = 0.06
-"""Difference of the logarithms of two focal lengths of a stretch. Pieces of 40 to 60 frames of three clips have 0.016
-to 0.033 as they are; a focus that breathes by 2 % either way 0.04 to 0.05 and costs 1 to 4 cm more; by 5 %, 0.08 to
-0.11 and 5 to 11 cm; a zoom to 1.3 0.12 to 0.25 and 2 to 14 cm."""
+"""Difference of the logarithms of two focal lengths of a stretch. Pieces of 40 to 60 frames of three clips have 0.015
+to 0.024 as they are; a focus that breathes by 2 % either way at most 0.043, and costs 1 to 4 cm more; by 5 %, 0.08 to
+0.10 and 5 to 11 cm; a zoom to 1.3 0.12 to 0.21 and 2 to 14 cm."""
 SIGMAS = 5.0
 KNOWN = 0.02
 """Standard deviation of a log focal length beyond which that keyframe says nothing."""
@@ -88,12 +88,16 @@ class FocalLengths:
     covariance: np.ndarray
 
     def largest_change(self) -> tuple[float, int, int]:
-        """The largest difference that is sure, and between which two; zero where none is."""
+        """The largest difference that is sure, and between which two; zero where none is. The value of each is the
+        median of it and its neighbours: a lens moves on, and one keyframe of bad matches does not count.
+        """
         variance = np.diag(self.covariance)
         known = np.flatnonzero(variance < KNOWN**2)
         if len(known) < LEAST_KEYFRAMES:
             return 0.0, 0, 0
-        apart = np.abs(self.value[known, None] - self.value[known])
+        own = self.value[known]
+        value = np.array([np.median(own[max(place - 1, 0) : place + 2]) for place in range(len(own))])
+        apart = np.abs(value[:, None] - value)
         spread = variance[known, None] + variance[known] - 2 * self.covariance[np.ix_(known, known)]
         apart = np.where(apart > SIGMAS * np.sqrt(np.maximum(spread, 0.0)), apart, 0.0)
         first, second = np.unravel_index(np.argmax(apart), apart.shape)
@@ -130,12 +134,13 @@ def focal_lengths(slam: Slam, stretch: np.ndarray) -> FocalLengths | None:
 
 @dataclass(frozen=True, eq=False)
 class _Matches:
-    """host, target: int [m], keyframes of a stretch; point: int [m], of `depth`, log inverse depths [p]; before, after:
-    float64 [m, 2], pixels; intrinsics: of the run.
+    """host, target: int [m], keyframes of a stretch; edges: int [e], the first match of each edge; point: int [m], of
+    `depth`, log inverse depths [p]; before, after: float64 [m, 2], pixels; intrinsics: of the run.
     """
 
     host: np.ndarray
     target: np.ndarray
+    edges: np.ndarray
     point: np.ndarray
     before: np.ndarray
     after: np.ndarray
@@ -225,7 +230,8 @@ def _matches(slam: Slam, stretch: np.ndarray) -> _Matches | None:
     if np.count_nonzero(often) < LEAST_KEYFRAMES:
         return None
     _, first, point = np.unique(slots, return_index=True, return_inverse=True)
-    return _Matches(ends_of[:, 0], ends_of[:, 1], point, before, after, depth[first], intrinsics)
+    edges = np.cumsum([0, *(len(column[1]) for column in columns[:-1])])
+    return _Matches(ends_of[:, 0], ends_of[:, 1], edges, point, before, after, depth[first], intrinsics)
 
 
 def _linearise(seen: _Matches, unknowns: _Unknowns) -> _Linear:
@@ -242,8 +248,10 @@ def _linearise(seen: _Matches, unknowns: _Unknowns) -> _Linear:
     columns = np.concatenate([7 * seen.host[:, None] + np.arange(7), 7 * seen.target[:, None] + np.arange(7)], 1)
     weighted = by_frames * weight[:, None, None]
     frames, frames_side = np.zeros((size, size)), np.zeros(size)
-    np.add.at(frames, (columns[:, :, None], columns[:, None, :]), np.swapaxes(weighted, 1, 2) @ by_frames)
-    np.add.at(frames_side, columns, -np.einsum("mij,mi->mj", weighted, residual))
+    rows = columns[seen.edges]  # all matches of an edge touch the same two keyframes
+    squares = np.add.reduceat(np.swapaxes(weighted, 1, 2) @ by_frames, seen.edges)
+    np.add.at(frames, (rows[:, :, None], rows[:, None, :]), squares)
+    np.add.at(frames_side, rows, -np.add.reduceat(np.einsum("mij,mi->mj", weighted, residual), seen.edges))
     both = np.zeros((points, size))
     np.add.at(both, (seen.point[:, None], columns), np.einsum("mij,mi->mj", weighted, by_depth))
     total = lambda values: np.bincount(seen.point, weight * np.sum(values, 1), points)
@@ -271,20 +279,9 @@ def _derivatives(seen: _Matches, unknowns: _Unknowns) -> tuple[np.ndarray, np.nd
     rows = np.stack(pinhole.projection_rows(there, (1.0, 1.0, 0.0, 0.0))).transpose(2, 0, 1) * own[:, :, None]
     by_point = rows[:, :, :3]
     by_target = np.concatenate([by_point * inverse[:, None, None], rows[:, :, 3:]], 2)
-    by_host = -by_target @ _adjoints(relative)
+    by_host = -by_target @ rigid.adjoint(relative)
     off_centre = own * there[:, :2] / there[:, 2:]
     by_host_focal = np.einsum("mij,mj->mi", by_point, turned(np.column_stack([-at, np.zeros(len(at))])))
     by_frames = np.concatenate([by_host, by_host_focal[:, :, None], by_target, off_centre[:, :, None]], 2)
     by_depth = np.einsum("mij,mj->mi", by_point, shift)
     return off_centre + centre - seen.after, by_frames, by_depth
-
-
-def _adjoints(poses: np.ndarray) -> np.ndarray:
-    """`rigid.adjoint` of each, float64 [m, 6, 6]."""
-    x, y, z = poses[:, :3, 3].T
-    none = np.zeros_like(x)
-    skew = np.stack([none, -z, y, z, none, -x, -y, x, none], 1).reshape(-1, 3, 3)
-    found = np.zeros((len(poses), 6, 6))
-    found[:, :3, :3] = found[:, 3:, 3:] = poses[:, :3, :3]
-    found[:, :3, 3:] = skew @ poses[:, :3, :3]
-    return found
