@@ -140,6 +140,12 @@ def test_a_file_that_was_too_much_is_refused(row: int, tmp_path: Path) -> None:
         read(name, change, tmp_path)
 
 
+@pytest.mark.filterwarnings("ignore::vggtgeo.io.errors.InputWarning")
+def test_a_separator_behind_a_time_is_space(tmp_path: Path) -> None:
+    """`str.strip` takes U+001F away, `int` does not; oracle: no ValueError."""
+    read("EuRoC list", put(b"1403636579763555584,", b"1403636579763555584\x1f,"), tmp_path)
+
+
 @pytest.mark.filterwarnings("ignore:.*poses have a NaN")
 def test_a_pose_of_zeros_is_no_truth(tmp_path: Path) -> None:
     """ScanNet's lost frames hold infinities, other exporters write zeros; oracle: the warning."""

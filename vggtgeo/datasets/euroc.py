@@ -79,10 +79,10 @@ def _images(file: Path) -> list[tuple[float, str]]:
         text = line.split("#", 1)[0].strip()
         if not text:
             continue
-        time, _, name = text.partition(",")
-        if not time.strip().isdecimal() or len(time) > _MOST_DIGITS:
+        time, name = (part.strip() for part in text.partition(",")[::2])
+        if not time.isdecimal() or len(time) > _MOST_DIGITS:
             raise InputError(f"`{file}`, line {number}: found {text[:60]!r}; expected `nanoseconds,file`")
-        entries.append((int(time) * 1e-9, name.strip() or f"{time.strip()}.png"))
+        entries.append((int(time) * 1e-9, name or f"{time}.png"))
     return entries
 
 

@@ -79,7 +79,7 @@ class ScanNet(FolderSequence):
 
 
 def _number(image: Path, index: int) -> int:
-    return int(image.stem) if image.stem.isdigit() else index
+    return int(image.stem) if image.stem.isdecimal() else index
 
 
 def _depth(folder: Path, image: Path) -> Path | None:
