@@ -93,10 +93,12 @@ def kept() -> int:
 
 
 def contents() -> dict[str, object]:
-    """The files of the run, and of the summary what is no time; not the page, which tells times."""
+    """The files of the run, and of the summary what is no time; not the page, which tells times, nor the lock that a
+    run leaves, free, that is killed between its last file and its end.
+    """
     found: dict[str, object] = {}
     for path in sorted(Path("out").rglob("*")):
-        if path.is_file() and path.name not in ("report.html", "trajectory.png", "summary.json"):
+        if path.is_file() and path.name not in ("report.html", "trajectory.png", "summary.json", ".lock"):
             found[str(path)] = path.read_bytes()
     summary = json.loads(Path("out/summary.json").read_text())
     return found | {name: value for name, value in summary.items() if name not in DIFFERS and name != "settings"}
