@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_keyframe_depth import SIZE, keyframe
-from vggtgeo.models.roles import PointMatches
+from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.slam.covisibility import Pair, without_matches
 from vggtgeo.slam.factors import MeasuredRelativePose
@@ -35,7 +35,8 @@ def _walk(steps: list[float], across: dict[int, int] | None = None) -> Slam:
         pose[0, 3] = -place
         pixels = K[:2] * (world - [place, 0, 0])[:, :2] / depth[:, None] + K[2:]
         slots = Slots(pixels, 1 / depth, unknown, unknown, one, one)
-        keyframes.append(replace(keyframe(number, np.ones(SIZE), slots), pose=pose))
+        made = replace(keyframe(number, np.ones(SIZE), slots), pose=pose)
+        keyframes.append(replace(made, features=Features(pixels, one)))
     pairs, ties = [], []
     for second in range(1, len(keyframes)):
         for first in range(max(second - REACH, 0), second):
