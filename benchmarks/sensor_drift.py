@@ -20,9 +20,10 @@ from degraded_clips import judged, print_table
 
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.simulation.degradations import DEGRADATIONS
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.enlargement import beyond_neighbours
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
-from vggtgeo.slam.trust.sensor_drift import Change, changes
+from vggtgeo.slam.trust.sensor_drift import changes
 from vggtgeo.slam.trust.zoom import largest_change
 
 CHANGES = {name: DEGRADATIONS[name] for name in ("base", "zooming", "changed_lens", "growing_depth")}
@@ -33,19 +34,23 @@ def cells(sequence: SequenceView) -> Iterator[str]:
     """What came of it, and what was measured of the sensors."""
     result, error = judged(sequence)
     yield from (f"{100 * error:.1f}", result.verdict.level)
-    measured: tuple[Change | None, ...] = ()
-    if sequence.has_depth and result.record is not None:
-        slam = result.record.slam
-        measured = changes(slam, range(len(slam.keyframes)))
-    told = ["" if one is None else f"{one.value:.3f} +- {one.sigma:.3f}" for one in measured]
-    if not told:
-        told = ["" if result.record is None else f"{largest_change(result.record.slam)[0]:.3f}", ""]
-    yield from told
+    yield from _measured(sequence.has_depth, None if result.record is None else result.record.slam)
     recorder = EvidenceRecorder(sequence.camera)
     for frame in sequence.frames():
         recorder.add(frame)
     yield f"{beyond_neighbours(np.array([noted.enlarged for noted in recorder.frames], np.float64)).max():.3f}"
     yield "; ".join(result.verdict.reasons)
+
+
+def _measured(has_depth: bool, slam: Slam | None) -> tuple[str, str]:
+    """Of the lens and of the unit of depth."""
+    if slam is None:
+        return "", ""
+    if not has_depth:
+        return f"{largest_change(slam)[0]:.3f}", ""
+    lens, unit = changes(slam, range(len(slam.keyframes)))
+    told = lambda one: "" if one is None else f"{one.value:.3f} +- {one.sigma:.3f}"
+    return told(lens), told(unit)
 
 
 if __name__ == "__main__":

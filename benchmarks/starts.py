@@ -6,7 +6,8 @@
 
 A row a piece: its frames, how many were tracked, the ATE after Sim(3) (with `--depth`: SE(3)), the length of the true
 path, the share of matches that agree with the poses (`vggtgeo/slam/trust/contradicted.py`, the median pair of
-keyframes 1, 2, 3 and 5 apart), and the verdict. A stranger's video begins anywhere: at a wall, in a turn, in the middle
+keyframes 1, 2, 3 and 5 apart), without depth by how much the logarithm of the focal length seems to change
+(`vggtgeo/slam/trust/zoom.py`), and the verdict. A stranger's video begins anywhere: at a wall, in a turn, in the middle
 of a step.
 """
 
@@ -23,9 +24,10 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.simulation.degradations import Recording, compressed
 from vggtgeo.slam.trust.contradicted import median_shares
+from vggtgeo.slam.trust.zoom import largest_change
 
-HEADER = "| clip | frames | tracked | keyframes | ATE cm | path m | agreeing matches | verdict | reasons |\n" + (
-    "|---" * 9 + "|"
+HEADER = "| clip | frames | tracked | keyframes | ATE cm | path m | agreeing matches | lens | verdict | reasons |\n" + (
+    "|---" * 10 + "|"
 )
 
 
@@ -55,6 +57,7 @@ def _row(name: str, start: int, frames: int, result: vg.Result) -> str:
     assert result.record is not None
     keyframes, intrinsics = result.record.slam.keyframes, result.record.slam.intrinsics
     shares = median_shares(keyframes, intrinsics)
+    lens = "" if result.metric else f"{largest_change(result.record.slam)[0]:.3f}"
     error, length = float("nan"), float("nan")
     if result.record.truth is not None and len(result.trajectory) > 2:
         report = evaluate_trajectory(result.trajectory, result.record.truth)
@@ -66,7 +69,7 @@ def _row(name: str, start: int, frames: int, result: vg.Result) -> str:
     tracked = f"{result.summary['frames_tracked']}/{result.summary['frames']}"
     cells = (
         *(name, f"{start} to {start + frames - 1}", tracked, str(len(keyframes)), f"{error:.1f}", f"{length:.1f}"),
-        *(shares, result.verdict.level, "; ".join(result.verdict.reasons)),
+        *(shares, lens, result.verdict.level, "; ".join(result.verdict.reasons)),
     )
     return "| " + " | ".join(cells) + " |"
 

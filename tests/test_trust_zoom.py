@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from test_keyframe_depth import SIZE, keyframe
+from test_trust_sensor_drift import KEYFRAMES, Curve, K, grows, still
 from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
@@ -21,20 +21,7 @@ from vggtgeo.slam.trust import zoom
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.zoom import KNOWN, STRETCH, FocalLengths, check_zoom, focal_lengths
 
-K = np.array([500.0, 500.0, 320.0, 240.0])
-POINTS, REACH, KEYFRAMES = 80, 4, 20
-Curve = Callable[[float], float]
-"""The focal length, times that of the run, by the share of the run that is over."""
-
-
-def still(share: float) -> float:
-    """Nothing changes."""
-    return 1.0
-
-
-def grows(share: float) -> float:
-    """By 1.3 in the end."""
-    return 1.0 + 0.3 * share
+POINTS, REACH = 80, 4
 
 
 def breathes(share: float) -> float:

@@ -2,12 +2,11 @@
 
 A map that was built with one focal length takes a zoom up by its depths and motions, and ends with residuals that look
 like any others: building-walk without depth, enlarged by 1.3 over 40 frames, was 9 cm off and called good. So each
-stretch of keyframes is adjusted once more to its matches, with a focal length for each keyframe. A single
-one for the whole map, or three by time, do not tell: enlarged by 1.3, they ended 5 and 16 % longer, all three alike.
+stretch of keyframes is adjusted once more to its matches, with a focal length for each keyframe.
 
 Unknowns: pose (left tangent, translation first) and log factor on the focal lengths of each keyframe, log inverse depth
 of each key point in its host. Gauss-Newton with Cauchy weights, damped where a step does not serve; the depths are
-eliminated (Schur). First pose held; the unit of length is held by the damping alone.
+eliminated (Schur). First pose held; the unit of length is held by little (`UNIT_HELD`).
 
 With measured depth `sensor_drift.py` says more.
 """
@@ -28,15 +27,16 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 
 MOST_ZOOM = 0.065
-"""Difference of the logarithms of two focal lengths of a stretch. 20 pieces of 40 to 80 frames of three clips have at
-most 0.025 as they are, three more 0.045 to 0.049, two of these across white walls and a turn; a focus that breathes by
-2 % either way at most 0.043, and costs 1 to 4 cm more; by 5 %, 0.08 to 0.10 and 5 to 11 cm; a zoom to 1.3 0.12 to 0.21
-and 2 to 14 cm."""
+"""Difference of the logarithms of two focal lengths of a stretch. Pieces of 40 to 80 frames of three clips as they are
+(`benchmarks/starts.py`): 17 have at most 0.025, three 0.045 to 0.049, two of these across white walls and a turn. A
+focus that breathes (`benchmarks/edited_videos.py --frames 60`, and the same from other frames) by 2 % either way has at
+most 0.043, and costs 1 to 4 cm more; by 5 %, 0.08 to 0.10 and 5 to 11 cm, but 0.05 in 8 keyframes of redkitchen. A zoom
+to 1.3 (`benchmarks/sensor_drift.py`) has 0.12 to 0.21, and costs 2 to 14 cm."""
 SIGMAS = 5.0
 KNOWN = 0.02
 """Standard deviation of a log focal length beyond which that keyframe says nothing."""
 STRETCH = 40
-"""Keyframes that are asked together, every second of them in the next stretch, too."""
+"""Keyframes that are asked together; half of them are in the next stretch, too."""
 LEAST_KEYFRAMES = 4
 MOST_MATCHES = 12_000
 """Of a stretch, evenly thinned: more cost time and say no more."""
@@ -51,6 +51,10 @@ HELD = 1e-2
 ITERATIONS, SETTLED = 10, 0.002
 """At most; and the step of a log focal length below which there are no more, a fortieth of what is told."""
 LONGEST_DEPTH_STEP = 1.0
+UNIT_HELD = 1e-3
+"""Information on every step of a keyframe: it holds the unit of length, and a keyframe without a match."""
+BEHIND = 1e6
+"""Squared pixels that a point behind a camera costs."""
 
 
 def check_zoom(slam: Slam) -> list[Finding]:
@@ -179,13 +183,13 @@ class _Linear:
         side = self.frames_side - self.both.T @ (self.depths_side / depths)
         reduced[np.diag_indices(len(reduced))] *= 1 + damping
         own = np.zeros(len(side))
-        own[6:] = np.linalg.solve(reduced[6:, 6:] + 1e-3 * np.eye(len(side) - 6), side[6:])
+        own[6:] = np.linalg.solve(reduced[6:, 6:] + UNIT_HELD * np.eye(len(side) - 6), side[6:])
         return own.reshape(-1, 7), (self.depths_side - self.both @ own) / depths
 
     def focal_covariance(self) -> np.ndarray:
         """Of the log focal lengths, all else free, for matches of one pixel: float64 [n, n]."""
         reduced = (self.frames - (self.both.T / self.depths) @ self.both)[6:, 6:]
-        return np.asarray(np.linalg.inv(reduced + 1e-3 * np.eye(len(reduced)))[::7, ::7])
+        return np.asarray(np.linalg.inv(reduced + UNIT_HELD * np.eye(len(reduced)))[::7, ::7])
 
 
 def _stretches(slam: Slam) -> Iterable[np.ndarray]:
@@ -238,9 +242,10 @@ def _matches(slam: Slam, stretch: np.ndarray) -> _Matches | None:
 def _linearise(seen: _Matches, unknowns: _Unknowns) -> _Linear:
     residual, by_frames, by_depth = _derivatives(seen, unknowns)
     squared = np.sum(residual**2, 1)
-    weight = np.where(np.isfinite(squared), 1.0 / (1.0 + squared / ROBUST**2), 0.0)
-    cost = ROBUST**2 * float(np.sum(np.log1p(np.where(weight > 0, squared, 1e6) / ROBUST**2)))
-    good = weight > 0
+    good = np.isfinite(squared)
+    squared = np.where(good, squared, BEHIND)
+    weight = good / (1.0 + squared / ROBUST**2)
+    cost = ROBUST**2 * float(np.sum(np.log1p(squared / ROBUST**2)))
     residual, by_frames, by_depth = (
         np.where(good.reshape(-1, *([1] * (values.ndim - 1))), values, 0.0)
         for values in (residual, by_frames, by_depth)
