@@ -30,9 +30,9 @@ MOST_ZOOM = 0.065
 """Difference of the logarithms of two focal lengths of a stretch. Of 22 pieces of 60 and 80 frames of three clips as
 they are (`benchmarks/starts.py`) 19 have at most 0.025, three of building-walk 0.041 to 0.049, two of these across
 white walls and a turn; the first 40 frames of corridor-office 0.045. A focus that breathes
-(`benchmarks/edited_videos.py --frames 60`, and the same from other frames) by 2 % either way has at most 0.043, and costs 1 to 4 cm more; by 5 %,
-0.08 to 0.10 and 5 to 11 cm, but 0.05 in 8 keyframes of redkitchen. A zoom to 1.3 (`benchmarks/sensor_drift.py`) has
-0.12 to 0.21, and costs 2 to 14 cm."""
+(`benchmarks/edited_videos.py --frames 60`, and the same from other frames) by 2 % either way has at most 0.043, and
+costs 1 to 4 cm more; by 5 %, 0.08 to 0.10 and 5 to 11 cm, but 0.05 in 8 keyframes of redkitchen. A zoom to 1.3
+(`benchmarks/sensor_drift.py`) has 0.12 to 0.21, and costs 2 to 14 cm."""
 SIGMAS = 5.0
 KNOWN = 0.02
 """Standard deviation of a log focal length beyond which that keyframe says nothing."""
