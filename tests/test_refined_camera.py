@@ -13,7 +13,7 @@ import pytest
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.calibration import Refinement, free_focal, try_camera
-from vggtgeo.slam.camera_of_pairs import CameraPair, camera_of_pairs
+from vggtgeo.slam.camera_of_pairs import CameraPair, _Points, camera_of_pairs
 
 HELD = 1e-6
 """Relative standard deviation of a camera that is held, as in the pipeline."""
@@ -91,6 +91,23 @@ def test_a_lens_that_nobody_told_of_is_no_focal_length() -> None:
     assert opinion.value[3] == pytest.approx(-0.2, abs=0.02)
     assert abs(opinion.value[0]) < 0.01
     assert opinion.value[3] < -10 * opinion.sigma[3]
+
+
+def test_the_derivatives_of_pairs_are_those_of_their_residuals() -> None:
+    # Proves that a pixel's derivatives by the pose and by the camera, lens included, are right. Oracle: central
+    # differences. The lens is weak enough for its inverse, four iterations, to be one.
+    points = _Points.of(pairs(vg.simulate_window(seed=4, **WINDOW))[:3])
+    intrinsics, camera, poses = np.array([500.0, 490.0, 320.0, 240.0]), np.array([0.02, 3.0, -4.0, -0.01]), points.given
+    exact = points.linearized(poses, camera, intrinsics)
+    moved = lambda step: points.residuals(rigid.moved(poses, np.tile(step, (3, 1))), camera, intrinsics)
+    changed = lambda step: points.residuals(poses, camera + step, intrinsics)
+    for column, step in enumerate(1e-5 * np.eye(6)):
+        np.testing.assert_allclose(exact[:, :, column], (moved(step) - moved(-step)) / 2e-5, rtol=1e-4, atol=1e-3)
+    for column, size in enumerate((1e-5, 1e-2, 1e-2, 1e-5)):
+        step = size * np.eye(4)[column]
+        expected = (changed(step) - changed(-step)) / (2 * size)
+        np.testing.assert_allclose(exact[:, :, 6 + column], expected, rtol=1e-4, atol=1e-3)
+    np.testing.assert_array_equal(exact[:, :, 10], points.residuals(poses, camera, intrinsics))
 
 
 def test_matches_alone_tell_a_wrong_focal_length() -> None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import t as student_t
@@ -36,9 +37,6 @@ FARTHEST = 30.0
 PRIOR = np.array([0.5, 300.0, 300.0, 1.0])
 """Standard deviations: so weak that they only keep the problem solvable."""
 LONGEST_STEP = np.array([0.1, 30.0, 30.0, 0.1])
-POSE_STEPS = (1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5)
-CAMERA_STEPS = (1e-5, 1e-2, 1e-2, 1e-5)
-"""Of the numerical derivatives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,17 +135,73 @@ class _Points:
 
     def residuals(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
         """Predicted minus seen pixels float64 [n, 2]; NaN behind a camera. poses: float64 [pairs, 4, 4]."""
+        return self._carried(poses, value, intrinsics).pixels - self.after
+
+    def _carried(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Carried:
         focal = intrinsics[:2] * np.exp(value[0])
-        centre = intrinsics[2:] + value[1:3]
-        bent = (self.before - centre) / focal
+        bent = (self.before - intrinsics[2:] - value[1:3]) / focal
         x = bent
         for _ in range(4):  # the inverse of the lens by fixed-point iteration, as OpenCV does it
-            x = bent / (1 + value[3] * (x**2).sum(1, keepdims=True))
+            x = bent / _stretch(x, value[3])
+        turns = poses[self.pair, :3, :3]
         local = np.column_stack([x, np.ones(len(x))]) * self.depth[:, None]
-        points = np.einsum("nij,nj->ni", poses[self.pair, :3, :3], local) + poses[self.pair, :3, 3]
+        points = (turns @ local[:, :, None])[:, :, 0] + poses[self.pair, :3, 3]
         z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
         y = points[:, :2] / z[:, None]
-        return np.asarray(y * (1 + value[3] * (y**2).sum(1, keepdims=True)) * focal + centre - self.after)
+        return _Carried(bent, x, turns, points, z, y, y * _stretch(y, value[3]) * focal + intrinsics[2:] + value[1:3])
+
+    def linearized(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+        """Derivatives of the residuals by a left tangent of the pose (translation first) and by the camera, and the
+        residuals, float64 [n, 2, 6 + 4 + 1].
+        """
+        now = self._carried(poses, value, intrinsics)
+        focal = intrinsics[:2] * np.exp(value[0])
+        k1, doubled = value[3], 2.0 * value[3]
+        square = lambda points: np.sum(points**2, 1, keepdims=True)
+        # Before: how the ray moves with log f, cx, cy and k1, through the lens undone.
+        rays = np.zeros((len(self.depth), 2, PARAMETERS))
+        rays[:, :, 0] = -now.bent
+        rays[:, 0, 1], rays[:, 1, 2] = -1.0 / focal
+        rays[:, :, 3] = -now.x * square(now.x)
+        along = doubled * now.x / (_stretch(now.x, k1) + doubled * square(now.x))  # Sherman and Morrison
+        rays -= now.x[:, :, None] * np.einsum("ni,nik->nk", along, rays)[:, None]
+        rays /= _stretch(now.x, k1)[:, None]
+        # After: how the pixel moves with the point.
+        onto = np.zeros((len(self.depth), 2, 3))
+        onto[:, 0, 0] = onto[:, 1, 1] = 1.0
+        onto[:, :, 2] = -now.y
+        turned = np.einsum("ni,nij->nj", now.y, onto)
+        onto = _stretch(now.y, k1)[:, None] * onto + doubled * now.y[:, :, None] * turned[:, None]
+        onto *= (focal / now.z[:, None])[:, :, None]
+        rows = np.empty((len(self.depth), 2, 6 + PARAMETERS + 1))
+        rows[:, :, :3] = onto
+        rows[:, :, 3:6] = np.cross(now.points[:, None], onto)
+        rows[:, :, 6:10] = onto @ (now.turns[:, :, :2] @ rays) * self.depth[:, None, None]
+        rows[:, :, 6] += now.y * _stretch(now.y, k1) * focal
+        rows[:, 0, 7] += 1.0
+        rows[:, 1, 8] += 1.0
+        rows[:, :, 9] += now.y * square(now.y) * focal
+        rows[:, :, 10] = now.pixels - self.after
+        return rows
+
+
+class _Carried(NamedTuple):
+    """Pixels on their way to the other frame: on the plane at depth 1, bent by the lens and not [n, 2], turns of the
+    pairs [n, 3, 3], points in the other camera [n, 3], their depth [n], on its plane and in its image [n, 2].
+    """
+
+    bent: np.ndarray
+    x: np.ndarray
+    turns: np.ndarray
+    points: np.ndarray
+    z: np.ndarray
+    y: np.ndarray
+    pixels: np.ndarray
+
+
+def _stretch(points: np.ndarray, k1: float) -> np.ndarray:
+    """The factor of the lens at points [n, 2] of the plane at depth 1, float64 [n, 1]."""
+    return 1.0 + k1 * np.sum(points**2, 1, keepdims=True)
 
 
 def _costs(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
@@ -178,15 +232,8 @@ class _Reduced:
 
 
 def _reduce(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Reduced:
-    residual = points.residuals(poses, value, intrinsics)
-    columns = []
-    for size, row in zip(POSE_STEPS, np.eye(6), strict=True):
-        beside = rigid.moved(poses, np.tile(size * row, (len(poses), 1)))
-        columns.append((points.residuals(beside, value, intrinsics) - residual) / size)
-    for size, row in zip(CAMERA_STEPS, np.eye(4), strict=True):
-        columns.append((points.residuals(poses, value + size * row, intrinsics) - residual) / size)
-    rows = np.stack([*columns, residual], 2)  # [n, 2, 11]
-    size = np.linalg.norm(residual, axis=1)
+    rows = points.linearized(poses, value, intrinsics)
+    size = np.linalg.norm(rows[:, :, 10], axis=1)
     good = np.isfinite(rows).all((1, 2)) & (size < FARTHEST)
     weight = np.where(good, np.minimum(HUBER / np.maximum(size, 1e-9), 1.0), 0.0)
     rows = np.where(good[:, None, None], rows, 0.0) * np.sqrt(weight)[:, None, None]
