@@ -56,7 +56,9 @@ def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
     assert slam.camera_found
     assert (slam.lens, slam.focal_without_lens) == (LENS, 300.0)
     assert slam.intrinsics.tolist() == slam.given_intrinsics.tolist() == list(LENS.intrinsics)
-    assert not slam.calibrated, "the last adjustment estimates it once more"
+    for focal in (280.0, 5000.0):
+        far = replace(slam, given_intrinsics=np.array([focal, focal, 158.0, 121.0]))
+        assert not far.calibrated, "the last adjustment estimates it once more"
     assert (slam.frames, slam.keyframes, slam.factors) == ((), (), ())
     assert "280.0 px (images of 320 x 240) and a lens that distorts, k1 -0.100" in slam.notes[0]
     plain = begun(monkeypatch, found())
@@ -103,10 +105,13 @@ def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.M
 
 
 def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that a map of few keyframes, frames that were lost, and a focal length that is none give no camera.
+    # Proves that a map of few keyframes, without depth fewer than ten, with it fewer than three, frames that were lost,
+    # and a focal length that is none give no camera.
     whole = found()
-    assert begun(monkeypatch, whole) is not None
-    assert begun(monkeypatch, replace(whole, keyframes=whole.keyframes[:-3])) is None
+    for metric, least in ((False, 10), (True, 3)):
+        of = lambda count, metric=metric: replace(whole, metric=metric, keyframes=whole.keyframes[:count])
+        assert begun(monkeypatch, of(least)) is not None
+        assert begun(monkeypatch, of(least - 1)) is None
     lost = tuple(replace(record, tracked=row > 5) for row, record in enumerate(whole.frames))
     assert begun(monkeypatch, replace(whole, frames=lost)) is None
     assert begun(monkeypatch, replace(whole, intrinsics=np.array([1e6, 1e6, 160.0, 120.0]))) is None

@@ -78,6 +78,7 @@ def full(slam: Slam) -> Slam:
         focal_wanted=np.array([140.0, 141.0]),
         readout=Readout(0.02, False, 3.0),
         focal_without_lens=150.0,
+        focal_with_lens=130.0,
     )
 
 

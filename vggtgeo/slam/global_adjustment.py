@@ -166,11 +166,14 @@ def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, 
 
 
 def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
-    """The state of the run with its lens taken out, if that pays, and a word on it."""
-    if found is None or not found.pays:
-        return slam
+    """The state of the run with its lens taken out, if that pays, and a word on it; else with what it would change."""
+    if found is None or np.isinf(found.warp):
+        return replace(slam, focal_with_lens=None)
+    if not found.pays:
+        return replace(slam, focal_with_lens=found.camera.intrinsics[0])
     without = float(slam.intrinsics[0])
-    adjusted = replace(undistorted(_taken(slam, adjustment, found.state), found.camera), focal_without_lens=without)
+    adjusted = undistorted(_taken(slam, adjustment, found.state), found.camera)
+    adjusted = replace(adjusted, focal_without_lens=without, focal_with_lens=None)
     k1, k2, *_ = found.camera.distortion
     note = (
         f"nobody gave the camera, and its lens distorts: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "

@@ -119,7 +119,8 @@ class Slam:
     they explain matches no better than chance. readout: of the rolling shutter that the last adjustment found and took
     out of the poses (`rolling_shutter.py`); pixels and images stay as they were read. between: rows of the last frames,
     and their views, that wait for the next keyframe (`frame_refinement.py`). focal_without_lens: the focal length, in
-    pixels, that the frames by which `lens` was found had told before it.
+    pixels, that the frames by which `lens` was found had told before it. focal_with_lens: the one that the last
+    adjustment found with a lens that it did not take.
     """
 
     intrinsics: np.ndarray
@@ -151,6 +152,7 @@ class Slam:
     readout: Readout | None = None
     between: tuple[tuple[int, RgbdView], ...] = ()
     focal_without_lens: float | None = None
+    focal_with_lens: float | None = None
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)
@@ -165,7 +167,8 @@ class Slam:
     @property
     def calibrated(self) -> bool:
         """Whether the camera was given, not guessed."""
-        return bool(self.intrinsics_sigma[0] < 0.1 * self.given_intrinsics[0])
+        # A focal length that was found can be so long that the guess was sure of a tenth of it.
+        return bool(not self.camera_found and self.intrinsics_sigma[0] < 0.1 * self.given_intrinsics[0])
 
     @property
     def ties(self) -> tuple[MeasuredRelativePose, ...]:

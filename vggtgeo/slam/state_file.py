@@ -67,7 +67,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 9
+VERSION = 10
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -119,6 +119,12 @@ def _with_focal_without_lens(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
+def _with_focal_with_lens(header: Header) -> Header:
+    """Version 9 did not keep what the focal length would be with a lens that was tried and not taken."""
+    tree, classes = with_field(header["tree"], header["classes"], "Slam", "focal_with_lens")
+    return {**header, "tree": tree, "classes": classes}
+
+
 UPGRADES = {
     1: _with_recorded_times,
     2: _with_lens,
@@ -128,6 +134,7 @@ UPGRADES = {
     6: _with_readout,
     7: _with_second_motions,
     8: _with_focal_without_lens,
+    9: _with_focal_with_lens,
 }
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)

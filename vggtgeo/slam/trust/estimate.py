@@ -27,7 +27,8 @@ class Estimate:
     doubt, without any match; None: no frame. focal_wanted: focal lengths that the last adjustment found if they are
     free, float64 [2], pixels; None where that explained nothing. readout: of the rolling shutter that was found.
     in_known_map: whether the run began in the map of an earlier one. guessed: whether nobody gave the camera, and too
-    little was seen to find it. focal_without_lens: pixels, by the frames that told of a lens, before it was found.
+    little was seen to find it. focal_without_lens: pixels, by the frames that told of a lens, before it was found;
+    focal_with_lens: that of a lens that was tried and not taken. camera_found: `given` is what a first pass found.
     """
 
     frames: np.ndarray
@@ -48,6 +49,8 @@ class Estimate:
     in_known_map: bool = False
     guessed: bool = False
     focal_without_lens: float | None = None
+    focal_with_lens: float | None = None
+    camera_found: bool = False
 
     @classmethod
     def of(cls, slam: Slam) -> Self:
@@ -73,6 +76,8 @@ class Estimate:
             any(keyframe.frame < 0 for keyframe in slam.keyframes),
             not (slam.calibrated or slam.camera_found) and len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA,
             slam.focal_without_lens,
+            slam.focal_with_lens,
+            slam.camera_found,
         )
 
     def __len__(self) -> int:
@@ -86,4 +91,4 @@ class Estimate:
     @property
     def calibrated(self) -> bool:
         """Whether the intrinsics were given, not guessed."""
-        return bool(self.sigma[0] < GUESSED * self.given[0])
+        return bool(not self.camera_found and self.sigma[0] < GUESSED * self.given[0])

@@ -22,6 +22,7 @@ from vggtgeo.slam.trust.extent import check_extent
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
 from vggtgeo.slam.trust.islands import check_islands
 from vggtgeo.slam.trust.pace import pace
+from vggtgeo.slam.trust.parallax import check_parallax
 from vggtgeo.slam.trust.record import check_record
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
 from vggtgeo.slam.trust.scale_hand_over import check_hand_over
@@ -54,6 +55,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
         found += check_surfaces(slam.keyframes, estimate.intrinsics)
     if estimate.started:
         found += check_hand_over(slam)
+        found += check_parallax(slam)
         found += check_zoom(slam)
     for piece in pieces_by_size(slam) if estimate.started else ():
         own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]
