@@ -79,14 +79,16 @@ def test_a_wrong_transforms_file_is_told(tmp_path: Path, change: dict[str, objec
         open_sequence(folder)
 
 
-def test_images_that_were_listed_elsewhere_are_found_by_their_names(tmp_path: Path) -> None:
-    # Proves that a list made on another computer, outside its folder, reads the images that lie here. Oracle: the same
-    # recording as it was listed.
+@pytest.mark.parametrize("ending", ["", ".JPEG", None])
+def test_images_that_were_listed_elsewhere_are_found_by_their_names(tmp_path: Path, ending: str | None) -> None:
+    # Proves that a list made on another computer, outside its folder, reads the images that lie here, and if they were
+    # converted since, or listed without an ending. Oracle: the same recording as it was listed.
     folder = tiny.nerfstudio(tmp_path / "scene")
     plain = list(tiny.quietly_opened(folder).frames())
     content = json.loads((folder / "transforms.json").read_text())
     for frame in content["frames"]:
-        frame["file_path"] = "..\\slides\\" + Path(frame["file_path"]).name
+        name = Path(frame["file_path"])
+        frame["file_path"] = "..\\slides\\" + (name.name if ending is None else name.stem + ending)
     (folder / "transforms.json").write_text(json.dumps(content))
     for one, other in zip(tiny.quietly_opened(folder).frames(), plain, strict=True):
         np.testing.assert_array_equal(one.image, other.image)

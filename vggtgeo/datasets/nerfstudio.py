@@ -13,7 +13,7 @@ The poses are those of another program (COLMAP, ARKit), often of free scale: no 
 import math
 import statistics
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -98,12 +98,8 @@ def _listed(value: object, what: str) -> list[Any]:
 
 
 def _image(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path:
-    """The image of a frame; some writers leave its ending out."""
-    path = _below(folder, file, "file_path", frame.get("file_path"))
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
-        endings = (path.with_name(path.name + suffix) for suffix in sorted(IMAGE_SUFFIXES))
-        path = next((one for one in endings if one.is_file()), path)
-    return path
+    """The image of a frame; some writers leave its ending out, and some images were converted since."""
+    return _below(folder, file, "file_path", frame.get("file_path"), sorted(IMAGE_SUFFIXES))
 
 
 def _depth(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path | None:
@@ -113,18 +109,23 @@ def _depth(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path | None:
     return None
 
 
-def _below(folder: Path, file: Path, key: str, name: object) -> Path:
+def _below(folder: Path, file: Path, key: str, name: object, endings: Collection[str] = ()) -> Path:
     """A file below the folder: a list from a stranger opens nothing else. One that was listed elsewhere, before
-    somebody copied the folder, is searched by its name, here and in `images`.
+    somebody copied the folder, is searched by its name, here and in `images`; one that is nowhere, with other endings.
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise InputError(f"`{file}`: `{key}` of a frame is {name!r}; expected the name of a file in the folder")
     path = Path(name.replace("\\", "/"))
     listed = [] if path.is_absolute() or ".." in path.parts else [path]
     places = [folder / place for place in (*listed, Path("images") / path.name, Path(path.name))]
-    found = next((place for place in places if place.is_file()), None)
+    bare = lambda place: place.stem if place.suffix.lower() in endings else place.name
+    others = [place.with_name(bare(place) + ending) for place in places for ending in endings]
+    found = next((place for place in (*places, *others) if place.is_file()), None)
     if found is None and not listed:
-        raise InputError(f"`{file}`: `{key}` is {name!r}; expected a file below the folder of `{FILE}`")
+        raise InputError(
+            f"`{file}`: `{key}` is {name!r}; expected a file below the folder of `{FILE}`: neither it nor its folder "
+            f"`images` has a `{path.name}`"
+        )
     return found or places[0]
 
 
