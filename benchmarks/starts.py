@@ -3,12 +3,15 @@
     python benchmarks/starts.py ../shared/data/building-walk ../shared/data/corridor-office ../shared/data/icl-office
     python benchmarks/starts.py ../shared/data/redkitchen --frames 80 --every 60
     python benchmarks/starts.py ../shared/data/building-walk --frames 80 --first 160 --jpeg 95
+    python benchmarks/starts.py ../shared/data/icl-office --frames 52 --first 8 --depth --uncalibrated
 
 A row a piece: its frames, how many were tracked, the ATE after Sim(3) (with `--depth`: SE(3)), the length of the true
 path, the share of matches that agree with the poses (`vggtgeo/slam/trust/contradicted.py`, the median pair of
-keyframes 1, 2, 3 and 5 apart), without depth by how much the logarithm of the focal length seems to change
-(`vggtgeo/slam/trust/zoom.py`), and the verdict. A stranger's video begins anywhere: at a wall, in a turn, in the middle
-of a step.
+keyframes 1, 2, 3 and 5 apart), without depth by how much the logarithm of the focal length seems to change (`zoom.py`
+there), the degrees that the parallax of nine in ten points does not exceed (`parallax.py`), the focal length, and the
+verdict. With `--uncalibrated`, which tells nobody the camera, the focal length is followed by that of the other model:
+with a lens that was not taken, or without the one that was. A stranger's video begins anywhere: at a wall, in a turn,
+in the middle of a step.
 """
 
 from __future__ import annotations
@@ -17,17 +20,22 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 import vggtgeo as vg
 from vggtgeo.benchmark.inputs import DegradedWalk
 from vggtgeo.datasets import Sequence, open_sequence, without_depth
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.simulation.degradations import Recording, compressed
 from vggtgeo.slam.trust.contradicted import median_shares
+from vggtgeo.slam.trust.parallax import best_parallax
 from vggtgeo.slam.trust.zoom import largest_change
 
-HEADER = "| clip | frames | tracked | keyframes | ATE cm | path m | agreeing matches | lens | verdict | reasons |\n" + (
-    "|---" * 10 + "|"
+HEADER = (
+    "| clip | frames | tracked | keyframes | ATE cm | path m | agreeing matches | lens | parallax | focal px | verdict "
+    "| reasons |\n" + "|---" * 12 + "|"
 )
 
 
@@ -49,15 +57,22 @@ def _piece(sequence: Sequence, start: int, options: argparse.Namespace) -> Seque
     if options.jpeg is not None:
         frames = [replace(frame, image=compressed(frame.image, options.jpeg)) for frame in frames]
     assert truth is not None
-    walk = DegradedWalk(sequence.name, Recording(frames, sequence.camera, truth))
-    return SequenceView(walk, sequence.camera, sequence.has_depth)
+    camera = sequence.camera
+    if options.uncalibrated:
+        camera = Camera.guess(camera.width, camera.height)
+    walk = DegradedWalk(sequence.name, Recording(frames, camera, truth))
+    return SequenceView(walk, camera, sequence.has_depth)
 
 
 def _row(name: str, start: int, frames: int, result: vg.Result) -> str:
     assert result.record is not None
-    keyframes, intrinsics = result.record.slam.keyframes, result.record.slam.intrinsics
-    shares = median_shares(keyframes, intrinsics)
-    lens = "" if result.metric else f"{largest_change(result.record.slam)[0]:.3f}"
+    slam = result.record.slam
+    shares = median_shares(slam.keyframes, slam.intrinsics)
+    lens = "" if result.metric else f"{largest_change(slam)[0]:.3f}"
+    best = best_parallax(slam)
+    parallax = "" if best is None else f"{np.rad2deg(best):.1f}"
+    others = (slam.focal_with_lens, slam.focal_without_lens)
+    focal = ", ".join(f"{value:.1f}" for value in (slam.intrinsics[0], *others) if value is not None)
     error, length = float("nan"), float("nan")
     if result.record.truth is not None and len(result.trajectory) > 2:
         report = evaluate_trajectory(result.trajectory, result.record.truth)
@@ -68,8 +83,8 @@ def _row(name: str, start: int, frames: int, result: vg.Result) -> str:
         error = 100 * alignment.statistics.rmse
     tracked = f"{result.summary['frames_tracked']}/{result.summary['frames']}"
     cells = (
-        *(name, f"{start} to {start + frames - 1}", tracked, str(len(keyframes)), f"{error:.1f}", f"{length:.1f}"),
-        *(shares, lens, result.verdict.level, "; ".join(result.verdict.reasons)),
+        *(name, f"{start} to {start + frames - 1}", tracked, str(len(slam.keyframes)), f"{error:.1f}", f"{length:.1f}"),
+        *(shares, lens, parallax, focal, result.verdict.level, "; ".join(result.verdict.reasons)),
     )
     return "| " + " | ".join(cells) + " |"
 
@@ -82,6 +97,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--first", type=int, default=0, help="frame from which the first piece goes")
     parser.add_argument("--jpeg", type=int, help="compress the images once more, with this quality")
     parser.add_argument("--depth", action="store_true", help="use the depth of the clips")
+    parser.add_argument("--uncalibrated", action="store_true", help="do not use their cameras")
     return parser.parse_args()
 
 

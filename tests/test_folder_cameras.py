@@ -68,6 +68,8 @@ def test_a_renamed_folder_of_tum_says_in_its_list_what_it_is(tmp_path: Path) -> 
         ({"integer_depth_scale": 0}, r"`integer_depth_scale` is 0; it must be positive"),
         ({"frames": [{"file_path": "../../secret.png"}]}, r"`file_path` is '../../secret.png'; expected a file below"),
         ({"frames": [{"file_path": 7}]}, r"`file_path` of a frame is 7"),
+        ({"frames": [{"file_path": "/"}]}, r"`file_path` of a frame is '/'; expected the name"),
+        ({"frames": [{"file_path": "/far/" + "x" * 300 + ".png"}]}, r"nor its folder `images` has a `xxx"),
     ],
 )
 def test_a_wrong_transforms_file_is_told(tmp_path: Path, change: dict[str, object], told: str) -> None:

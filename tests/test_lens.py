@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recorded_run import ROLES, SETTINGS
+from recorded_run import ROLES, SETTINGS, recorded_run
+from same_leaves import differences
 from vggtgeo.models import pinhole
 from vggtgeo.models.classical import NoDepth, SiftMatcher
 
@@ -23,11 +24,13 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import SquarePinhole
+from vggtgeo.slam.global_adjustment import _taken_lens
 from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust import judge as judging
+from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import FrameEvidence
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
@@ -116,6 +119,20 @@ def test_few_keyframes_tell_no_lens() -> None:
     assert enough is not None
     assert few.needed == float("inf")
     assert enough.needed < float("inf")
+
+
+def test_a_lens_that_is_not_taken_leaves_its_focal_length() -> None:
+    # Proves that the state keeps what a lens would change that matches do not ask for, for the verdict to tell, and
+    # forgets it where the next adjustment finds none, or one that folds the image. Oracle: the lens.
+    slam = settled(recorded_run().states[-1])
+    assert slam.solved is not None
+    adjustment, state = slam.solved
+    left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
+    kept = _taken_lens(slam, adjustment, left_out)
+    assert kept.focal_with_lens == LENS.intrinsics[0] == Estimate.of(kept).focal_with_lens
+    assert list(differences(replace(kept, focal_with_lens=None), slam)) == []
+    for found in (None, replace(left_out, warp=float("inf"))):
+        assert _taken_lens(kept, adjustment, found).focal_with_lens is None
 
 
 def test_a_lens_that_folds_the_image_is_none() -> None:

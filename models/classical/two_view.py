@@ -56,12 +56,12 @@ class TwoViewStart:
             turned = self._only_turned(rays_i[agrees], rays_j[agrees], intrinsics)
             reason = GeometryResult.LOW_PARALLAX if turned else GeometryResult.TOO_FEW_INLIERS
             return _failed(len(pixels_i), reason)
-        parallax = median_parallax(points[inliers], pose)
-        if parallax < self.parallax or self._only_turned(rays_i[inliers], rays_j[inliers], intrinsics):
-            return StartGuess(pose, points, inliers, parallax, GeometryResult.LOW_PARALLAX)
+        angle = median_parallax(points[inliers], pose)
+        if angle < self.parallax or self._only_turned(rays_i[inliers], rays_j[inliers], intrinsics):
+            return StartGuess(pose, points, inliers, angle, GeometryResult.LOW_PARALLAX)
         if self._has_rival(pose, pixels_i, pixels_j, intrinsics):
-            return StartGuess(pose, points, inliers, parallax, GeometryResult.AMBIGUOUS)
-        return StartGuess(pose, points, inliers, parallax, GeometryResult.SUCCESS)
+            return StartGuess(pose, points, inliers, angle, GeometryResult.AMBIGUOUS)
+        return StartGuess(pose, points, inliers, angle, GeometryResult.SUCCESS)
 
     def _has_rival(self, pose: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> bool:
         """Whether a motion that a plane would have, and that goes elsewhere, explains nearly as many matches."""
@@ -174,11 +174,18 @@ def _triangulate(
     return np.where(good[:, None], midpoint, np.nan), good
 
 
-def median_parallax(points: np.ndarray, pose: np.ndarray) -> float:
-    """Median angle, radians, between the rays to points [n, 3] (first camera) from the first and the second camera."""
+def parallax(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Angles, radians, float64 [n], between the rays to points [n, 3] (first camera) from the first camera and from the
+    second, whose pose is first -> second.
+    """
     second = points - (-pose[:3, :3].T @ pose[:3, 3])
     cosine = (points * second).sum(axis=1) / (np.linalg.norm(points, axis=1) * np.linalg.norm(second, axis=1))
-    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def median_parallax(points: np.ndarray, pose: np.ndarray) -> float:
+    """The median of these angles."""
+    return float(np.median(parallax(points, pose)))
 
 
 def _rotation_between(rays_i: np.ndarray, rays_j: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ The poses are those of another program (COLMAP, ARKit), often of free scale: no 
 """
 
 import math
+import os
 import statistics
 import warnings
 from collections.abc import Collection, Mapping
@@ -113,14 +114,15 @@ def _below(folder: Path, file: Path, key: str, name: object, endings: Collection
     """A file below the folder: a list from a stranger opens nothing else. One that was listed elsewhere, before
     somebody copied the folder, is searched by its name, here and in `images`; one that is nowhere, with other endings.
     """
-    if not isinstance(name, str) or not name or "\0" in name:
+    path = Path(name.replace("\\", "/")) if isinstance(name, str) else Path()
+    if not path.name or "\0" in str(path):
         raise InputError(f"`{file}`: `{key}` of a frame is {name!r}; expected the name of a file in the folder")
-    path = Path(name.replace("\\", "/"))
     listed = [] if path.is_absolute() or ".." in path.parts else [path]
     places = [folder / place for place in (*listed, Path("images") / path.name, Path(path.name))]
     bare = lambda place: place.stem if place.suffix.lower() in endings else place.name
     others = [place.with_name(bare(place) + ending) for place in places for ending in endings]
-    found = next((place for place in (*places, *others) if place.is_file()), None)
+    # Not `Path.is_file`: a name may be too long for it.
+    found = next((place for place in (*places, *others) if os.path.isfile(place)), None)
     if found is None and not listed:
         raise InputError(
             f"`{file}`: `{key}` is {name!r}; expected a file below the folder of `{FILE}`: neither it nor its folder "

@@ -28,8 +28,8 @@ LEAST_KEYFRAMES = 10
 """Without depth; as many as a window has: the camera of fewer is estimated from all of them while the run goes on, too.
 101 frames of icl-office, images alone, have six keyframes and hardly any parallax: 516 px (481 is true). With depth
 three tell it, as many as the last adjustment needs: 52 of these frames had 480.6 px in the end, but each pose the
-camera of its moment, 0.89 cm off in all; with a first pass 480.5 px and 0.08 cm. Two pieces of redkitchen, 6 and 9
-keyframes: the turn beside the truth's leaps by up to 0.9 and 1.1 degrees from frame to frame, now by 0.3 and 0.9."""
+camera of its moment, 0.89 cm off in all; with a first pass 480.5 px and 0.08 cm (`benchmarks/starts.py
+../shared/data/icl-office --frames 52 --first 8 --depth --uncalibrated`)."""
 MOST_PASSES, SETTLED = 3, 0.03
 """Of the same frames, and how far the focal length may be from the one that they were tracked with, relative. With a
 lens of k1 = -0.25, images alone: corridor-office 843 px and no lens after the first pass, 517 px and -0.20 after the

@@ -21,6 +21,16 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 LEAST_TO_FIND_A_CAMERA = 3
 """Keyframes; as many as the last adjustment needs."""
+GUESSED = 0.1
+"""A prior on the focal length that is wider than this share of it stands for a guess."""
+
+
+def was_given(given: np.ndarray, sigma: np.ndarray, found: bool) -> bool:
+    """Whether a prior of the intrinsics, mean and standard deviation in pixels, is that of a camera that was given.
+
+    found: by a first pass, maybe so far from the guess that this one's `sigma` is a small share of it.
+    """
+    return bool(not found and sigma[0] < GUESSED * given[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,8 +177,7 @@ class Slam:
     @property
     def calibrated(self) -> bool:
         """Whether the camera was given, not guessed."""
-        # A focal length that was found can be so long that the guess was sure of a tenth of it.
-        return bool(not self.camera_found and self.intrinsics_sigma[0] < 0.1 * self.given_intrinsics[0])
+        return was_given(self.given_intrinsics, self.intrinsics_sigma, self.camera_found)
 
     @property
     def ties(self) -> tuple[MeasuredRelativePose, ...]:

@@ -81,8 +81,9 @@ phone: 0.22 (792 px, 989 with a lens, 803 by all of the video), and the camera t
 good; a walk straight on 0.14; four sources that came out right 0.01 to 0.06."""
 MOST_BY_UNTAKEN_LENS = 0.2
 """The same of a lens that matches do not ask for by more than chance. A head-mounted fisheye (f 208 by COLMAP), four
-keyframes: 368 px, 213 with a lens, 8.8 degrees off and called good. Sixteen pieces of the clips without calibration,
-with depth and without: at most 0.12 (redkitchen, five keyframes: 562 and 501 px, 525 is true)."""
+keyframes: 368 px, 213 with a lens, 8.8 degrees off and called good. Pieces of redkitchen without calibration, four
+with depth and four without (`benchmarks/starts.py --uncalibrated --frames 54 --first 8 --every 120 [--depth]`): at most
+0.08; its first 40 frames without: 0.12 (562 and 501 px in five keyframes, 525 is true)."""
 CONFIRMED = 0.3
 """Of that distance: what images that know it to a fifth of it want at most, if the given camera is theirs after all."""
 

@@ -10,10 +10,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.connected import pieces_by_size
 from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Readout, Slam
-
-GUESSED = 0.1
-"""A prior on the focal length that is wider than this share of it stands for a guess."""
+from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Readout, Slam, was_given
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,4 +88,4 @@ class Estimate:
     @property
     def calibrated(self) -> bool:
         """Whether the intrinsics were given, not guessed."""
-        return bool(not self.camera_found and self.sigma[0] < GUESSED * self.given[0])
+        return was_given(self.given, self.sigma, self.camera_found)

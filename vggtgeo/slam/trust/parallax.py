@@ -11,13 +11,15 @@ from __future__ import annotations
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.models.classical.two_view import TwoViewStart, parallax
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 
-LEAST_PARALLAX = float(np.deg2rad(1.0))
-"""Radians, half of what a start needs. In seven maps without depth that came out right nine in ten points have at most
-2.7 degrees (two keyframes) to 17."""
+LEAST_PARALLAX = TwoViewStart.parallax / 2.0
+"""Radians, half of what a start needs: 1 degree. Ten pieces of three clips of which a map came have 7 to 18
+(`benchmarks/starts.py`: building-walk and corridor-office, `--every 60`; redkitchen, `--frames 54 --first 8 --every
+120`), a start of 101 frames of icl-office with two keyframes 2.7."""
 BEST = 0.9
 """Share of the points whose largest parallax is compared with it."""
 
@@ -26,14 +28,20 @@ def check_parallax(slam: Slam) -> list[Finding]:
     """A map without depth in which hardly any point was seen from two sides."""
     if slam.metric:
         return []
-    found = largest_parallax(slam)
-    if not len(found) or (best := float(np.quantile(found, BEST))) >= LEAST_PARALLAX:
+    best = best_parallax(slam)
+    if best is None or best >= LEAST_PARALLAX:
         return []
     text = (
         f"the map rests on hardly any parallax: {100 * BEST:.0f} % of its points were seen under no more than "
         f"{np.rad2deg(best):.1f} degrees, where turns look like sideways motion; the camera may have stood still"
     )
     return [Finding("parallax", "degraded", text)]
+
+
+def best_parallax(slam: Slam) -> float | None:
+    """Radians that `BEST` of the points do not exceed; None where no two keyframes share any."""
+    found = largest_parallax(slam)
+    return float(np.quantile(found, BEST)) if len(found) else None
 
 
 def largest_parallax(slam: Slam) -> np.ndarray:
@@ -53,7 +61,5 @@ def _parallax(host: Keyframe, other: Keyframe, slots: np.ndarray, intrinsics: np
     """The angle at the host's points, float64 [m]; NaN where their depth is not known."""
     inverse = host.points.inverse_depth[slots]
     inverse = np.where(inverse > 0, inverse, np.nan)
-    points = rigid.unproject(host.points.pixels[slots], inverse, host.pose, intrinsics)
-    one, two = (points - rigid.centre(keyframe.pose) for keyframe in (host, other))
-    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
-    return np.asarray(np.arccos(np.clip(np.sum(one * two, axis=1) / lengths, -1.0, 1.0)))
+    points = rigid.unproject(host.points.pixels[slots], inverse, np.eye(4), intrinsics)
+    return parallax(points, other.pose @ rigid.invert(host.pose))
