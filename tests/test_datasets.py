@@ -8,6 +8,7 @@ import numpy as np
 import picture_bytes as bytes_of
 import pytest
 import tiny_sequences as tiny
+from tiny_layouts import matroska
 
 from vggtgeo.cli.run import open_input
 from vggtgeo.datasets import (
@@ -216,6 +217,18 @@ def test_video_colours_are_rgb(tmp_path: Path) -> None:
     frame = next(iter(open_sequence(tmp_path / "red.avi").frames()))
     assert frame.image[..., 0].mean() > 150
     assert frame.image[..., 2].mean() < 50
+
+
+@pytest.mark.parametrize(
+    ("shown", "across"), [(None, 64), ((64, 48), 64), ((96, 48), 96), ((48, 48), 48), ((9000, 1), 64)]
+)
+def test_the_guess_of_a_video_has_its_pixels(tmp_path: Path, shown: tuple[int, int] | None, across: int) -> None:
+    # Proves that pixels which the container says to be wider than high make a guess of two focal lengths, and that an
+    # impossible word on them counts as none. Oracle: the guess of the picture as a player shows it, `across` wide.
+    with pytest.warns(GuessedCameraWarning):
+        camera = open_sequence(matroska(tmp_path / "clip.mkv", (0, 100, 200), shown)).camera
+    assert not camera.known
+    assert camera.intrinsics == pytest.approx(Camera.guess(across, 48).resized(64, 48).intrinsics, rel=1e-6)
 
 
 def _video(path: Path, levels: list[int]) -> Path:

@@ -93,6 +93,22 @@ def test_depth_of_floats_is_in_metres(tmp_path: Path, suffix: str) -> None:
     assert next(iter(with_depth_scale(sequence, 2.0).frames())).depth[3, 7] == pytest.approx(1.007 / 2)
 
 
+def test_depth_of_a_phone_is_enlarged_to_the_images(tmp_path: Path) -> None:
+    # Proves that depth of fewer pixels and the same shape is used, told, and that of another shape is not. Oracle: what
+    # was written.
+    folder = tiny.rgbd(tmp_path / "phone")
+    for file in sorted((folder / "depth").iterdir()):
+        tiny_sequences.write_image(file, tiny_sequences.depth_codes(int(file.stem), 20, 15))
+    with pytest.warns(InputWarning, match="20 x 15 pixels; the colour images are 40 x 30: taken for the same view"):
+        frames = list(open_sequence(folder).frames())
+    assert frames[1].depth.shape == (tiny_sequences.HEIGHT, tiny_sequences.WIDTH)
+    assert [frames[1].depth[3, column] for column in (6, 7, 8)] == pytest.approx([1.013, 1.013, 1.014])
+    for file in sorted((folder / "depth").iterdir()):
+        tiny_sequences.write_image(file, tiny_sequences.depth_codes(int(file.stem), 20, 16))
+    with pytest.raises(InputError, match="register the depth to the images"):
+        open_sequence(folder)
+
+
 def test_pictures_of_which_one_is_called_depth_are_pictures(tmp_path: Path) -> None:
     # Proves that a folder is one of RGB-D only where half of the images have a depth.
     folder = tiny.rgbd(tmp_path / "own", "{}.png", "other/{}.png")
@@ -415,6 +431,14 @@ def test_bags_of_ros(tmp_path: Path, ros2: bool) -> None:
     assert sequence.camera.distortion == (0.1, -0.02, 0.0, 0.0, 0.0)
     assert sequence.ground_truth().positions[:, 0].tolist() == [0, 1, 2]
     assert [frame.timestamp for frame in frames] == pytest.approx([50.0, 50.1, 50.2])
+
+
+def test_a_bag_of_a_camera_that_nobody_calibrated(tmp_path: Path) -> None:
+    # Proves that a `CameraInfo` of zeros is no camera. Oracle: the guess.
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    with pytest.warns(InputWarning, match="no intrinsics found"):
+        sequence = open_sequence(tiny.bag(tmp_path / "a.bag", ros2=False, calibrated=False))
+    assert not sequence.camera.known
 
 
 def test_a_stream_is_read_until_it_ends(tmp_path: Path) -> None:

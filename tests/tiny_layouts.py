@@ -259,7 +259,7 @@ def bonn(folder: Path) -> Path:
     return folder
 
 
-def bag(path: Path, ros2: bool) -> Path:
+def bag(path: Path, ros2: bool, calibrated: bool = True) -> Path:
     """Images 0.1 s apart, depth in millimetres 5 ms later, the camera, and the truth of a marker."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
@@ -293,7 +293,7 @@ def bag(path: Path, ros2: bool) -> Path:
                 step = len(data) // HEIGHT
                 image_kind = kinds["sensor_msgs/msg/Image"]
                 write(topic, time + later, image_kind(header(time + later), HEIGHT, WIDTH, encoding, 0, step, data))
-            write("/camera/color/camera_info", time, _camera_info(kinds, header(time), ros2))
+            write("/camera/color/camera_info", time, _camera_info(kinds, header(time), ros2, calibrated))
             place = kinds["geometry_msgs/msg/Point"](float(number), 0.0, 0.0)
             turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
             value = kinds["geometry_msgs/msg/Pose"](place, turn)
@@ -306,18 +306,19 @@ def _header(kinds: dict, time: float, ros2: bool) -> object:
     return kinds["std_msgs/msg/Header"](stamp, "c") if ros2 else kinds["std_msgs/msg/Header"](0, stamp, "c")
 
 
-def _camera_info(kinds: dict, header: object, ros2: bool) -> object:
+def _camera_info(kinds: dict, header: object, ros2: bool, calibrated: bool) -> object:
     fx, fy, cx, cy = INTRINSICS
-    matrix = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
+    matrix = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]) * calibrated
     region = kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     values = (np.array([0.1, -0.02, 0.0, 0.0, 0.0]), matrix, np.eye(3).ravel(), np.zeros(12))
     return kinds["sensor_msgs/msg/CameraInfo"](header, HEIGHT, WIDTH, "plumb_bob", *values, 0, 0, region)
 
 
-def matroska(path: Path, milliseconds: tuple[int, ...]) -> Path:
+def matroska(path: Path, milliseconds: tuple[int, ...], shown: tuple[int, int] | None = None) -> Path:
     """A video of 64 x 48 pixels with frames at just these times, as phones record them: brightness tells the number.
 
-    Written by hand (Matroska with Motion JPEG), as OpenCV's writer knows one rate only.
+    shown: width and height that players are to draw it with. Written by hand (Matroska with Motion JPEG), as OpenCV's
+    writer knows one rate only.
     """
 
     def element(name: str, content: bytes) -> bytes:
@@ -330,6 +331,7 @@ def matroska(path: Path, milliseconds: tuple[int, ...]) -> Path:
     head += element("4282", b"matroska") + number("4287", 4) + number("4285", 2)
     info = number("2AD7B1", 1_000_000) + element("4D80", b"t") + element("5741", b"t")
     picture = number("B0", 64) + number("BA", 48)
+    picture += b"" if shown is None else number("54B0", shown[0]) + number("54BA", shown[1])
     track = number("D7", 1) + number("73C5", 1) + number("83", 1) + element("86", b"V_MJPEG") + element("E0", picture)
     blocks = b""
     for row, time in enumerate(milliseconds):

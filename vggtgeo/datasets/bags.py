@@ -210,6 +210,8 @@ def _camera(reader: Any, topics: dict[str, str], colour: str, width: int, height
         if message is None or (message.width, message.height) != (width, height):
             continue
         matrix = np.reshape(message.K if hasattr(message, "K") else message.k, (3, 3))
+        if not matrix.any():  # as the message's definition has it: uncalibrated
+            continue
         values = np.asarray(message.D if hasattr(message, "D") else message.d, float)
         distortion = check_distortion(values if len(values) in (4, 5, 8) and values.any() else ())
         return Camera(

@@ -6,7 +6,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
+import cv2
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
@@ -51,6 +53,9 @@ class FolderSequence:
     depth_format: DepthFormat = MILLIMETRES
     has_depth: bool = False
 
+    depth_of_fewer_pixels: ClassVar[bool] = False
+    """Whether depth of fewer pixels than the images and the same shape is enlarged to them."""
+
     def __post_init__(self) -> None:
         for file in self.files:
             if not math.isfinite(file.timestamp):
@@ -78,7 +83,9 @@ class FolderSequence:
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
-        return read_depth(path, self.depth_format)
+        depth = read_depth(path, self.depth_format)
+        size = self.camera.width, self.camera.height
+        return enlarged(depth, size) if self.depth_of_fewer_pixels and _is_of_fewer_pixels(depth, *size) else depth
 
     def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
         empty = 0
@@ -156,13 +163,15 @@ def common_size(name: str, files: Sequence[FrameFile]) -> tuple[int, int]:
     return Counter(sizes).most_common(1)[0][0]
 
 
-def depth_is_usable(name: str, files: Sequence[FrameFile], coding: DepthFormat, width: int, height: int) -> bool:
+def depth_is_usable(
+    name: str, files: Sequence[FrameFile], coding: DepthFormat, width: int, height: int, of_fewer_pixels: bool = False
+) -> bool:
     """Whether the sequence has depth to work with: files, of the images' size, with a valid pixel in one of
     them.
 
     Looks at the first, middle and last file, and at the others only while no valid pixel has been seen.
     InputError where the depth has another size than the images; an InputWarning where no pixel of any file is
-    valid.
+    valid. of_fewer_pixels: depth of fewer pixels will do, if it has the shape of the images; an InputWarning says so.
     """
     with_depth = [file for file in files if file.depth is not None]
     reason = ""
@@ -173,18 +182,34 @@ def depth_is_usable(name: str, files: Sequence[FrameFile], coding: DepthFormat, 
         except InputError as error:
             reason = reason or f" ({error})"
             continue
-        if depth.shape != (height, width):
+        of_fewer = of_fewer_pixels and _is_of_fewer_pixels(depth, width, height)
+        if depth.shape != (height, width) and not of_fewer:
             raise InputError(
                 _other_size(file.depth, depth, width, height) + ": register the depth to the images, or leave it out "
                 "with --rgb-only"
             )
         if np.isfinite(depth).any():
+            if of_fewer:
+                _warn(_other_size(file.depth, depth, width, height) + ": taken for the same view, and enlarged to them")
             return True
     if with_depth:
         gone = not any(file.depth is not None and file.depth.exists() for file in with_depth)
         what = f"is there: `{with_depth[0].depth}`, ..." if gone else f"has a valid pixel{reason}"
         _warn(f"`{name}`: none of the {len(with_depth)} depth images {what}; reading the images only")
     return False
+
+
+def enlarged(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Depth of another number of pixels in the same view, float32 [height, width]: each pixel takes the nearest."""
+    if depth.shape == size[::-1]:
+        return depth
+    return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+
+
+def _is_of_fewer_pixels(depth: np.ndarray, width: int, height: int) -> bool:
+    """Whether depth [h, w] has the shape of images of this size, to a pixel, in fewer: that of a phone's LiDAR."""
+    rows, columns = depth.shape
+    return columns < width and abs(columns * height / width - rows) < 1
 
 
 def _spread(files: Sequence[FrameFile]) -> list[FrameFile]:

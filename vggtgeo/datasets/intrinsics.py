@@ -159,11 +159,12 @@ def published_camera(name: str, width: int, height: int) -> Camera | None:
     return Camera(check_intrinsics(intrinsics), width, height, distortion)
 
 
-def guess_with_warning(name: str, width: int, height: int) -> Camera:
+def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float = 1.0) -> Camera:
     """A guessed camera, `known` False, and a GuessedCameraWarning that says so."""
-    camera = Camera.guess(width, height)
+    camera = Camera.guess(width, height, pixel_aspect)
+    focal = " and ".join(dict.fromkeys(f"{value:.0f}" for value in camera.intrinsics[:2]))
     warnings.warn(
-        f"`{name}`: no intrinsics found; starting from a guess, f = {camera.intrinsics[0]:.0f} pixels: put "
+        f"`{name}`: no intrinsics found; starting from a guess, f = {focal} pixels: put "
         f"`fx fy cx cy` into a file `{CALIBRATION}` beside the images, or give --intrinsics fx,fy,cx,cy",
         GuessedCameraWarning,
         stacklevel=3,

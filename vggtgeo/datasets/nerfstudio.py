@@ -21,11 +21,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
-from vggtgeo.datasets.phones import enlarged
 from vggtgeo.datasets.pose_files import read_json, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory

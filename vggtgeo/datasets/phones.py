@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, read_depth
 from vggtgeo.datasets.images import natural_key
@@ -152,13 +152,6 @@ class ArkitScenes(FolderSequence):
         poses[:, :3, :3] = Rotation.from_rotvec(rows[:, 1:4]).as_matrix()
         poses[:, :3, 3] = rows[:, 4:]
         return trajectory_of(rows[:, 0], np.linalg.inv(poses), file)
-
-
-def enlarged(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Depth of another number of pixels in the same view, float32 [height, width]: each pixel takes the nearest."""
-    if depth.shape == size[::-1]:
-        return depth
-    return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
 
 
 def _odometry(folder: Path) -> np.ndarray:

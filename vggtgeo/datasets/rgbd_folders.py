@@ -38,7 +38,10 @@ class RgbdFolders(FolderSequence):
 
     A depth belongs to the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), of the nearest
     time within 0.02 s where names are times, or of the same place in the list. Times are as in a folder of images.
+    Depth of fewer pixels, as of a phone's LiDAR, is enlarged to the images if it has their shape.
     """
+
+    depth_of_fewer_pixels = True
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -78,7 +81,7 @@ class RgbdFolders(FolderSequence):
             or camera_from_folder(colour, width, height)
             or guess_with_warning(str(folder), width, height)
         )
-        has_depth = depth_is_usable(str(folder), files, MILLIMETRES, width, height)
+        has_depth = depth_is_usable(str(folder), files, MILLIMETRES, width, height, cls.depth_of_fewer_pixels)
         return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth)
 
     def ground_truth(self) -> Trajectory | None:

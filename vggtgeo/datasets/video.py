@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.intrinsics import MOST_ASPECT, camera_from_folder, guess_with_warning
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
@@ -53,8 +53,9 @@ class VideoFile:
             rate = capture.get(cv2.CAP_PROP_FPS)
             stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
             count = int(stated) if math.isfinite(stated) else 1
+            aspect = _pixel_aspect(capture)
         height, width = image.shape[:2]
-        camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height)
+        camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
         known_rate = math.isfinite(rate) and 0 < rate < 1000
         return cls(path, path.name, camera, rate if known_rate else _FALLBACK_RATE, max(count, 1))
 
@@ -140,6 +141,17 @@ class VideoFile:
             return index / self.given_rate
         time = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         return time if math.isfinite(time) and time > previous else previous + 1.0 / self.rate
+
+
+def _pixel_aspect(capture: Any) -> float:
+    """Width of a pixel over its height, as the container says (1440 x 1080 are shown as 16:9); 1 where it says none, or
+    what is none.
+    """
+    across, down = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    if capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90:  # OpenCV has turned the frames, not these
+        across, down = down, across
+    known = across > 0 and down > 0 and 1 / MOST_ASPECT <= across / down <= MOST_ASPECT
+    return across / down if known else 1.0
 
 
 def _stands_alone(capture: Any) -> bool:

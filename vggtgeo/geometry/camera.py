@@ -65,12 +65,15 @@ class Camera:
         check_sides(self.width, self.height)
 
     @classmethod
-    def guess(cls, width: int, height: int) -> Self:
-        """A starting guess for an unknown lens: 60 degrees across the longer side, centred, square pixels."""
+    def guess(cls, width: int, height: int, pixel_aspect: float = 1.0) -> Self:
+        """A starting guess for an unknown lens: 60 degrees across the longer side, as it is shown, and centred.
+
+        pixel_aspect: width of a pixel over its height.
+        """
         check_sides(width, height)
-        focal = 0.5 * max(width, height) / math.tan(0.5 * GUESSED_FIELD_OF_VIEW)
+        focal = 0.5 * max(width * pixel_aspect, height) / math.tan(0.5 * GUESSED_FIELD_OF_VIEW)
         centre = 0.5 * (width - 1), 0.5 * (height - 1)
-        return cls((focal, focal, *centre), width, height, known=False)
+        return cls((focal / pixel_aspect, focal, *centre), width, height, known=False)
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:

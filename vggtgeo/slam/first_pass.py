@@ -20,6 +20,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pipeline import begin
+from vggtgeo.slam.pixel_aspect import are_square
 from vggtgeo.slam.run import finish, run_frames
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Slam
@@ -93,7 +94,8 @@ def _note(found: Slam, passes: int, camera: Camera) -> str:
     times = "a first pass" if passes == 1 else f"{passes} first passes"
     text = (
         f"nobody gave the camera: {times} over {len(found.frames)} frames found a focal length of {focal} px "
-        f"(images of {camera.width} x {camera.height})"
+        f"({'images' if are_square(found.intrinsics) else 'pixels that are not square, images'} of "
+        f"{camera.width} x {camera.height})"
     )
     if found.lens is None:
         return text

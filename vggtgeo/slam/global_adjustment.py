@@ -18,6 +18,7 @@ from vggtgeo.slam.factors import Factor, MeasuredRelativePose, factor_terms
 from vggtgeo.slam.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.global_shape import GlobalShape, global_solver, shape_of
 from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, undistorted
+from vggtgeo.slam.pixel_aspect import are_square, find_aspect
 from vggtgeo.slam.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
 from vggtgeo.slam.settings import SlamSettings
@@ -81,7 +82,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             camera = replace(camera, mean=slam.intrinsics)
         if estimated:  # and held from here on: see `_of_any_camera`
             held = settings.camera.known_intrinsics_sigma * slam.intrinsics[0]
-            camera = replace(camera, sigma=np.full(4, held))
+            camera = replace(camera, sigma=np.full(4, held), kind=_of_pixels(slam.intrinsics))
     sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
     return replace(slam, pose_sigma=sigma)
 
@@ -123,14 +124,37 @@ def _with_its_camera(
     if slam.calibrated:
         found = try_camera(keyframe_pairs(slam, edges), adjustment.problem, state, again)
         return _taken_camera(slam, adjustment, found, settings)
+    slam, adjustment, state = _with_its_pixels(slam, adjustment, state, again)
     if slam.lens is not None or not can_undistort(slam):
         return slam
     return _taken_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, again))
 
 
+def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
+    """The state after a trial whether the pixels of a guessed camera are square; with what was adjusted last, and its
+    solution.
+    """
+    if adjustment.problem.camera is not SquarePinhole:
+        return slam, adjustment, state
+    found = find_aspect(adjustment.problem, state, solve)
+    if found is None or not found.pays:
+        return slam, adjustment, state
+    adjustment = replace(adjustment, problem=found.problem)
+    slam = _taken(slam, adjustment, found.state)
+    fx, fy = slam.intrinsics[:2]
+    note = f"nobody gave the camera, and its pixels are not square: fx, fy = {fx:.1f}, {fy:.1f} px"
+    return replace(slam, notes=(*slam.notes, note)), adjustment, found.state
+
+
 def camera_of(slam: Slam) -> type[Pinhole | SquarePinhole]:
-    """The model that the last adjustment has of the camera: a guessed one has square pixels."""
-    return Pinhole if slam.calibrated else SquarePinhole
+    """The model that the last adjustment has of the camera: a guessed one has square pixels, unless a first pass found
+    that they are not.
+    """
+    return Pinhole if slam.calibrated else _of_pixels(slam.given_intrinsics)
+
+
+def _of_pixels(intrinsics: np.ndarray) -> type[Pinhole | SquarePinhole]:
+    return SquarePinhole if are_square(intrinsics) else Pinhole
 
 
 def _edges(slam: Slam, settings: SlamSettings) -> list[Directed]:

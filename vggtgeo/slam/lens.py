@@ -23,7 +23,7 @@ from jaxtyping import Float
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.geometry.camera import Camera, Undistorter
-from vggtgeo.geometry.cameras import SquareRadialTangential
+from vggtgeo.geometry.cameras import RadialTangential, SquarePinhole, SquareRadialTangential
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.camera_gain import gain
@@ -62,49 +62,51 @@ class FoundLens:
 
 
 def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solve) -> FoundLens | None:
-    """The lens, from a map that was adjusted with square pixels and no distortion; None where what comes out is no
-    camera.
+    """The lens, from a map that was adjusted without distortion; None where what comes out is no camera.
 
-    problem, state: that adjustment, its camera a `SquarePinhole`. size: height and width of the images. solve: adjusts
-    any problem.
+    problem, state: that adjustment, its camera a `SquarePinhole` or a `Pinhole`. size: height and width of the images.
+    solve: adjusts any problem.
     """
-    with_lens = _with_lens(problem)
-    none = jnp.zeros(len(SquareRadialTangential.names) - 3)
+    with_lens, square = _with_lens(problem), problem.camera is SquarePinhole
+    pinhole = len(problem.camera.names)
+    none = jnp.zeros(len(with_lens.camera.names) - pinhole)
     start = eqx.tree_at(lambda s: s.intrinsics, state, jnp.concatenate([state.intrinsics, none]))
     found = solve(with_lens, start)
-    f, cx, cy, *distortion = (float(value) for value in found.intrinsics)
-    if not (f > 0 and np.isfinite([f, cx, cy, *distortion]).all()):
+    parameters = [float(value) for value in found.intrinsics]
+    fx, fy, cx, cy, *distortion = [parameters[0], *parameters] if square else parameters
+    if not (min(fx, fy) > 0 and np.isfinite(parameters).all()):
         return None
     height, width = size
-    camera = Camera((f, f, cx, cy), width, height, tuple(distortion), known=False)
+    camera = Camera((fx, fy, cx, cy), width, height, tuple(distortion), known=False)
     # Both cameras have seen all matches: two numbers for thousands of them are no reason to set some aside.
     present = np.asarray(problem.points.present())
-    better, needed = gain((problem, state), (with_lens, found), present, fitted=len(SquareRadialTangential.names) - 2)
-    ideal = eqx.tree_at(lambda s: s.intrinsics, found, found.intrinsics[:3])
+    better, needed = gain((problem, state), (with_lens, found), present, fitted=pinhole + 2)
+    ideal = eqx.tree_at(lambda s: s.intrinsics, found, found.intrinsics[:pinhole])
     return FoundLens(camera, ideal, better, needed, largest_shift(camera))
 
 
 def _with_lens(problem: Problem) -> Problem:
     """The same problem with a camera whose radial distortion is free."""
     prior = problem.intrinsics_prior
-    names = SquareRadialTangential.names
+    kind = SquareRadialTangential if problem.camera is SquarePinhole else RadialTangential
+    names, more = kind.names, len(kind.names) - len(problem.camera.names)
     wider = IntrinsicsPrior(
         index=jnp.arange(len(names)),
-        mean=jnp.concatenate([prior.mean, jnp.zeros(len(names) - 3)]),
-        weight=jnp.concatenate([prior.weight, jnp.full(len(names) - 3, 1 / RADIAL**2)]),
+        mean=jnp.concatenate([prior.mean, jnp.zeros(more)]),
+        weight=jnp.concatenate([prior.weight, jnp.full(more, 1 / RADIAL**2)]),
     )
     held = jnp.asarray([name in ("p1", "p2") for name in names])
-    return replace(problem.with_term(wider), camera=SquareRadialTangential, fixed_intrinsics=held)
+    return replace(problem.with_term(wider), camera=kind, fixed_intrinsics=held)
 
 
 def largest_shift(camera: Camera) -> float:
     """The most that the lens moves a pixel of its images, pixels; infinite where it folds them before the middle of
     their farthest side. A fold in the corners costs no more than those: k1 = -0.25 does that to redkitchen.
     """
-    fx, _, cx, cy = camera.intrinsics
+    fx, fy, cx, cy = camera.intrinsics
     k1, k2, *_ = camera.distortion
-    sides = max(cx, camera.width - cx), max(cy, camera.height - cy)
-    side, corner = max(sides) / fx, np.hypot(*sides) / fx
+    sides = max(cx, camera.width - cx) / fx, max(cy, camera.height - cy) / fy
+    side, corner = max(sides), np.hypot(*sides)
     # Ideal radii up to a corner's, and half as far again: a barrel's corner is farther out than it looks.
     radius = np.linspace(0.0, 1.5 * corner, 300)
     drawn = radius * (1 + k1 * radius**2 + k2 * radius**4)

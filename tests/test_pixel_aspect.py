@@ -1,0 +1,200 @@
+"""Pixels that are not square, of a camera that nobody calibrated, are found. Truth: what images were squeezed by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from recorded_run import SETTINGS, recorded_run
+
+import vggtgeo as vg
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.datasets import Frame
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.slam import global_adjustment
+from vggtgeo.slam.global_adjustment import adjust_all, camera_of
+from vggtgeo.slam.lens import find_lens
+from vggtgeo.slam.pixel_aspect import FoundAspect, find_aspect
+
+WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
+_solve = eqx.filter_jit(vg.solve)
+
+
+def solve(problem: Problem, state: State) -> State:
+    return _solve(problem, state).state
+
+
+def rolling(seed: int) -> vg.SimulatedWindow:
+    """A window whose cameras roll by up to 17 degrees either way. On its arc, which is level, any stretch of heights
+    is as good as any other: with it the focal length downwards is not known.
+    """
+    window = vg.simulate_window(seed=seed, **WINDOW)
+    seen, start = window.observations, rigid.to_matrix(window.start)
+    angles = np.random.default_rng(seed).uniform(-0.3, 0.3, len(start))
+    turns = rigid.moved(np.tile(np.eye(4), (len(start), 1, 1)), np.outer(angles, np.eye(6)[5]))
+    centre = window.intrinsics[2:]
+    assert window.intrinsics[0] == window.intrinsics[1]
+    turned = lambda pixels, of: np.einsum("nij,nj->ni", turns[of, :2, :2], pixels - centre) + centre
+    target = seen.edges[seen.point_edge, 1]
+    seen = replace(seen, pixel=turned(seen.pixel, seen.host), point_target=turned(seen.point_target, target))
+    return replace(window, observations=seen, start=rigid.to_quaternion(turns @ start))
+
+
+def drawn(window: vg.SimulatedWindow, squeeze: float, *distortion: float) -> vg.SimulatedWindow:
+    """Its key points and matches as a lens draws them, in images of `squeeze` times the width."""
+    lens = vg.RadialTangential(jnp.asarray([*window.intrinsics, *(distortion or (0.0, 0.0)), 0.0, 0.0]))
+    straight = vg.Pinhole(jnp.asarray(window.intrinsics))
+    bent = lambda pixels: np.asarray(
+        jax.vmap(lambda pixel: lens.project(straight.unproject(pixel)))(jnp.asarray(pixels))
+    )
+    resized = lambda pixels: (bent(pixels) + 0.5) * np.array([squeeze, 1.0]) - 0.5
+    seen = window.observations
+    return replace(
+        window, observations=replace(seen, point_target=resized(seen.point_target), pixel=resized(seen.pixel))
+    )
+
+
+def as_square(window: vg.SimulatedWindow, squeeze: float) -> tuple[Problem, State]:
+    """Adjusted with one focal length, which begins as that of the images before they were squeezed."""
+    f, _, cx, cy = window.intrinsics
+    guess = np.array([f, squeeze * cx, cy])
+    depths = 1.0 / window.observations.depth_mean
+    packed = vg.pack(
+        window.observations,
+        window.start,
+        guess,
+        depths,
+        intrinsics_sigma=np.full(3, 0.3 * f),
+        camera=vg.SquarePinhole,
+    )
+    return packed[0], solve(*packed[:2])
+
+
+def found_in(window: vg.SimulatedWindow, squeeze: float) -> FoundAspect:
+    found = find_aspect(*as_square(window, squeeze), solve)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("squeeze", [0.75, pytest.param(1.067, marks=pytest.mark.long)])
+def test_squeezed_images_have_two_focal_lengths(squeeze: float) -> None:
+    # Proves that both are found, 16:9 shown as 4:3 and the pixels of a tape, and that they are seen to pay. Oracle:
+    # those that the window was drawn with, resized.
+    window = rolling(1)
+    found = found_in(drawn(window, squeeze), squeeze)
+    assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.state.intrinsics}"
+    assert found.stretch == pytest.approx(np.log(squeeze), abs=0.005)
+    fx, fy, cx, _ = window.intrinsics
+    np.testing.assert_allclose(found.state.intrinsics[:2], [squeeze * fx, fy], rtol=0.01)
+    assert float(found.state.intrinsics[2]) == pytest.approx((cx + 0.5) * squeeze - 0.5, abs=3.0)
+
+
+@pytest.mark.long
+def test_square_pixels_stay_square() -> None:
+    # Proves that noise alone makes no second focal length, in six windows. Oracle: the one that they were drawn with.
+    found = [found_in(rolling(seed), 1.0) for seed in range(6)]
+    assert not any(each.pays for each in found), [(each.gain, each.needed, each.stretch) for each in found]
+
+
+def test_a_level_path_tells_no_aspect() -> None:
+    # Proves that a stretch that any stretch of the heights makes up for is not taken. Oracle: the gain of nothing.
+    squeezed = drawn(vg.simulate_window(seed=1, **WINDOW), 0.75)
+    assert not found_in(squeezed, 0.75).pays
+
+
+@pytest.mark.long
+def test_a_lens_is_found_behind_pixels_that_are_not_square() -> None:
+    # Proves that the lens of squeezed images is sought with both focal lengths. Oracle: the lens and the squeeze.
+    window = rolling(2)
+    aspect = found_in(drawn(window, 0.75, -0.15, 0.05), 0.75)
+    _, _, cx, cy = window.intrinsics
+    lens = find_lens(aspect.problem, aspect.state, (round(2 * cy + 1), round(1.5 * cx + 1)), solve)
+    assert lens is not None
+    assert lens.pays
+    fx, fy, *_ = lens.camera.intrinsics
+    assert (fx, fy) == pytest.approx((0.75 * window.intrinsics[0], window.intrinsics[1]), rel=0.01)
+    assert lens.camera.distortion[0] == pytest.approx(-0.15, abs=0.03)
+    assert lens.state.intrinsics.shape == (4,)
+
+
+def test_what_ends_in_no_camera_is_none() -> None:
+    # Proves that a focal length below zero, or NaN, as a solver may end with, does not end the run. Oracle: the rule.
+    window = vg.simulate_window(3, 12, 0)
+    f, _, cx, cy = window.intrinsics
+    depths = 1.0 / window.observations.depth_mean
+    problem, state, _ = vg.pack(
+        window.observations, window.start, np.array([f, cx, cy]), depths, camera=vg.SquarePinhole
+    )
+    for focal in (-1.0, float("nan")):
+        ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[1].set(f))
+        assert find_aspect(problem, state, ends_at) is None
+
+
+def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that what is found is taken, told, and kept by the rounds after it; and that a run begun with it needs no
+    # trial. Oracle: the focal lengths that the trial gives.
+    tried: list[Problem] = []
+
+    def stretched(problem: Problem, state: State, solve: Any) -> FoundAspect | None:
+        tried.append(problem)
+        found = find_aspect(problem, state, lambda _, start: start)
+        assert found is not None
+        moved = eqx.tree_at(lambda s: s.intrinsics, found.state, found.state.intrinsics.at[1].multiply(1.2))
+        return replace(found, state=moved, stretch=float(-np.log(1.2)), gain=1.0, needed=0.0)
+
+    monkeypatch.setattr(global_adjustment, "find_aspect", stretched)
+    monkeypatch.setattr(global_adjustment, "can_undistort", lambda slam: False)
+    slam = recorded_run().states[-1]
+    guess = replace(slam, intrinsics_sigma=np.full(4, 100.0), camera_found=False, pending=None)
+    assert camera_of(guess) is vg.SquarePinhole
+    done = adjust_all(guess, SETTINGS)
+    fx, fy, *_ = done.intrinsics
+    assert fy / fx == pytest.approx(1.2, rel=0.02)
+    assert any("its pixels are not square" in note for note in done.notes)
+    assert len(tried) == 1
+    again = replace(guess, intrinsics=done.intrinsics, given_intrinsics=done.intrinsics, camera_found=True)
+    assert camera_of(again) is vg.Pinhole
+    adjust_all(again, SETTINGS)
+    assert len(tried) == 1
+
+
+class Squeezed:
+    """A simulated sequence in images of three quarters of the width, whose camera nobody knows."""
+
+    def __init__(self, source: Any) -> None:
+        self.source, self.name, self.has_depth = source, source.name, False
+        self.size = (3 * source.camera.width // 4, source.camera.height)
+        self.camera = Camera.guess(*self.size)
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def ground_truth(self) -> Any:
+        return self.source.ground_truth()
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Any:
+        for frame in self.source.frames(start, end, stride):
+            image = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
+            yield Frame(frame.index, frame.timestamp, image, None, frame.name)
+
+
+@pytest.mark.slow  # minutes: first passes, a run, its last adjustment
+def test_a_squeezed_video_without_calibration(tmp_path: Path) -> None:
+    # Proves that images alone, resized out of shape, give both focal lengths to 3 %, a word on it, and the path.
+    # Oracle: the camera that drew them, resized.
+    frames = Squeezed(vg.simulate("office", 60, size=(320, 240), rate=10.0))
+    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), dense="none")
+    expected = frames.source.camera.resized(*frames.size).intrinsics
+    np.testing.assert_allclose(result.intrinsics[:2], expected[:2], rtol=0.03)
+    assert any("pixels that are not square" in note for note in result.summary["notes"])
+    assert evaluate_trajectory(result.trajectory, frames.ground_truth()).sim3.statistics.rmse < 0.02
