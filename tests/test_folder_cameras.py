@@ -63,7 +63,7 @@ def test_a_renamed_folder_of_tum_says_in_its_list_what_it_is(tmp_path: Path) -> 
         ({"frames": 3}, r"`frames` is int; expected a list"),
         ({"fl_x": "wide"}, r"`fl_x` is wide; expected a number"),
         ({"fl_x": -5.0}, r"transforms.json`: .*has focal lengths -5"),
-        ({"camera_model": "OPENCV_FISHEYE"}, r"`camera_model` is OPENCV_FISHEYE; read are PINHOLE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"`camera_model` is EQUIRECTANGULAR; read are PINHOLE"),
         ({"w": 10, "h": 1000}, r"images of 10 x 1000 pixels; those here are .*another shape"),
         ({"integer_depth_scale": 0}, r"`integer_depth_scale` is 0; it must be positive"),
         ({"frames": [{"file_path": "../../secret.png"}]}, r"`file_path` is '../../secret.png'; expected a file below"),

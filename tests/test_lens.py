@@ -231,9 +231,8 @@ def test_a_camera_that_was_found_goes_with_its_map() -> None:
 class Bent:
     """A simulated sequence as a lens draws it, whose camera nobody knows."""
 
-    def __init__(self, source: Any, distortion: tuple[float, ...]) -> None:
-        self.source, self.name, self.has_depth = source, source.name, False
-        self.lens = replace(source.camera, distortion=distortion)
+    def __init__(self, source: Any, lens: Camera) -> None:
+        self.source, self.name, self.has_depth, self.lens = source, source.name, False, lens
         self.camera = Camera.guess(self.lens.width, self.lens.height)
 
     def __len__(self) -> int:
@@ -255,7 +254,8 @@ def test_a_phone_without_calibration_from_end_to_end(tmp_path: Path) -> None:
     # Proves that images alone, of an unknown lens that bends corners by many pixels, give its focal length to 3 %, a
     # word on it, a summary that says it, and a map that frames as they were drawn are found in again. Oracle: the lens
     # that drew them.
-    frames = Bent(vg.simulate("office", 60, size=(320, 240), rate=10.0), (-0.08, -0.02, 0.0, 0.0))
+    office = vg.simulate("office", 60, size=(320, 240), rate=10.0)
+    frames = Bent(office, replace(office.camera, distortion=(-0.08, -0.02, 0.0, 0.0)))
     result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), dense="none")
     lens = result.summary["lens"]
     assert lens["fx"] == pytest.approx(frames.lens.intrinsics[0], rel=0.03)

@@ -259,7 +259,7 @@ def bonn(folder: Path) -> Path:
     return folder
 
 
-def bag(path: Path, ros2: bool, calibrated: bool = True) -> Path:
+def bag(path: Path, ros2: bool, calibrated: bool = True, lens: str = "plumb_bob") -> Path:
     """Images 0.1 s apart, depth in millimetres 5 ms later, the camera, and the truth of a marker."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
@@ -293,7 +293,7 @@ def bag(path: Path, ros2: bool, calibrated: bool = True) -> Path:
                 step = len(data) // HEIGHT
                 image_kind = kinds["sensor_msgs/msg/Image"]
                 write(topic, time + later, image_kind(header(time + later), HEIGHT, WIDTH, encoding, 0, step, data))
-            write("/camera/color/camera_info", time, _camera_info(kinds, header(time), ros2, calibrated))
+            write("/camera/color/camera_info", time, _camera_info(kinds, header(time), (calibrated, lens)))
             place = kinds["geometry_msgs/msg/Point"](float(number), 0.0, 0.0)
             turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
             value = kinds["geometry_msgs/msg/Pose"](place, turn)
@@ -306,12 +306,14 @@ def _header(kinds: dict, time: float, ros2: bool) -> object:
     return kinds["std_msgs/msg/Header"](stamp, "c") if ros2 else kinds["std_msgs/msg/Header"](0, stamp, "c")
 
 
-def _camera_info(kinds: dict, header: object, ros2: bool, calibrated: bool) -> object:
+def _camera_info(kinds: dict, header: object, camera: tuple[bool, str]) -> object:
     fx, fy, cx, cy = INTRINSICS
+    calibrated, lens = camera
     matrix = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]) * calibrated
     region = kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    values = (np.array([0.1, -0.02, 0.0, 0.0, 0.0]), matrix, np.eye(3).ravel(), np.zeros(12))
-    return kinds["sensor_msgs/msg/CameraInfo"](header, HEIGHT, WIDTH, "plumb_bob", *values, 0, 0, region)
+    distortion = np.array([0.1, -0.02, 0.0, 0.0, 0.0])[: 5 if lens == "plumb_bob" else 4]
+    values = (distortion, matrix, np.eye(3).ravel(), np.zeros(12))
+    return kinds["sensor_msgs/msg/CameraInfo"](header, HEIGHT, WIDTH, lens, *values, 0, 0, region)
 
 
 def matroska(path: Path, milliseconds: tuple[int, ...], shown: tuple[int, int] | None = None) -> Path:

@@ -51,7 +51,7 @@ class RecordedFrames:
         truth = sequence.ground_truth()
         if truth is None or not sequence.has_depth:
             return None
-        if any(sequence.camera.distortion):
+        if sequence.camera.distorts:
             raise InputError(f"`exact_depth` is true of `{sequence.name}`, whose lens distorts; leave it out")
         return cls(sequence, truth)
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.intrinsics import guess_with_warning
+from vggtgeo.datasets.intrinsics import guess_with_warning, is_fisheye
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.geometry.trajectory import Trajectory
@@ -213,10 +213,13 @@ def _camera(reader: Any, topics: dict[str, str], colour: str, width: int, height
         if not matrix.any():  # as the message's definition has it: uncalibrated
             continue
         values = np.asarray(message.D if hasattr(message, "D") else message.d, float)
-        distortion = check_distortion(values if len(values) in (4, 5, 8) and values.any() else ())
-        return Camera(
-            check_intrinsics((matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])), width, height, distortion
-        )
+        fisheye = is_fisheye(f"`{name}`: `distortion_model`", message.distortion_model)
+        lens = tuple(values) if len(values) in (4, 5, 8) and (fisheye or values.any()) else ()
+        try:
+            intrinsics = check_intrinsics((matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+            return Camera(intrinsics, width, height, check_distortion(lens), fisheye=fisheye)
+        except InputError as error:
+            raise InputError(f"`{name}`: {error}") from None
     return None
 
 

@@ -4,6 +4,7 @@ The left camera alone is read; its distortion is removed like any other. Source:
 aerial vehicle datasets", IJRR 2016.
 """
 
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,8 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
-from vggtgeo.datasets.intrinsics import intrinsics_of
-from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of, yaml_numbers
+from vggtgeo.datasets.intrinsics import intrinsics_of, is_fisheye
+from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_text, states_list, trajectory_of, yaml_numbers
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
@@ -22,6 +23,7 @@ from vggtgeo.io.text_files import whole_text
 _MOST_DIGITS = 20
 """Of a time in nanoseconds, with room; Python refuses to read numbers of thousands."""
 _TRUTH = ("state_groundtruth_estimate0", "leica0", "vicon0")
+_MODEL = re.compile(r"^\s*distortion_model\s*:\s*['\"]?([\w-]+)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,7 @@ class Euroc(FolderSequence):
             raise InputError(f"`{camera_folder}/data.csv` lists no image; expected lines `nanoseconds,file`")
         width, height = common_size(str(folder), files)
         sensor = camera_folder / "sensor.yaml"
-        intrinsics = intrinsics_of(sensor, yaml_numbers(sensor, "intrinsics"))
-        distortion = check_distortion(yaml_numbers(sensor, "distortion_coefficients"))
-        return cls(base, folder.resolve().name, Camera(intrinsics, width, height, distortion), files)
+        return cls(base, folder.resolve().name, _camera(sensor, width, height), files)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses of the left camera, at their own times."""
@@ -67,6 +67,27 @@ class Euroc(FolderSequence):
         body = poses_of(rows[:, 1:4], rows[:, [5, 6, 7, 4]])  # w first in the file
         extrinsics = np.reshape(yaml_numbers(self.folder / "cam0" / "sensor.yaml", "data", 16), (4, 4))
         return trajectory_of(rows[:, 0] * 1e-9, body @ extrinsics, file)
+
+
+def _camera(sensor: Path, width: int, height: int) -> Camera:
+    """The camera of a `sensor.yaml` for images of this size. EuRoC's lenses are "radial-tangential", those of TUM VI
+    "equidistant".
+    """
+    if states_list(sensor, "resolution"):
+        stated = yaml_numbers(sensor, "resolution", 2)
+        if stated != [width, height]:
+            raise InputError(
+                f"`{sensor}` is of images of {stated[0]:g} x {stated[1]:g} pixels; those here are {width} x {height}: "
+                "write the camera of these, or give --intrinsics fx,fy,cx,cy"
+            )
+    intrinsics = intrinsics_of(sensor, yaml_numbers(sensor, "intrinsics"))
+    coefficients = yaml_numbers(sensor, "distortion_coefficients")
+    found = _MODEL.search(read_text(sensor))
+    fisheye = is_fisheye(f"`{sensor}`: `distortion_model`", found.group(1) if found else "")
+    try:
+        return Camera(intrinsics, width, height, check_distortion(coefficients), fisheye=fisheye)
+    except InputError as error:
+        raise InputError(f"`{sensor}`: {error}") from None
 
 
 def _base(folder: Path) -> Path | None:

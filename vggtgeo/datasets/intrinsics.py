@@ -20,9 +20,14 @@ LEAST_VALID = 0.5
 more than 0.8."""
 MOST_ASPECT = 4.0
 """Ratio of the focal lengths, either way: pixels of cameras are square; of interlaced and anamorphic ones, 1 to 2."""
+_OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
+_FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye")
+"""What ROS, Kalibr, EuRoC, RealSense and nerfstudio call the two lenses that are read."""
 MOST_BYTES = 100_000
 """Of a file with a few numbers and comments."""
 CALIBRATION = "calibration.txt"
+FISHEYE = "fisheye"
+"""Last word of such a file, behind four coefficients of Kannala and Brandt."""
 MATRIX = "camera-intrinsics.txt"
 _SAYS_CAMERA = re.compile(r"(intrinsic|calib|camera|(^|[_.-])k(?=[_.-])).*\.(txt|csv)$|^k$", re.IGNORECASE)
 JSON = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
@@ -53,24 +58,25 @@ def intrinsics_of(file: Path, values: object) -> tuple[float, float, float, floa
         raise InputError(f"`{file}`: {error}") from None
 
 
+def is_fisheye(where: str, model: str) -> bool:
+    """Whether the word for a lens is that of a fisheye; InputError for one of neither kind. where: it stands."""
+    if model.lower() not in (*_OPENCV, *_FISHEYES):
+        known = ", ".join((*_OPENCV[1:], *_FISHEYES))
+        raise InputError(f"{where} is {model[:40]}; read are {known}: undistort the images")
+    return model.lower() in _FISHEYES
+
+
 def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
-    """The camera of `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`), else of
+    """The camera of `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, or `fx fy cx cy k1 k2 k3 k4
+    fisheye`), else of
     `camera-intrinsics.txt` (3 x 3), else of a JSON file as Open3D's and RealSense's recorders write it, in `folder`,
     else None. InputError where such a file is there but wrong.
     """
-
-    def of_this_size(file: Path) -> tuple[tuple[float, float, float, float], tuple[float, ...]]:
-        return _read_json_camera(file, width, height)
-
-    for name, read in (
-        (CALIBRATION, _read_calibration),
-        (MATRIX, _read_matrix),
-        *((name, of_this_size) for name in JSON),
-    ):
+    readers = {CALIBRATION: _read_calibration, MATRIX: _read_matrix, **dict.fromkeys(JSON, _read_json_camera)}
+    for name, read in readers.items():
         file = folder / name
         if file.is_file():
-            intrinsics, distortion = read(file)
-            camera = Camera(intrinsics, width, height, distortion)
+            camera = read(file, width, height)
             check_plausible(f"`{file}`", camera)
             _warn_of_other_size(file, camera)
             return camera
@@ -172,15 +178,19 @@ def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float =
     return camera
 
 
-def _read_calibration(file: Path) -> tuple[tuple[float, float, float, float], tuple[float, ...]]:
-    numbers = _numbers(f"`{file}`", _without_comments(file), "fx fy cx cy [k1 k2 p1 p2]")
+def _read_calibration(file: Path, width: int, height: int) -> Camera:
+    text = _without_comments(file)
+    words = text.split()
+    fisheye = words[-1:] == [FISHEYE]
+    expected = "fx fy cx cy k1 k2 k3 k4 fisheye" if fisheye else "fx fy cx cy [k1 k2 p1 p2]"
+    numbers = _numbers(f"`{file}`", " ".join(words[:-1]) if fisheye else text, expected)
     try:
-        return check_intrinsics(numbers[:4]), check_distortion(numbers[4:])
+        return Camera(check_intrinsics(numbers[:4]), width, height, check_distortion(numbers[4:]), fisheye=fisheye)
     except InputError as error:
         raise InputError(f"`{file}`: {error}") from None
 
 
-def _read_matrix(file: Path) -> tuple[tuple[float, float, float, float], tuple[float, ...]]:
+def _read_matrix(file: Path, width: int, height: int) -> Camera:
     numbers = _numbers(f"`{file}`", _without_comments(file), "a 3 x 3 matrix of intrinsics")
     if len(numbers) != 9:
         raise InputError(f"`{file}`: found {len(numbers)} numbers; expected a 3 x 3 matrix of intrinsics")
@@ -188,12 +198,10 @@ def _read_matrix(file: Path) -> tuple[tuple[float, float, float, float], tuple[f
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6):
         raise InputError(f"`{file}`: found {matrix.tolist()}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    return intrinsics_of(file, (fx, fy, cx, cy)), ()
+    return Camera(intrinsics_of(file, (fx, fy, cx, cy)), width, height)
 
 
-def _read_json_camera(
-    file: Path, width: int, height: int
-) -> tuple[tuple[float, float, float, float], tuple[float, ...]]:
+def _read_json_camera(file: Path, width: int, height: int) -> Camera:
     """Of Open3D: `width`, `height` and `intrinsic_matrix`, nine numbers column by column; of RealSense: `fx`, `fy`,
     `ppx`, `ppy`, or `cx`, `cy`.
     """
@@ -215,7 +223,7 @@ def _read_json_camera(
     if not all(isinstance(number, int | float) for number in found):
         raise InputError(f"`{file}`: expected `intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`")
     try:
-        return check_intrinsics(tuple(map(float, found))), ()
+        return Camera(check_intrinsics(tuple(map(float, found))), width, height)
     except (InputError, OverflowError) as error:
         raise InputError(f"`{file}`: {error}") from None
 

@@ -34,6 +34,8 @@ FILE = "transforms.json"
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera axes to OpenCV's, and back."""
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+_OF_FISHEYE = ("k1", "k2", "k3", "k4")
+_FISHEYE = "OPENCV_FISHEYE"
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 _SAME_SHAPE = 0.01
 _ONE_CAMERA = 0.02
@@ -146,10 +148,9 @@ def _pose(file: Path, frame: Mapping[str, Any]) -> np.ndarray:
 def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], width: int, height: int) -> Camera:
     """The camera of the file, or the middle of those of its frames, for images of this size."""
     model = str(content.get("camera_model", "")).upper()
-    if model not in _PINHOLES:
-        raise InputError(
-            f"`{file}`: `camera_model` is {model}; read are {', '.join(_PINHOLES[1:])}: undistort the images"
-        )
+    if model not in (*_PINHOLES, _FISHEYE):
+        known = ", ".join((*_PINHOLES[1:], _FISHEYE))
+        raise InputError(f"`{file}`: `camera_model` is {model}; read are {known}: undistort the images")
     across, down = (
         float(size) if stated is None else _positive(file, key, stated)
         for key, size in (("w", width), ("h", height))
@@ -161,9 +162,10 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
     fy = _number(file, content, frames, "fl_y") or focal
     cx, cy = _number(file, content, frames, "cx"), _number(file, content, frames, "cy")
     centre = (0.5 * across if cx is None else cx) - 0.5, (0.5 * down if cy is None else cy) - 0.5
-    lens = tuple(_number(file, content, frames, key) or 0.0 for key in _DISTORTION)
+    fisheye = model == _FISHEYE
+    lens = tuple(_number(file, content, frames, key) or 0.0 for key in (_OF_FISHEYE if fisheye else _DISTORTION))
     try:
-        distortion = check_distortion(lens if lens[4] else lens[:4]) if any(lens) else ()
+        distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
     except InputError as error:
         raise InputError(f"`{file}`: {error}") from None
     if abs(across * height - down * width) > _SAME_SHAPE * across * height:
@@ -171,7 +173,7 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
             f"`{file}` is of images of {across:g} x {down:g} pixels; those here are {width} x {height}, which is "
             "another shape: were they turned or cut afterwards?"
         )
-    camera = Camera(intrinsics_of(file, (focal, fy, *centre)), round(across), round(down), distortion)
+    camera = Camera(intrinsics_of(file, (focal, fy, *centre)), round(across), round(down), distortion, fisheye=fisheye)
     return camera.resized(width, height)
 
 

@@ -104,6 +104,11 @@ def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
     return numbers_of(words, f"`{file}`: `{key}`")
 
 
+def states_list(file: Path, key: str) -> bool:
+    """Whether the YAML file has a list `key: [...]`."""
+    return re.search(rf"^\s*{re.escape(key)}\s*:\s*\[", read_text(file), re.MULTILINE) is not None
+
+
 def numbers_of(words: Sequence[str], what: str) -> list[float]:
     """Words as numbers; what: they are, for the InputError where one is none."""
     try:

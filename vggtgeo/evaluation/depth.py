@@ -65,7 +65,7 @@ def depth_of_cloud(
     `pose` is world -> camera. A pixel takes the nearest of the points that fall on it. A sparse cloud lets
     points of hidden surfaces through: use it with a dense one.
     """
-    if any(camera.distortion):
+    if camera.distorts:
         raise InputError("`camera` has distortion; give `camera.pinhole`, and undistorted depth to compare with")
     local = points @ pose[:3, :3].T + pose[:3, 3]
     inside, rows, columns = pinhole.visible(local, camera.intrinsics, (camera.height, camera.width), nearest=0.0)

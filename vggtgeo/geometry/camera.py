@@ -30,6 +30,7 @@ _CONVERGED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-8)
 """OpenCV's own five iterations leave 0.3 pixels in the corners of a wide lens (k1 = -0.3)."""
 
 _DISTORTION_LENGTHS = (0, 4, 5, 8)
+_FISHEYE_LENGTH = 4
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,10 @@ class Camera:
     Fields:
         intrinsics: fx, fy, cx, cy in pixels; fx, fy > 0.
         width, height: of the image, pixels.
-        distortion: k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order; () for none.
+        distortion: k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order; () for none. Of a fisheye: k1, k2, k3, k4 of
+            Kannala and Brandt (2006), as OpenCV's `fisheye` and Kalibr's "equidistant" have them.
         known: False for a starting guess, which is to be optimised and reported.
+        fisheye: whether the lens draws angles from its axis, not their tangents.
 
     Raises InputError where a number is missing, not finite, or not positive where it must be.
 
@@ -57,11 +60,17 @@ class Camera:
     height: int
     distortion: tuple[float, ...] = ()
     known: bool = True
+    fisheye: bool = False
 
     def __post_init__(self) -> None:
         fx, fy, cx, cy = check_intrinsics(self.intrinsics)
         object.__setattr__(self, "intrinsics", (fx, fy, cx, cy))
         object.__setattr__(self, "distortion", check_distortion(self.distortion))
+        if self.fisheye and len(self.distortion) != _FISHEYE_LENGTH:
+            raise InputError(
+                f"`distortion` has {len(self.distortion)} coefficients; a fisheye has four: k1, k2, k3, k4 (zeros for "
+                "an ideal one)"
+            )
         check_sides(self.width, self.height)
 
     @classmethod
@@ -81,9 +90,14 @@ class Camera:
         return pinhole.matrix(self.intrinsics)
 
     @property
+    def distorts(self) -> bool:
+        """Whether its images are not those of `pinhole`."""
+        return self.fisheye or any(self.distortion)
+
+    @property
     def pinhole(self) -> Self:
         """The ideal camera that undistorted images belong to: the same intrinsics, no distortion."""
-        return replace(self, distortion=())
+        return replace(self, distortion=(), fisheye=False)
 
     def resized(self, width: int, height: int) -> Self:
         """The same camera of its images resized to `width` x `height` pixels; a pixel's middle is a whole number."""
@@ -95,10 +109,11 @@ class Camera:
     def undistorted(self, pixels: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
         """Where pixels of this camera's images are in those of `pinhole`, float64; any may lie outside the image."""
         flat = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
-        if not any(self.distortion) or not len(flat):
+        if not self.distorts or not len(flat):
             return flat.reshape(np.shape(pixels))
         matrix, coefficients = self.matrix, np.array(self.distortion)
-        found = cv2.undistortPoints(flat, matrix, coefficients, P=matrix, criteria=_CONVERGED)
+        undistort = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
+        found = undistort(flat, matrix, coefficients, P=matrix, criteria=_CONVERGED)
         return np.asarray(found, np.float64).reshape(np.shape(pixels))
 
     def undistorter(self) -> "Undistorter":
@@ -129,9 +144,10 @@ class Undistorter:
     @classmethod
     def of(cls, camera: Camera) -> Self:
         """The undistorter of `camera`."""
-        if not any(camera.distortion):
+        if not camera.distorts:
             return cls(camera.pinhole)
-        x, y = cv2.initUndistortRectifyMap(
+        maps_of = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
+        x, y = maps_of(
             camera.matrix,
             np.array(camera.distortion),
             np.eye(3),

@@ -67,7 +67,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 10
+VERSION = 11
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -125,6 +125,12 @@ def _with_focal_with_lens(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
+def _with_fisheyes(header: Header) -> Header:
+    """Version 10 did not know fisheyes."""
+    tree, classes = with_field(header["tree"], header["classes"], "Camera", "fisheye", False)
+    return {**header, "tree": tree, "classes": classes}
+
+
 UPGRADES = {
     1: _with_recorded_times,
     2: _with_lens,
@@ -135,6 +141,7 @@ UPGRADES = {
     7: _with_second_motions,
     8: _with_focal_without_lens,
     9: _with_focal_with_lens,
+    10: _with_fisheyes,
 }
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)
