@@ -98,9 +98,8 @@ def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) ->
     camera = sequence.camera
     focal = f"f = {camera.intrinsics[0]:.1f}, {camera.intrinsics[1]:.1f}"
     coefficients = ", ".join(f"{value:g}" for value in camera.distortion)
-    lens = (
-        f"{'a fisheye of' if camera.fisheye else 'distorted by'} {coefficients}" if camera.distorts else "no distortion"
-    )
+    kind = "a fisheye of" if camera.fisheye else "distorted by"
+    lens = f"{kind} {coefficients}" if camera.distorts else "no distortion"
     facts = [
         f"reader: {type(sequence).__name__}",
         f"{len(sequence)} frames of {camera.width} x {camera.height}",

@@ -78,7 +78,7 @@ def _camera(sensor: Path, width: int, height: int) -> Camera:
         if stated != [width, height]:
             raise InputError(
                 f"`{sensor}` is of images of {stated[0]:g} x {stated[1]:g} pixels; those here are {width} x {height}: "
-                "write the camera of these, or give --intrinsics fx,fy,cx,cy"
+                "write the camera of these into it"
             )
     intrinsics = intrinsics_of(sensor, yaml_numbers(sensor, "intrinsics"))
     coefficients = yaml_numbers(sensor, "distortion_coefficients")

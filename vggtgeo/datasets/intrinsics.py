@@ -21,8 +21,8 @@ more than 0.8."""
 MOST_ASPECT = 4.0
 """Ratio of the focal lengths, either way: pixels of cameras are square; of interlaced and anamorphic ones, 1 to 2."""
 _OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
-_FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye")
-"""What ROS, Kalibr, EuRoC, RealSense and nerfstudio call the two lenses that are read."""
+_FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
+"""What ROS, Kalibr, EuRoC and RealSense call the two lenses that are read."""
 MOST_BYTES = 100_000
 """Of a file with a few numbers and comments."""
 CALIBRATION = "calibration.txt"

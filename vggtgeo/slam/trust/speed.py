@@ -29,7 +29,10 @@ def check_speed(estimate: Estimate, cuts: np.ndarray | None = None) -> list[Find
     speed = speeds(estimate, np.zeros(len(estimate) - 1, bool) if cuts is None else cuts)
     typical = float(np.median(speed))
     if typical > MOST_TYPICAL_SPEED:
-        text = f"the camera moves at {typical:.1f} m/s: nobody carries one so fast; is the unit of the depth right?"
+        text = (
+            f"the camera moves at {typical:.1f} m/s: nobody carries one so fast; is the unit of the depth right, and "
+            "are there as many frames a second as the times say (`--fps`)?"
+        )
         return [Finding("speed", "degraded", text, scale=True)]
     found = []
     for first, last in spans(speed > MOST_SPEED, join=3):
