@@ -49,6 +49,26 @@ def calibrated(content: str | bytes) -> Any:
     return lambda folder: bad.frames(folder / "frames", calibration=content)
 
 
+def phone(folder: Path) -> Path:
+    """Images and depth in folders, the depth of half their sides."""
+    made = layouts.rgbd(folder / "phone")
+    for file in sorted((made / "depth").iterdir()):
+        tiny.write_image(file, tiny.depth_codes(0, 20, 15))
+    return made
+
+
+def sensor(*change: str) -> Any:
+    """A flight of EuRoC, a sentence of its `sensor.yaml` changed."""
+
+    def make(folder: Path) -> Path:
+        file = layouts.euroc(folder / "MH_01") / "mav0/cam0/sensor.yaml"
+        (folder / "MH_01/mav0/imu0/data.csv").unlink()
+        file.write_text((file.read_text() + "resolution: [40, 30]\n").replace(*change))
+        return folder / "MH_01"
+
+    return make
+
+
 def matrix(content: str) -> Any:
     """Good images with this `camera-intrinsics.txt`."""
 
@@ -158,6 +178,7 @@ DEPTH = rows(
         ("three channels", bad.every_depth(lambda: tiny.image(1))),
         ("all zero", bad.every_depth(lambda: np.zeros((tiny.HEIGHT, tiny.WIDTH), np.uint16))),
         ("another size than the images", bad.every_depth(lambda: tiny.depth_codes(0, 20, 15))),
+        ("a phone's, of fewer pixels", phone),
         ("one that is cut off", bad.rgbd(bad.write("depth/10.104000.png", b"\x89PNG\r\n\x1a\n"))),
         ("one that is not there", bad.rgbd(lambda folder: (folder / "depth/10.104000.png").unlink())),
         ("none near in time", lines("depth.txt", "99 depth/10.104000.png\n")),
@@ -198,6 +219,9 @@ CALIBRATION = rows(
         ("a focal length of zero", calibrated("0 0 31.5 23.5")),
         ("distortion 5, 5, 5, 5", calibrated("55 55 31.5 23.5 5 5 5 5")),
         ("seven numbers", calibrated("55 55 31.5 23.5 0 0 0")),
+        ("a fisheye of three coefficients", calibrated("55 55 31.5 23.5 0 0 0 fisheye")),
+        ("a lens of another kind in EuRoC's `sensor.yaml`", sensor("radial-tangential", "omni")),
+        ("a `sensor.yaml` of other images", sensor("[40, 30]", "[752, 480]")),
         ("of another image size", calibrated("525 525 120 90")),
         ("binary data", calibrated(bytes(range(256)))),
         ("commas, a byte order mark and CR LF", calibrated(b"\xef\xbb\xbf55, 55, 31.5, 23.5\r\n")),
