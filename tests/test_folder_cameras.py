@@ -9,6 +9,7 @@ import tiny_layouts as tiny
 import tiny_sequences
 
 from vggtgeo.datasets import open_sequence
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
 
 
@@ -54,6 +55,20 @@ def test_a_renamed_folder_of_tum_says_in_its_list_what_it_is(tmp_path: Path) -> 
     camera = open_sequence(tmp_path).camera
     assert camera.intrinsics == (517.3, 516.5, 318.6, 255.3)
     assert camera.known
+
+
+def test_the_camera_of_an_export_of_record3d(tmp_path: Path) -> None:
+    # Proves the matrix by columns of images of this size, and that another program's `metadata.json` is left alone.
+    folder = tiny.rgbd(tmp_path / "phone")
+    (folder / "intrinsic.json").unlink()
+    fx, fy, cx, cy = tiny_sequences.INTRINSICS
+    matrix = [fx, 0, 0, 0, fy, 0, cx, cy, 1]
+    size = {"w": tiny_sequences.WIDTH, "h": tiny_sequences.HEIGHT}
+    (folder / "metadata.json").write_text(json.dumps({**size, "fps": 60, "K": matrix}))
+    assert open_sequence(folder).camera == Camera(tiny_sequences.INTRINSICS, *size.values())
+    for other in ({"w": 80, "h": 60, "K": matrix}, {**size, "K": "none"}, {**size, "K": [matrix] * 9}, [1, 2], None):
+        (folder / "metadata.json").write_text("no JSON" if other is None else json.dumps(other))
+        assert not tiny.quietly_opened(folder).camera.known
 
 
 @pytest.mark.parametrize(

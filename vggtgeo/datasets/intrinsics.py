@@ -80,7 +80,24 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
             check_plausible(f"`{file}`", camera)
             _warn_of_other_size(file, camera)
             return camera
-    return _camera_of_another_name(folder, width, height)
+    return _camera_of_record3d(folder, width, height) or _camera_of_another_name(folder, width, height)
+
+
+def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
+    """The camera of `metadata.json` beside the images of an export of Record3D; None where that is another's file."""
+    file = folder / "metadata.json"
+    try:
+        content = read_json(file) if file.is_file() else None
+    except InputError:
+        return None
+    if not isinstance(content, dict) or (content.get("w"), content.get("h")) != (width, height):
+        return None
+    matrix = content.get("K")
+    if not (isinstance(matrix, list) and len(matrix) == 9 and all(isinstance(value, int | float) for value in matrix)):
+        return None
+    camera = Camera(intrinsics_of(file, (matrix[0], matrix[4], matrix[6], matrix[7])), width, height)
+    check_plausible(f"`{file}`", camera)
+    return camera
 
 
 def _camera_of_another_name(folder: Path, width: int, height: int) -> Camera | None:
