@@ -100,19 +100,11 @@ def test_a_bag_of_a_fisheye(tmp_path: Path) -> None:
         open_sequence(tiny.bag(tmp_path / "b.bag", ros2=False, lens="ftheta"))
 
 
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (("equidistant", "omni"), r"sensor.yaml`: `distortion_model` is omni; read are"),
-        (("[40, 30]", "[640, 480]"), r"sensor.yaml` is of images of 640 x 480 pixels; those here are 40 x 30"),
-        ((", -0.0007", ""), r"sensor.yaml`: `distortion` has 3 coefficients"),
-    ],
-)
-def test_a_wrong_sensor_file_is_told(tmp_path: Path, change: tuple[str, str], told: str) -> None:
-    # Proves that the sentence names the file, what was found and what was expected.
+def test_a_lens_of_three_numbers_is_told_with_its_file(tmp_path: Path) -> None:
+    # Proves that the sentence names the file; what else may be wrong in it are rows of docs/bad-inputs.md.
     sensor = of_euroc(tmp_path / "scene") / "mav0/cam0/sensor.yaml"
-    sensor.write_text(sensor.read_text().replace(*change))
-    with pytest.raises(InputError, match=told):
+    sensor.write_text(sensor.read_text().replace(", -0.0007", ""))
+    with pytest.raises(InputError, match=r"sensor.yaml`: `distortion` has 3 coefficients"):
         tiny.quietly_opened(tmp_path / "scene")
 
 
