@@ -115,6 +115,16 @@ def empty(folder: Path) -> Path:
     return folder / "a"
 
 
+def spoilt(layout: Callable[[Path], Path], name: str, content: str) -> Callable[[Path], Path]:
+    """A recording in this layout, of which one file holds something else."""
+
+    def make(folder: Path) -> Path:
+        (layout(folder / "room") / name).write_text(content)
+        return folder / "room"
+
+    return make
+
+
 def flat(folder: Path) -> Path:
     """Images that are 3 pixels high."""
     for row in range(3):
@@ -161,7 +171,10 @@ IMAGES = rows(
         ("a folder of other files", lambda folder: bad.file("a/notes.txt", "")(folder).parent),
         ("a single image", bad.file("a.png", bad.encoded(".png"))),
         ("an animated GIF", bad.file("a.gif", b"GIF89a" + NUL)),
-        ("a recording of Record3D", lambda folder: layouts.record3d_file(folder / "room.r3d")),
+        ("a recording of Record3D, one depth damaged", spoilt(layouts.record3d, "rgbd/1.depth", "bvx2 and no more")),
+        ("a recording of Record3D whose camera is of other images", spoilt(layouts.record3d, "metadata", '{"w": 960, "h": 720}')),
+        ("a recording of Record3D, its metadata cut off", spoilt(layouts.record3d, "metadata", '{"w": 40, "h"')),
+        ("a damaged EXR", spoilt(layouts.record3d_exported, "depth/1.exr", "v/1")),
         ("one camera of a raw drive of KITTI", lambda folder: layouts.kitti_raw(folder) / "image_02"),
     ],
     call=read_frames,

@@ -75,6 +75,20 @@ def _bag(folder: Path) -> bytes:
     return whole
 
 
+def _exr(folder: Path) -> bytes:
+    return (layouts.record3d_exported(folder / "exr") / "depth/1.exr").read_bytes()
+
+
+def _record3d(folder: Path) -> bytes:
+    whole = layouts.record3d_file(folder / "whole.r3d").read_bytes()
+    (folder / "whole.r3d").unlink()
+    return whole
+
+
+def _lzfse(folder: Path) -> bytes:
+    return (layouts.record3d(folder / "r") / "rgbd/1.depth").read_bytes()
+
+
 def bag2(file: str) -> Callable[[Path], bytes]:
     """One file of a bag of ROS 2; the rest of it is there."""
     return lambda folder: (layouts.bag(folder / "bag", ros2=True) / file).read_bytes()
@@ -138,6 +152,9 @@ DECODERS: tuple[Kind, ...] = (
     picture("PPM", ".ppm"),
     depth("depth PNG", ".png"),
     depth("depth TIFF", ".tiff"),
+    Kind("depth EXR", "d.exr", _exr, lambda file: read_depth(file, MILLIMETRES)),
+    Kind("Record3D", "room.r3d", _record3d, _read_sequence),
+    Kind("depth of Record3D", "r/rgbd/1.depth", _lzfse, lambda file: _read_sequence(file.parent.parent)),
     video(".mp4", "mp4v"),
     video(".avi", "MJPG"),
     Kind("video mkv", "v.mkv", _matroska, _read_sequence),

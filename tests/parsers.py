@@ -186,6 +186,7 @@ KINDS = (
     layout("KITTI poses", layouts.kitti, "data/poses/07.txt", "data/sequences/07"),
     layout("ARKit poses", layouts.arkit, "data/lowres_wide.traj"),
     layout("ARKit camera", layouts.arkit, "data/lowres_wide_intrinsics/41069021_305.477.pincam"),
+    layout("Record3D", layouts.record3d, "data/metadata"),
     layout("Stray poses", layouts.stray, "data/odometry.csv", count=8),
     layout("Stray camera", layouts.stray, "data/camera_matrix.csv", count=8),
     Kind("problem", "p.npz", lambda folder: bad.problem()(folder).read_bytes(), finite_problem, 60),

@@ -295,15 +295,6 @@ def test_a_part_of_a_raw_drive_is_named(tmp_path: Path) -> None:
             open_sequence(part)
 
 
-@pytest.mark.parametrize("write", [tiny.record3d, tiny.record3d_file])
-def test_record3d_is_named(tmp_path: Path, write: Callable[[Path], Path]) -> None:
-    # Proves that a recording of Record3D, packed or not, is told by its name, with what to do.
-    with pytest.raises(
-        InputError, match=r"is a recording of Record3D, whose depth .LZFSE. is not read; .*`depth/0.png`"
-    ):
-        open_sequence(write(tmp_path / "room.r3d"))
-
-
 def test_arkit_scenes(tmp_path: Path) -> None:
     # Proves depth of fewer pixels enlarged, the middle of the frames' intrinsics, and inverted poses.
     sequence = tiny.quietly_opened(tiny.arkit(tmp_path / "41069021"))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tiny_sequences import HEIGHT, INTRINSICS, WIDTH, depth_codes, image, pose, tum_line, write_image
 
 from vggtgeo import datasets
@@ -198,13 +199,52 @@ def kitti_raw(folder: Path) -> Path:
 
 
 def record3d(folder: Path) -> Path:
-    """A recording of the app Record3D, unpacked; its depth is compressed with LZFSE, which is not read."""
+    """A recording of the app Record3D, unpacked: depth of half the pixels, one row of it without trust; a camera of
+    each frame, which differ a little; OpenGL's axes.
+    """
+    from imagecodecs import lzfse_encode
+
     for number in range(COUNT):
         write_image(folder / f"rgbd/{number}.jpg", image(number))
-        (folder / f"rgbd/{number}.depth").write_bytes(b"bvx2" + bytes(40))
-    matrix = [INTRINSICS[0], 0, 0, 0, INTRINSICS[1], 0, *INTRINSICS[2:], 1]
-    (folder / "metadata").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fps": 60, "K": matrix, "poses": []}))
+        (folder / f"rgbd/{number}.depth").write_bytes(lzfse_encode(record3d_depth(number).tobytes()))
+        trust = np.full((HEIGHT // 2, WIDTH // 2), 2, np.uint8)
+        trust[5] = 0
+        (folder / f"rgbd/{number}.conf").write_bytes(lzfse_encode(trust.tobytes()))
+    (folder / "metadata").write_text(json.dumps(RECORD3D | {"dw": WIDTH // 2, "dh": HEIGHT // 2}))
     return folder
+
+
+def record3d_exported(folder: Path) -> Path:
+    """The same as the app exports it, "EXR + JPG"."""
+    import OpenEXR
+
+    (folder / "depth").mkdir(parents=True)
+    for number in range(COUNT):
+        write_image(folder / f"rgb/{number}.jpg", image(number))
+        file = OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {"R": record3d_depth(number)})
+        file.write(str(folder / f"depth/{number}.exr"))
+    (folder / "metadata.json").write_text(json.dumps(RECORD3D))
+    return folder
+
+
+def record3d_depth(number: int) -> np.ndarray:
+    """Metres, float32, in half the pixels: 1 + number / 10, the first pixel none."""
+    depth = np.full((HEIGHT // 2, WIDTH // 2), 1 + number / 10, np.float32)
+    depth[0, 0] = np.nan
+    return depth
+
+
+RECORD3D = {
+    "w": WIDTH,
+    "h": HEIGHT,
+    "fps": 60,
+    "K": [INTRINSICS[0] + 3, 0, 0, 0, INTRINSICS[1] + 3, 0, *INTRINSICS[2:], 1],
+    "perFrameIntrinsicCoeffs": [[value + 0.1 * (number - 1) for value in INTRINSICS] for number in range(COUNT)],
+    "frameTimestamps": [0.1 * number for number in range(COUNT)],
+    "poses": [
+        [*Rotation.from_matrix(one[:3, :3] @ np.diag([1.0, -1.0, -1.0])).as_quat(), *one[:3, 3]] for one in POSES
+    ],
+}
 
 
 def record3d_file(path: Path) -> Path:

@@ -68,8 +68,8 @@ def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
     """How many of the files that are listed are not there, and the sequence of those that are."""
     if not isinstance(sequence, FolderSequence):
         return [], sequence
-    images = [file.image for file in sequence.files if not file.image.exists()]
-    depths = [file.depth for file in sequence.files if file.depth is not None and not file.depth.exists()]
+    images = [file.image for file in sequence.files if not sequence.holds(file.image)]
+    depths = [file.depth for file in sequence.files if file.depth and not sequence.holds(file.depth)]
     gone = {*images, *depths}
     files = tuple(
         replace(file, depth=None if file.depth in gone else file.depth)

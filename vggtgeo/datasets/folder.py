@@ -77,6 +77,10 @@ class FolderSequence:
         """No truth, unless the layout knows one."""
         return None
 
+    def holds(self, path: Path) -> bool:
+        """Whether a file of `files` is there."""
+        return path.exists()
+
     def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
         """The image in a file, see `read_image_file`; a layout whose images do not fit its depth changes them here."""
         return read_image_file(path, least_bits)

@@ -15,6 +15,7 @@ import numpy as np
 import simplejpeg
 from jaxtyping import Float, UInt8
 
+from vggtgeo.datasets.exr_files import exr_depth
 from vggtgeo.datasets.image_defects import decoding_defect, defect
 from vggtgeo.datasets.image_orientation import as_stored, orientation
 from vggtgeo.datasets.image_sizes import declared_white
@@ -23,7 +24,7 @@ from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 
-DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm"}
+DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,12 @@ def read_image_file(path: Path, least_bits: int = 8) -> ImageFile:
 
     least_bits: that a 16-bit image has at least, however dark it is: those of the images before it.
     """
-    content, image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    return image_in(file_content(path), path, least_bits)
+
+
+def image_in(content: bytes, path: Path, least_bits: int = 8) -> ImageFile:
+    """The image whose file has these bytes. path: for messages; otherwise as `read_image_file`."""
+    image = _decode(content, path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image.dtype not in (np.uint8, np.uint16) or image.ndim != 3:
         raise InputError(f"`{path}`: found {image.dtype} of shape {image.shape}; images must have 8 or 16 bits")
     bits = 8
@@ -90,7 +96,7 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     """The depth, float32 metres, NaN for none, of an image or an array of NumPy (`.npy`); InputError where it has not
     one channel, of 16-bit numbers or of floats.
     """
-    codes = _array(path) if path.suffix.lower() == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)[1]
+    codes = _codes(path)
     codes = codes[..., 0] if codes.ndim == 3 and codes.shape[2] == 1 else codes
     if codes.ndim == 2 and np.issubdtype(codes.dtype, np.floating):
         with np.errstate(over="ignore", invalid="ignore"):
@@ -107,9 +113,17 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     return depth
 
 
+def _codes(path: Path) -> np.ndarray:
+    if path.suffix.lower() == ".npy":
+        return _array(path)
+    if path.suffix.lower() == ".exr":
+        return exr_depth(path)
+    return _decode(file_content(path), path, cv2.IMREAD_UNCHANGED)
+
+
 def _array(path: Path) -> np.ndarray:
     """What an `.npy` file holds; no pickle is opened, and no size that its header declares is believed."""
-    content = _content(path)
+    content = file_content(path)
     try:
         stream = io.BytesIO(content)
         header = array_header(stream)
@@ -126,7 +140,7 @@ MOST_BYTES = 700_000_000
 """Of an image's file: all that is decoded, a hundred million pixels, unpacked, of 16 bits in three channels."""
 
 
-def _content(path: Path) -> bytes:
+def file_content(path: Path) -> bytes:
     """All bytes of a regular file that is no larger than an image can be."""
     try:
         if path.exists() and not path.is_file():  # a list may name a pipe, which has no end
@@ -139,15 +153,14 @@ def _content(path: Path) -> bytes:
         raise InputError(f"`{path}` cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
-    """The file's bytes, and the image in them."""
-    content = _content(path)
+def _decode(content: bytes, path: Path, flags: int) -> np.ndarray:
+    """The image in the bytes of a file."""
     wrong = defect(content)
     if wrong:
         raise InputError(f"`{path}` {wrong}")
     if content.startswith(b"\xff\xd8"):
         try:
-            return content, simplejpeg.decode_jpeg(content, "BGR")
+            return simplejpeg.decode_jpeg(content, "BGR")
         except ValueError as error:
             wrong = decoding_defect(str(error))
         if wrong:
@@ -158,4 +171,4 @@ def _decode(path: Path, flags: int) -> tuple[bytes, np.ndarray]:
         raise InputError(f"`{path}` cannot be decoded: {error.err}") from None
     if image is None:
         raise InputError(f"`{path}` cannot be decoded: it is damaged, or not an image")
-    return content, image
+    return image

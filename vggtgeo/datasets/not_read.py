@@ -1,6 +1,5 @@
 """Recordings whose layout is known and not read: what they are, and what to do."""
 
-import zipfile
 from pathlib import Path
 
 _RAW_PARTS = ("image_00", "image_01", "image_02", "image_03", "oxts", "velodyne_points")
@@ -8,13 +7,6 @@ _RAW_PARTS = ("image_00", "image_01", "image_02", "image_03", "oxts", "velodyne_
 
 def reason_not_read(place: Path) -> str | None:
     """A sentence about a file or folder that is such a recording; None for any other."""
-    if _is_record3d(place):
-        return (
-            f"`{place}` is a recording of Record3D, whose depth (LZFSE) is not read; unpack it (it is a zip archive) "
-            "and write each `rgbd/0.depth` (float32 metres) as 16-bit millimetres into `depth/0.png` beside "
-            "`rgb/0.jpg`, or give its folder `rgbd` alone for images without depth; `K` in `metadata` "
-            "holds the intrinsics, by columns"
-        )
     if _is_part_of_raw_kitti(place):
         return (
             f"`{place}` is a part of KITTI's raw recordings; give the folder of a drive, which holds `image_02/data` "
@@ -47,19 +39,6 @@ def _archive(file: Path) -> str | None:
     if head[_TAR[0] :] == _TAR[1]:
         return "a tar archive"
     return next((kind for start, kind in _ARCHIVES.items() if head.startswith(start)), None)
-
-
-def _is_record3d(place: Path) -> bool:
-    if place.is_dir():
-        return (place / "metadata").is_file() and (place / "rgbd").is_dir()
-    if not (place.is_file() and zipfile.is_zipfile(place)):
-        return False
-    try:
-        with zipfile.ZipFile(place) as archive:
-            names = archive.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return False
-    return "metadata" in names and any(name.startswith("rgbd/") for name in names)
 
 
 def _is_part_of_raw_kitti(place: Path) -> bool:

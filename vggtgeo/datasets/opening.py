@@ -19,6 +19,7 @@ from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.not_read import reason_not_read
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
+from vggtgeo.datasets.record3d import Record3d
 from vggtgeo.datasets.replica import Replica
 from vggtgeo.datasets.rgbd_folders import RgbdFolders
 from vggtgeo.datasets.scannet import ScanNet
@@ -48,6 +49,7 @@ FOLDER_KINDS: dict[str, FolderReader] = {
     "scannet": ScanNet,
     "arkitscenes": ArkitScenes,
     "stray": StrayScanner,
+    "record3d": Record3d,
     "kitti": Kitti,
     "tanks": TanksAndTemples,
     "icl": IclNuim,
@@ -100,6 +102,8 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
     if kind == "bag" or (kind is None and is_bag(place)):
         return RosBag.open(place)
+    if place.is_file() and (kind == "record3d" or (kind is None and Record3d.matches(place))):
+        return Record3d.open(place)
     if kind == "video" or (kind is None and not place.is_dir()):
         return _open_video(place)
     if not place.is_dir():
@@ -152,7 +156,7 @@ def _readable_below(folder: Path) -> Iterator[Path]:
         place, depth = waiting.popleft()
         try:
             inside = sorted(path for path in place.iterdir() if not path.name.startswith((".", "__")))
-            yield from (path for path in inside if path.suffix.lower() in _VIDEOS and path.is_file())
+            yield from (path for path in inside if path.suffix.lower() in _FILES and path.is_file())
             for path in (path for path in inside if path.is_dir()):
                 if any(reader.matches(path) for reader in FOLDER_KINDS.values()):
                     yield path
@@ -162,7 +166,7 @@ def _readable_below(folder: Path) -> Iterator[Path]:
             continue
 
 
-_VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".bag", ".mcap"})
+_FILES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".bag", ".mcap", ".r3d"})
 _MOST_LOOKED_AT, _DEEPEST = 100, 2
 """Folders, and levels below the one that was given: a whole disk is not searched for a hint."""
 

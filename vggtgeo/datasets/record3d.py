@@ -1,0 +1,284 @@
+"""Recordings of the app Record3D (a phone's LiDAR, or the camera of its face), as it shares them: a `.r3d`, which is a
+zip archive, or the same unpacked, or what it exports as "EXR + JPG".
+
+| `.r3d` | EXR + JPG | what it holds |
+|---|---|---|
+| `metadata` | `metadata.json` | size, camera (of each frame, too), times, ARKit's poses: quaternion x y z w, place |
+| `rgbd/0.jpg` | `rgb/0.jpg` | the image |
+| `rgbd/0.depth` | `depth/0.exr` | depth, float32 metres; in a `.r3d` compressed with LZFSE |
+| `rgbd/0.conf` | | trust in it, uint8, 0 to 2, compressed likewise; not of every phone |
+
+LZFSE is decoded by the package imagecodecs, EXR by OpenEXR (extra `phones`). Poses are those of ARKit, which are no
+independent truth.
+"""
+
+import json
+import math
+import re
+import warnings
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Self, cast
+
+import numpy as np
+
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, enlarged
+from vggtgeo.datasets.image_files import FARTHEST, MILLIMETRES, ImageFile, file_content, image_in, read_depth
+from vggtgeo.datasets.images import FRAMES_PER_SECOND
+from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, intrinsics_of
+from vggtgeo.datasets.nerfstudio import FROM_OPENGL
+from vggtgeo.datasets.pose_files import poses_of, trajectory_of
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.archives import UNREADABLE
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.models.extras import install_hint
+
+METADATA, EXPORTED = "metadata", "metadata.json"
+_IMAGE = re.compile(r"rgbd?/(\d{1,9})\.(jpe?g|png)")
+_LEAST_CONFIDENCE = 1
+"""Of 0 (low), 1 and 2."""
+
+
+@dataclass(frozen=True)
+class Record3d(FolderSequence):
+    """A recording of Record3D. `folder`: the archive, or the folder of its parts. Truth: ARKit's own poses.
+
+    depth_size: width and height of the depth, which is enlarged to the images.
+    """
+
+    depth_size: tuple[int, int] = (0, 0)
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Whether there is `metadata` beside `rgbd`, in a folder or a zip archive, or `metadata.json` beside EXR."""
+        if folder.is_dir():
+            exported = (folder / EXPORTED).is_file() and next((folder / "depth").glob("*.exr"), None) is not None
+            return exported or ((folder / METADATA).is_file() and (folder / "rgbd").is_dir())
+        try:
+            if not (folder.is_file() and zipfile.is_zipfile(folder)):
+                return False
+            names = _names(folder)
+        except UNREADABLE:
+            return False
+        return METADATA in names and any(name.startswith("rgbd/") for name in names)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Lists the images; InputError where there is none. Depth that cannot be read is told, and left out."""
+        try:
+            names = _names(folder)
+        except UNREADABLE as error:
+            raise InputError(f"`{folder}` is no archive of Record3D that can be read: {error}") from None
+        numbered = {int(match.group(1)): folder / name for name in sorted(names) if (match := _IMAGE.fullmatch(name))}
+        if not names & {METADATA, EXPORTED} or not numbered:
+            raise InputError(f"`{folder}` is no recording of Record3D: expected `{METADATA}` and `rgbd/0.jpg`, ...")
+        numbers = sorted(numbered)
+        images = [numbered[number] for number in numbers]
+        depths = [_depth_of(image) for image in images]
+        there = [depth if depth.relative_to(folder).as_posix() in names else None for depth in depths]
+        unread = cls(folder, folder.resolve().name, Camera.guess(1, 1), ())
+        metadata = unread.metadata()
+        files = tuple(map(FrameFile, range(len(numbers)), _times(metadata, numbers), images, there))
+        height, width = unread.first_image(files).shape[:2]
+        camera = _camera(unread.file, metadata, width, height) or guess_with_warning(str(folder), width, height)
+        whole = cls(folder, unread.name, camera, files, MILLIMETRES, any(there), _depth_size(metadata))
+        return whole if not any(there) or whole.depth_is_usable() else replace(whole, has_depth=False)
+
+    @property
+    def file(self) -> Path:
+        """Of the metadata."""
+        return self.folder / (EXPORTED if (self.folder / EXPORTED).is_file() else METADATA)
+
+    def metadata(self) -> Mapping[str, Any]:
+        """What the file of the metadata holds; InputError where it is no JSON object."""
+        where = self.file
+        try:
+            content = json.loads(self._content(where))
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"`{where}` is no JSON: {error}") from None
+        if not isinstance(content, dict):
+            raise InputError(f"`{where}` holds no object of JSON; expected one with `K`, `fps` and `poses`")
+        return content
+
+    def first_image(self, files: tuple[FrameFile, ...]) -> np.ndarray:
+        """The first of the images that can be read; InputError where none can."""
+        reason = ""
+        for file in files:
+            try:
+                return self.load_image(file.image).image
+            except InputError as error:
+                reason = reason or str(error)
+        raise InputError(f"none of the {len(files)} images of `{self.folder}` can be read; the first: {reason}")
+
+    def holds(self, path: Path) -> bool:
+        """Whether the archive, or the folder, has such a part."""
+        if self.folder.is_dir():
+            return path.is_file()
+        return path.relative_to(self.folder).as_posix() in self._archive.NameToInfo
+
+    def depth_is_usable(self) -> bool:
+        """Whether depth of the first, the middle or the last image that has some can be read; else an InputWarning."""
+        depths = [file.depth for file in self.files if file.depth is not None]
+        reason = ""
+        for depth in (depths[0], depths[len(depths) // 2], depths[-1]):
+            try:
+                self.load_depth(depth)
+            except InputError as error:
+                reason = reason or str(error)
+            else:
+                return True
+        warnings.warn(f"{reason}; reading the images only", InputWarning, stacklevel=4)
+        return False
+
+    def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
+        """The image in a part of the archive."""
+        return image_in(self._content(path), path, least_bits)
+
+    def load_depth(self, path: Path) -> np.ndarray:
+        """The depth in a part of the archive, enlarged to the images; what is not trusted is none."""
+        if path.suffix == ".exr":
+            return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height))
+        shape = self.camera.height, self.camera.width
+        depth = _shaped(self._unpacked(path, 4), np.float32, path, self.depth_size[::-1], shape)
+        depth = np.where((depth > 0) & (depth <= FARTHEST), depth, np.float32(np.nan))
+        trusted = path.with_suffix(".conf")
+        if self.holds(trusted):
+            trust = _shaped(self._unpacked(trusted, 1), np.uint8, trusted, depth.shape, shape)
+            depth[trust < _LEAST_CONFIDENCE] = np.nan
+        return enlarged(depth, (self.camera.width, self.camera.height))
+
+    def ground_truth(self) -> Trajectory | None:
+        """ARKit's poses, camera -> world; the file has them with OpenGL's axes. None where it has none."""
+        poses, where = self.metadata().get("poses"), self.file
+        if not (isinstance(poses, list) and poses):
+            return None
+        try:
+            rows = np.array(poses, np.float64).reshape(len(poses), 7)
+        except (ValueError, TypeError):
+            raise InputError(f"`{where}`: a pose has not 7 numbers, a quaternion and a place") from None
+        numbers = [int(file.image.stem) for file in self.files]
+        there = [row for row, number in enumerate(numbers) if number < len(rows)]
+        found = poses_of(rows[:, 4:], rows[:, :4])[[numbers[row] for row in there]] @ FROM_OPENGL
+        return trajectory_of([self.files[row].timestamp for row in there], found, where)
+
+    def _content(self, path: Path) -> bytes:
+        """All bytes of a part, by its path in the folder or, as if it were one, in the archive."""
+        if self.folder.is_dir():
+            return file_content(path)
+        try:
+            return self._archive.read(path.relative_to(self.folder).as_posix())
+        except UNREADABLE as error:
+            raise InputError(f"`{path}` cannot be read: {error}") from None
+
+    @cached_property
+    def _archive(self) -> zipfile.ZipFile:
+        """Open as long as the sequence lives: its list of contents takes longer to read than an image."""
+        return zipfile.ZipFile(self.folder)
+
+    def _unpacked(self, path: Path, item_bytes: int) -> bytes:
+        """The bytes that LZFSE made smaller: at most one of these items for each pixel of the image."""
+        most = item_bytes * self.camera.width * self.camera.height
+        packed = self._content(path)
+        try:
+            content = _decoder()(packed, out=most + 1)
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"`{path}` cannot be unpacked (LZFSE): {error}") from None
+        if len(content) > most:
+            raise InputError(f"`{path}` unpacks to more than {most} bytes; expected no more pixels than the image has")
+        return bytes(content)
+
+
+def _names(place: Path) -> frozenset[str]:
+    """Of the parts."""
+    if place.is_dir():
+        parts = [place / METADATA, place / EXPORTED]
+        parts += [path for name in ("rgbd", "rgb", "depth") for path in (place / name).glob("*")]
+        return frozenset(path.relative_to(place).as_posix() for path in parts if path.is_file())
+    with zipfile.ZipFile(place) as archive:
+        return frozenset(archive.namelist())
+
+
+def _depth_of(image: Path) -> Path:
+    """Where the depth of an image would be."""
+    if image.parent.name == "rgbd":
+        return image.with_suffix(".depth")
+    return image.parent.parent / "depth" / f"{image.stem}.exr"
+
+
+def _decoder() -> Callable[..., Any]:
+    try:
+        from imagecodecs import lzfse_decode
+    except ImportError:
+        hint = install_hint("phones")
+        raise InputError(f"depth of Record3D (LZFSE) needs the package imagecodecs; {hint}") from None
+    return cast(Callable[..., Any], lzfse_decode)
+
+
+def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image: tuple[int, int]) -> np.ndarray:
+    """An array of that size, rows and columns, or, where it is (0, 0), in the shape of an image."""
+    each = np.dtype(kind).itemsize
+    rows, columns = size
+    if not all(size):
+        rows = round(math.sqrt(len(content) / each * image[0] / image[1]))
+        columns = round(rows * image[1] / image[0])
+    if not content or rows * columns * each != len(content):
+        raise InputError(
+            f"`{path}` unpacks to {len(content)} bytes; expected {rows * columns * each}, {columns} x {rows} pixels"
+        )
+    return np.frombuffer(content, kind).reshape(rows, columns)
+
+
+def _depth_size(metadata: Mapping[str, Any]) -> tuple[int, int]:
+    """Width and height; (0, 0) where older versions of the app do not say."""
+    width, height = metadata.get("dw"), metadata.get("dh")
+    if isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
+        return width, height
+    return 0, 0
+
+
+def _times(metadata: Mapping[str, Any], numbers: list[int]) -> list[float]:
+    """Seconds of each image: those of the file, where they rise, else by its frames a second."""
+    stamps = metadata.get("frameTimestamps")
+    if isinstance(stamps, list) and len(stamps) > numbers[-1]:
+        times = [stamps[number] for number in numbers]
+        if all(map(_is_number, times)) and all(after > before for before, after in pairwise(times)):
+            return [float(time) for time in times]
+    stated: Any = metadata.get("fps")
+    rate = stated if _is_number(stated) and stated > 0 else FRAMES_PER_SECOND
+    return [number / rate for number in numbers]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -> Camera | None:
+    """The middle of the cameras of all frames, which autofocus changes a little; else the one of the file."""
+    size = metadata.get("w"), metadata.get("h")
+    if None not in size and size != (width, height):
+        warnings.warn(
+            f"`{where}` has a camera for {size[0]} x {size[1]} pixels; the images are {width} x {height}: not used",
+            InputWarning,
+            stacklevel=4,
+        )
+        return None
+    try:
+        frames = metadata.get("perFrameIntrinsicCoeffs")
+        if isinstance(frames, list) and frames:
+            values = np.median(np.array(frames, np.float64).reshape(len(frames), 4), axis=0)
+        elif (matrix := metadata.get("K")) is not None:
+            columns = np.array(matrix, np.float64).reshape(3, 3)
+            columns = columns if columns[2, :2].any() else columns.T
+            values = np.array([columns[0, 0], columns[1, 1], *columns[2, :2]])
+        else:
+            return None
+    except (ValueError, TypeError):
+        raise InputError(f"`{where}`: `K` must hold 9 numbers, `perFrameIntrinsicCoeffs` 4 for each frame") from None
+    camera = Camera(intrinsics_of(where, tuple(values.tolist())), width, height)
+    check_plausible(f"`{where}`", camera)
+    return camera
