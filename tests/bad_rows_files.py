@@ -172,7 +172,10 @@ IMAGES = rows(
         ("a single image", bad.file("a.png", bad.encoded(".png"))),
         ("an animated GIF", bad.file("a.gif", b"GIF89a" + NUL)),
         ("a recording of Record3D, one depth damaged", spoilt(layouts.record3d, "rgbd/1.depth", "bvx2 and no more")),
-        ("a recording of Record3D whose camera is of other images", spoilt(layouts.record3d, "metadata", '{"w": 960, "h": 720}')),
+        (
+            "a recording of Record3D whose camera is of other images",
+            spoilt(layouts.record3d, "metadata", '{"w": 960, "h": 720}'),
+        ),
         ("a recording of Record3D, its metadata cut off", spoilt(layouts.record3d, "metadata", '{"w": 40, "h"')),
         ("a damaged EXR", spoilt(layouts.record3d_exported, "depth/1.exr", "v/1")),
         ("one camera of a raw drive of KITTI", lambda folder: layouts.kitti_raw(folder) / "image_02"),

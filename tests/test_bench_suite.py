@@ -187,6 +187,15 @@ def test_a_recording_is_found_below_any_data_folder(tmp_path: Path) -> None:
         assert jobs_of(read_suite(text, "t", "t"), folders)[-1].spec["path"].endswith("older/desk")
 
 
+def test_a_recording_in_a_folder_of_its_own_name_is_found(tmp_path: Path) -> None:
+    # Proves that an archive which was unpacked into a folder of its own name is no empty recording.
+    tiny_sequences.tum(tmp_path / "desk" / "desk")
+    text = tiny.TEXT.replace('simulate = { scene = "hall", frames = 4 }', 'path = "desk"')
+    with pytest.warns(InputWarning, match=r"hall in `.*/desk/desk` \(the first of 2, with `.*/desk`\)"):
+        jobs = jobs_of(read_suite(text, "t", "t"), [tmp_path])
+    assert jobs[-1].spec["path"].endswith("desk/desk")
+
+
 def test_a_recording_that_is_not_there_is_told_where_it_was_looked_for(tmp_path: Path) -> None:
     # Proves that the row says which folder was expected where, and what to do where no folder was given.
     text = tiny.TEXT.replace('simulate = { scene = "hall", frames = 4 }', 'path = "desk"')

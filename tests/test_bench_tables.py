@@ -55,6 +55,8 @@ def test_summaries_are_those_of_the_textbook() -> None:
     np.testing.assert_allclose([found.mean - found.half, found.mean + found.half], [low, high], rtol=1e-12)
     assert (found.count, found.deviation) == (12, pytest.approx(np.std(a - b, ddof=1)))
     assert found.differs == (low > 0 or high < 0)
+    assert not Summary.of(np.full(3, 0.1)).differs
+    assert not Summary.of(np.zeros(3)).differs
     one = Summary.of(np.array([5.0]))
     assert (one.mean, np.isnan(one.half), one.differs) == (5.0, True, False)
     assert cells.number_cell(one, 2) == "5.00"
@@ -65,7 +67,35 @@ def test_differences_are_taken_run_by_run() -> None:
     rows = [row("walk", "full", 1, 4.0), row("walk", "bare", 0, 5.0), row("walk", "bare", 1, 9.0), *ROWS[6:]]
     np.testing.assert_allclose(100 * paired(rows, "bare", "full", "ate_se3_m", "walk"), [5.0])
     np.testing.assert_allclose(100 * paired(rows, "bare", "full", "ate_se3_m"), [-1.0, -0.5, -1.5, 5.0])
+    # Over all sequences a recording is one sample, and a rendered world one for each seed.
+    found = paired(rows, "bare", "full", "ate_se3_m", recorded={"hall"})
+    np.testing.assert_allclose(100 * found, [-1.0, 5.0])
     np.testing.assert_allclose(paired([*ROWS[:3], row("walk", "bare", 0, None)], "bare", "full", "ate_se3_m"), [])
+
+
+def test_seeds_of_a_recording_are_no_recordings() -> None:
+    # Proves that the row over all sequences counts a recording once, and that seeds which agree mark nothing.
+    rows = [row(name, "full", seed, 1.0) for name in ("walk", "hall") for seed in range(5)]
+    rows += [row("walk", "bare", seed, 1.8 + 0.01 * seed) for seed in range(5)]
+    rows += [row("hall", "bare", seed, 1.2) for seed in range(5)]
+    suite = tiny.suite()
+    recorded = replace(suite, sequence=tuple(replace(one, simulate={}, path=one.name) for one in suite.sequence))
+    found = {one.sequence: one for one in cells.differences(recorded, rows)}
+    assert {name: one.pairs for name, one in found.items()} == {"walk": 5, "hall": 5, "all": 2}
+    assert {name: one.cells[0].place for name, one in found.items()} == {"walk": 2, "hall": 0, "all": 0}
+
+
+def test_yaw_is_about_the_vertical_of_the_truth() -> None:
+    # Proves the axis of a world with y up. Oracle: a path that was turned about y, and moved.
+    angle, times = np.radians(40.0), np.arange(20.0)
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(20, 3))
+    turn = np.eye(4)
+    turn[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    turn[:3, 3] = 1.0, 2.0, 3.0
+    estimate, truth = Trajectory(times, turn @ poses), Trajectory(times, poses)
+    assert trajectory_errors(estimate, truth, vertical="y")[0]["ate_yaw_m"] == pytest.approx(0.0, abs=1e-9)
+    assert trajectory_errors(estimate, truth)[0]["ate_yaw_m"] > 0.5
 
 
 def test_tables_mark_the_best_and_the_second() -> None:

@@ -150,10 +150,11 @@ def test_the_result_of_a_run_is_no_recording(tmp_path: Path) -> None:
         open_sequence(folder)
 
 
-def test_scannet_brings_images_to_the_depth_camera(tmp_path: Path) -> None:
+@pytest.mark.parametrize("write", [tiny.scannet, tiny.scannet_flat])
+def test_scannet_brings_images_to_the_depth_camera(tmp_path: Path, write: Callable[[Path], Path]) -> None:
     # Proves that a pixel of the image shows what the depth of that pixel measures, that lost poses are left out with a
     # word, and that depth is in millimetres. Oracle: the place that each pixel of the large image has as colour.
-    sequence = tiny.quietly_opened(tiny.scannet(tmp_path / "scene0000_00"))
+    sequence = tiny.quietly_opened(write(tmp_path / "scene0000_00"))
     frames = _check(sequence, "ScanNet")
     assert frames[0].image.shape[:2] == frames[0].depth.shape == (30, 40)
     x, y = np.meshgrid(np.arange(40), np.arange(30))
@@ -199,6 +200,21 @@ def test_icl_is_mirrored_with_its_truth(tmp_path: Path) -> None:
     assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1.0)
 
 
+@pytest.mark.filterwarnings("ignore::vggtgeo.io.errors.NoteWarning")
+@pytest.mark.parametrize("write", [tiny.scannet, tiny.tanks, tiny.arkit, tiny.icl, tiny.kitti, tiny.stray])
+def test_what_macos_leaves_beside_files_is_none(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    # Proves that a recording that lay on a disk formatted elsewhere is read: a file `._NAME` stands beside each.
+    folder = write(tmp_path / "room")
+    before = tiny.quietly_opened(folder)
+    for file in [path for path in folder.rglob("*") if path.is_file()]:
+        file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7" + bytes(78))
+    after = tiny.quietly_opened(folder)
+    assert (type(after), len(after), after.camera) == (type(before), len(before), before.camera)
+    assert [frame.name for frame in after.frames()] == [frame.name for frame in before.frames()]
+    if (truth := before.ground_truth()) is not None:
+        np.testing.assert_array_equal(after.ground_truth().poses, truth.poses)
+
+
 def test_tanks_and_temples(tmp_path: Path) -> None:
     # Proves the log, the similarity to the scanner's frame, and the crop. Oracle: what was written; points by hand, one
     # of them in the notch of the polygon.
@@ -209,6 +225,9 @@ def test_tanks_and_temples(tmp_path: Path) -> None:
     truth = sequence.ground_truth()
     np.testing.assert_allclose(truth.positions, [[0, 0, 5], [2, 0, 5], [4, 0, 5]])
     np.testing.assert_allclose(truth.rotations[1], np.eye(3), atol=1e-12)
+    (folder / "000002.jpg").unlink()
+    part = tiny.quietly_opened(folder)
+    assert [frame.timestamp for frame in part.frames()] == pytest.approx([truth.timestamps[0], truth.timestamps[2]])
     points = np.array([[1.0, 0, 0.5], [1.0, 2, 0.5], [1.0, 0, 1.5], [0.2, 0, 1.5], [3.0, 0, 0.5]])
     assert inside_crop(folder / "Ignatius.json", points).tolist() == [True, False, False, True, False]
 

@@ -1,5 +1,7 @@
 """Windows on the disk: what was written is read, in an order that the seed tells, without holding all of it."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -8,7 +10,7 @@ import pytest
 
 import vggtgeo as vg
 from vggtgeo.io.errors import InputError
-from vggtgeo.learning.window_dataset import RunWindows, WindowDataset, WindowWriter, stacked
+from vggtgeo.learning.window_dataset import RunWindows, WindowDataset, WindowWriter, stack_windows
 
 SIZE = vg.PaddedSize(keyframes=3, points=16, lines=0, degree=2)
 COUNT = 7
@@ -96,11 +98,36 @@ def test_loaders_take_it_as_it_is(folder: Path) -> None:
     try:
         from torch.utils.data import DataLoader
     except ImportError:
-        batches = [stacked([data[row] for row in rows]) for rows in ((0, 1), (2, 3))]
+        batches = [stack_windows([data[row] for row in rows]) for rows in ((0, 1), (2, 3))]
     else:
-        batches = list(DataLoader(data, batch_size=2, collate_fn=stacked))  # type: ignore[arg-type]
+        batches = list(DataLoader(data, batch_size=2, collate_fn=stack_windows))  # type: ignore[arg-type]
     assert batches[1].labels["seed"].tolist() == [2, 3]
     assert batches[0].problem.points.weight.shape[0] == 2
+
+
+FORKED = """
+import multiprocessing, sys, warnings
+import jax
+import vggtgeo as vg
+
+warnings.simplefilter("ignore")  # JAX's own about forks
+data = vg.WindowDataset.open(sys.argv[1])
+jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((500, 500))))
+
+def read(row):
+    return vg.stack_windows([data[row], data[row + 1]]).labels["seed"].tolist()
+
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    print(pool.map_async(read, range(4)).get(30))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems start the workers of a loader anew")
+def test_forked_workers_read_it(folder: Path) -> None:
+    # Proves that a loader's worker, forked from a process that has used JAX, does not wait for ever: what torch's
+    # loader does on Linux. Oracle: the labels.
+    ran = subprocess.run([sys.executable, "-c", FORKED, folder], capture_output=True, text=True, check=False)
+    assert ran.stdout.strip() == "[[0, 1], [1, 2], [2, 3], [3, 4]]", ran.stderr
 
 
 def test_grain_takes_it_as_it_is(folder: Path) -> None:
@@ -108,11 +135,11 @@ def test_grain_takes_it_as_it_is(folder: Path) -> None:
     # stacks it. Oracle: the labels, and the windows themselves.
     grain = pytest.importorskip("grain.python", reason="grain is not installed")
     data = WindowDataset.open(folder)
-    loaded = grain.MapDataset.source(data).shuffle(seed=3).batch(1, batch_fn=stacked)
+    loaded = grain.MapDataset.source(data).shuffle(seed=3).batch(1, batch_fn=stack_windows)
     seeds = [int(batch.labels["seed"][0]) for batch in loaded]
     assert sorted(seeds) == list(range(COUNT))
     assert seeds != list(range(COUNT))
-    expected = stacked([data[seeds[0]]])
+    expected = stack_windows([data[seeds[0]]])
     for a, b in zip(jax.tree.leaves(loaded[0].problem), jax.tree.leaves(expected.problem), strict=True):
         np.testing.assert_array_equal(a, b)
 

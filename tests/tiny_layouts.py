@@ -1,6 +1,7 @@
 """Tiny recordings in the layouts of the benchmarks, as they are downloaded; see `tiny_sequences` for their contents."""
 
 import json
+import shutil
 import warnings
 import zipfile
 from collections.abc import Sequence
@@ -82,6 +83,26 @@ def scannet(folder: Path) -> Path:
         (folder / "intrinsic").mkdir(exist_ok=True)
         (folder / f"intrinsic/intrinsic_{name}.txt").write_text(_matrix(matrix))
     return folder
+
+
+def scannet_flat(folder: Path) -> Path:
+    """The same as SensReader in C++ exports it."""
+    made = scannet(folder)
+    for number in range(COUNT):
+        for what, old, new in (("color", ".png", ".png"), ("depth", ".png", ".pgm"), ("pose", ".txt", ".txt")):
+            source, target = made / what / f"{number}{old}", made / f"frame-{number:06d}.{what}{new}"
+            if old == new:
+                source.rename(target)
+            else:
+                write_image(target, depth_codes(number))
+    lines = ["m_versionNumber = 4\n"]
+    for name in ("Color", "Depth"):
+        numbers = (made / f"intrinsic/intrinsic_{name.lower()}.txt").read_text().split()
+        lines.append(f"m_calibration{name}Intrinsic = {' '.join(numbers)} \n")
+    for what in ("color", "depth", "pose", "intrinsic"):
+        shutil.rmtree(made / what)
+    (made / "_info.txt").write_text("".join(lines))
+    return made
 
 
 def euroc(folder: Path) -> Path:
@@ -299,8 +320,10 @@ def bonn(folder: Path) -> Path:
     return folder
 
 
-def bag(path: Path, ros2: bool, calibrated: bool = True, lens: str = "plumb_bob") -> Path:
-    """Images 0.1 s apart, depth in millimetres 5 ms later, the camera, and the truth of a marker."""
+def bag(path: Path, ros2: bool, calibrated: bool = True, lens: str = "plumb_bob", more: Sequence[str] = ()) -> Path:
+    """Images 0.1 s apart, depth in millimetres 5 ms later, the camera, and the truth of a marker. more: topics of depth
+    that is not registered.
+    """
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
@@ -315,6 +338,7 @@ def bag(path: Path, ros2: bool, calibrated: bool = True, lens: str = "plumb_bob"
             "/camera/color/camera_info": "sensor_msgs/msg/CameraInfo",
             "/camera/aligned_depth/image_raw": "sensor_msgs/msg/Image",
             "/mocap/pose": "geometry_msgs/msg/PoseStamped",
+            **dict.fromkeys(more, "sensor_msgs/msg/Image"),
         }
         connections = {name: writer.add_connection(name, kind, typestore=store) for name, kind in topics.items()}
 
@@ -328,6 +352,7 @@ def bag(path: Path, ros2: bool, calibrated: bool = True, lens: str = "plumb_bob"
             for topic, later, encoding, pixels in (
                 ("/camera/color/image_raw", 0.0, "rgb8", image(number)),
                 ("/camera/aligned_depth/image_raw", 0.005, "16UC1", depth_codes(number)),
+                *((topic, 0.005, "16UC1", depth_codes(number)[::-1]) for topic in more),
             ):
                 data = np.frombuffer(pixels.tobytes(), np.uint8)
                 step = len(data) // HEIGHT

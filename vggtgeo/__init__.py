@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from vggtgeo.learning.window_dataset import RunWindows as RunWindows
     from vggtgeo.learning.window_dataset import WindowDataset as WindowDataset
     from vggtgeo.learning.window_dataset import WindowWriter as WindowWriter
+    from vggtgeo.learning.window_dataset import stack_windows as stack_windows
     from vggtgeo.mapping.fusion import SurfaceFusion as SurfaceFusion
     from vggtgeo.results.checkpoints import Checkpoints as Checkpoints
     from vggtgeo.results.reading import evaluate as evaluate
@@ -150,7 +151,7 @@ _HOME = {
     "bundle.problem": ("Problem", "State"),
     "bundle.problem_file": ("load_problem", "save_problem"),
     "bundle.residuals": ("ResidualSizes", "residual_sizes", "residuals_at"),
-    "learning.window_dataset": ("RunWindows", "WindowDataset", "WindowWriter"),
+    "learning.window_dataset": ("RunWindows", "WindowDataset", "WindowWriter", "stack_windows"),
     "mapping.fusion": ("SurfaceFusion",),
     "results.result": ("Result",),
     "results.reading": ("evaluate", "read"),

@@ -58,7 +58,7 @@ def _row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -
         truth = _truth(job, runs)
         if truth is None:
             return {**row, "status": "error", "message": "there is no truth to compare with"}
-        errors, _ = trajectory_errors(load_trajectory(file, truth), truth, table.metric)
+        errors, _ = trajectory_errors(load_trajectory(file, truth), truth, table.metric, vertical=job.spec["vertical"])
     except InputError as error:
         return {**row, "status": "error", "message": str(error)}
     return {**row, **errors}

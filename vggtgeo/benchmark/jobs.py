@@ -14,6 +14,7 @@ from vggtgeo.benchmark.inputs import find_sequences
 from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.suite import SequenceTable, SettingTable, Suite
+from vggtgeo.datasets.opening import is_readable
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.settings_table import Tables, changed, updated
@@ -55,7 +56,9 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
     says which of them were found in folders below those.
     """
     roots = tuple(data)
-    places = {one.name: find_sequences(one.path, roots) if one.path else [] for one in suite.sequence}
+    # An archive that was unpacked into a folder of its own name has the recording one folder further down.
+    first_readable = lambda places: sorted(places, key=lambda place: not is_readable(place))
+    places = {one.name: first_readable(find_sequences(one.path, roots) if one.path else []) for one in suite.sequence}
     _tell_deeper(suite, places, roots)
     found = []
     for sequence in suite.sequence:
@@ -115,6 +118,7 @@ def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: P
         "key_points": sequence.key_points,
         "references": dict(sequence.references),
         "threshold": sequence.threshold,
+        "vertical": sequence.vertical,
         "exact_depth": sequence.exact_depth,
         "set": _plain(changed(settings)),
         "pages": suite.pages,

@@ -12,6 +12,7 @@ import numpy as np
 from vggtgeo.benchmark.inputs import Input
 from vggtgeo.benchmark.map_errors import depth_errors, map_errors
 from vggtgeo.evaluation import Similarity, TrajectoryReport, evaluate_trajectory, focal_error, pose_consistency
+from vggtgeo.evaluation.alignment import AXES, Axis
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.results.result import Result
@@ -43,7 +44,7 @@ def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str,
     truth = truth_of_run(result, given.truth)
     alignment = None
     if truth is not None:
-        errors, alignment = trajectory_errors(estimate, truth, result.metric)
+        errors, alignment = trajectory_errors(estimate, truth, result.metric, vertical=spec["vertical"])
         row |= errors
     for name, file in spec["references"].items():
         reference = Trajectory.load_tum(Path(spec["path"]) / file)
@@ -88,13 +89,13 @@ def between(truth: Trajectory, first: float, last: float) -> Trajectory:
 
 
 def trajectory_errors(
-    estimate: Trajectory, truth: Trajectory, metric: bool = True, max_dt: float = 0.01
+    estimate: Trajectory, truth: Trajectory, metric: bool = True, max_dt: float = 0.01, vertical: Axis = "z"
 ) -> tuple[dict[str, Any], Similarity | None]:
     """ATE after each alignment, RTE and RRE at `DELTAS`; and the alignment that maps are compared after: SE(3) where
     lengths are metres, else Sim(3). Relative errors of an estimate without scale are taken after that, too.
     """
     try:
-        report = evaluate_trajectory(estimate, truth, max_dt)
+        report = evaluate_trajectory(estimate, truth, max_dt, vertical=AXES[vertical])
     except InputError as error:
         return {"warnings": str(error), "matched": 0}, None
     row: dict[str, Any] = {

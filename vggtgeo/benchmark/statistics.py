@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -14,17 +14,18 @@ from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.table import number
 
 LEVEL = 0.95
+SAME = 1e-6
+"""Relative spread below which numbers are the same: nothing was drawn at random."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Of n numbers: mean, median, sample standard deviation (NaN for one), and the half width of the 95 % interval of
-    the mean by Student's law (NaN for one).
+    """Of n numbers: mean, sample standard deviation (NaN for one), and the half width of the 95 % interval of the mean
+    by Student's law (NaN for one).
     """
 
     count: int
     mean: float
-    median: float
     deviation: float
     half: float
 
@@ -34,15 +35,17 @@ class Summary:
         known = values[np.isfinite(values)]
         count = len(known)
         if not count:
-            return cls(0, np.nan, np.nan, np.nan, np.nan)
+            return cls(0, np.nan, np.nan, np.nan)
         deviation = float(np.std(known, ddof=1)) if count > 1 else np.nan
         half = float(student.ppf(0.5 + LEVEL / 2, count - 1)) * deviation / np.sqrt(count) if count > 1 else np.nan
-        return cls(count, float(known.mean()), float(np.median(known)), deviation, float(half))
+        return cls(count, float(known.mean()), deviation, float(half))
 
     @property
     def differs(self) -> bool:
-        """Whether zero lies outside of the interval."""
-        return bool(abs(self.mean) > self.half)
+        """Whether zero lies outside of the interval. Numbers that agree to the last digit have none: seeds that change
+        nothing say nothing of chance.
+        """
+        return bool(abs(self.mean) > self.half > SAME * abs(self.mean))
 
 
 def select(rows: Sequence[Row], sequence: str | None = None, setting: str | None = None) -> list[Row]:
@@ -61,13 +64,23 @@ def values(rows: Sequence[Row], column: str) -> Float[np.ndarray, " n"]:
 
 
 def paired(
-    rows: Sequence[Row], setting: str, baseline: str, column: str, sequence: str | None = None
+    rows: Sequence[Row],
+    setting: str,
+    baseline: str,
+    column: str,
+    sequence: str | None = None,
+    recorded: Collection[str] = (),
 ) -> Float[np.ndarray, " n"]:
-    """Setting minus baseline on the same sequence and seed, where both have a number."""
+    """Setting minus baseline on the same sequence and seed, where both have a number.
+
+    recorded: sequences of which there is one, whatever the seed. Over several sequences such a one is one sample, the
+    mean over its seeds: ten seeds of two recordings are no twenty recordings.
+    """
     other = {(row["sequence"], row["seed"]): number(row, column) for row in select(rows, sequence, baseline)}
-    differences = [
-        number(row, column) - other.get((row["sequence"], row["seed"]), np.nan)
-        for row in select(rows, sequence, setting)
-    ]
-    found = np.array(differences, float)
-    return found[np.isfinite(found)]
+    samples: dict[tuple[str, int | None], list[float]] = {}
+    for row in select(rows, sequence, setting):
+        difference = number(row, column) - other.get((row["sequence"], row["seed"]), np.nan)
+        if np.isfinite(difference):
+            one = sequence is None and row["sequence"] in recorded
+            samples.setdefault((row["sequence"], None if one else row["seed"]), []).append(difference)
+    return np.array([np.mean(sample) for sample in samples.values()], float)

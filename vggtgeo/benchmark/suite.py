@@ -20,6 +20,7 @@ from vggtgeo.benchmark.checked_table import CheckedTable
 from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.published import check_published
 from vggtgeo.datasets.opening import KINDS
+from vggtgeo.evaluation.alignment import AXES
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.simulation.degradations import DEGRADATIONS
@@ -78,6 +79,7 @@ class SequenceTable(CheckedTable):
         key_points: of the simulated matcher, a frame.
         references: other truths by name, files of the TUM format in the sequence's folder; compared after Sim(3).
         threshold: of precision and recall, metres.
+        vertical: axis of the truth that points up or down, for the alignment by yaw alone: "x", "y" or "z".
         exact_depth: the recording's depth is exact (it was rendered): depth, map and mesh are compared with it.
         set: settings of the pipeline on this sequence.
     """
@@ -94,6 +96,7 @@ class SequenceTable(CheckedTable):
     key_points: int = 800
     references: Mapping[str, str] = field(default_factory=dict)
     threshold: float = 0.05
+    vertical: str = "z"
     exact_depth: bool = False
     set: Tables = field(default_factory=dict)
 
@@ -108,6 +111,7 @@ class SequenceTable(CheckedTable):
             WalkTable.read("`simulate`", self.simulate)
         if self.kind is not None:
             _one_of("kind", self.kind, KINDS)
+        _one_of("vertical", self.vertical, tuple(AXES))
         if self.start < 0:
             raise InputError(f"`start` is {self.start}; it must be at least 0")
         if self.end is not None and self.end <= self.start:

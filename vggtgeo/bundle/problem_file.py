@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +106,19 @@ def load_problem(
     return packed
 
 
+def load_arrays(path: Path, terms: Sequence[type] = ()) -> tuple[Problem, State, SlotIndex]:
+    """What `save_problem` wrote, with leaves of numpy and without JAX: for the workers of a data loader.
+
+    Raises:
+        InputError: as `load_problem`.
+
+    """
+    arrays = _read(path)
+    if DESCRIPTION not in arrays:
+        raise InputError(f"`{path}` is no problem that `save_problem` wrote")
+    return _restored(path, arrays, terms, None, np.asarray)
+
+
 def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -> None:
     """Write a problem with all its terms, kernels and its camera, a state and where the landmarks went, as `.npz`.
 
@@ -165,13 +178,17 @@ def _saved_or_flat(archive: Archive) -> dict[str, np.ndarray]:
 
 
 def _restored(
-    path: Path, arrays: dict[str, np.ndarray], terms: Sequence[type], dtype: DTypeLike | None
+    path: Path,
+    arrays: dict[str, np.ndarray],
+    terms: Sequence[type],
+    dtype: DTypeLike | None,
+    as_array: Callable[..., Any] = jnp.asarray,
 ) -> tuple[Problem, State, SlotIndex]:
     try:
         whole = json.loads(str(arrays[DESCRIPTION]))
         if whole["version"] != VERSION:
             raise InputError(f"it has the version {whole['version']}; this program reads {VERSION}")
-        problem, state = (restore(whole[name], arrays, terms, dtype) for name in ("problem", "state"))
+        problem, state = (restore(whole[name], arrays, terms, dtype, as_array) for name in ("problem", "state"))
         host, slot, edge = (arrays[f"index/{name}"] for name in ("host", "slot", "edge"))
         keyframes, edges, slots = map(int, whole["index"])
         index = SlotIndex(host, slot, edge, (keyframes, edges, slots))

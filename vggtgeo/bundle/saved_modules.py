@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jax.dtypes import canonicalize_dtype
 from jax.typing import DTypeLike
 
 from vggtgeo.bundle.precision import check_precision
@@ -59,11 +60,19 @@ def describe(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Descriptio
 
 
 def restore(
-    description: Description, arrays: Mapping[str, np.ndarray], own: Sequence[type], dtype: DTypeLike | None
+    description: Description,
+    arrays: Mapping[str, np.ndarray],
+    own: Sequence[type],
+    dtype: DTypeLike | None,
+    as_array: Callable[..., Any] = jnp.asarray,
 ) -> Any:
-    """What `describe` described. Float arrays become `dtype` (None: JAX's own for what is wider)."""
+    """What `describe` described. Float arrays become `dtype` (None: JAX's own for what is wider).
+
+    as_array: `numpy.asarray` for leaves of numpy, made without a word to JAX's device: what a process does that was
+    forked from one that uses JAX, which would wait for threads that it does not have.
+    """
     ((kind, content),) = ((k, v) for k, v in description.items() if k != "fields")
-    again = lambda part: restore(part, arrays, own, dtype)
+    again = lambda part: restore(part, arrays, own, dtype, as_array)
     if kind == "array":
         if content not in arrays:
             raise InputError(f"the array `{content}` is missing")
@@ -71,7 +80,7 @@ def restore(
         floating = np.issubdtype(values.dtype, np.floating)
         if floating:
             check_precision({content: values}, dtype)
-        return jnp.asarray(values, dtype if floating else None)
+        return as_array(values, canonicalize_dtype(dtype or values.dtype if floating else values.dtype))
     if kind == "value":
         return content
     if kind in ("list", "tuple"):

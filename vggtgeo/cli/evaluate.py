@@ -34,6 +34,9 @@ def evaluate(
     all_pairs: Annotated[
         bool, typer.Option("--all-pairs/--no-all-pairs", help="Overlapping pairs for RPE, not consecutive ones.")
     ] = False,
+    vertical: Annotated[
+        Literal["x", "y", "z"], typer.Option(help="Axis of GT that points up or down, for the yaw-only alignment.")
+    ] = "z",
     as_json: JsonOption = False,
 ) -> None:
     """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT.
@@ -41,11 +44,12 @@ def evaluate(
     Exit code 3: the numbers mean nothing, as the two are of different sequences, or the estimate failed.
     """
     from vggtgeo.evaluation import evaluate_trajectory
+    from vggtgeo.evaluation.alignment import AXES
     from vggtgeo.evaluation.resemblance import warn_of_strangers
 
     true = load_truth(truth)
     found, scale = load_estimate(estimate, true), load_scale(estimate)
-    report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit)
+    report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
     meaningless = warn_of_strangers(found, true, max_dt)
     if as_json:
         typer.echo(json.dumps({**report.as_dict(), **({} if scale is None else {"estimate_scale": scale})}, indent=2))

@@ -1,8 +1,9 @@
 """ROS 1 and ROS 2 bags, read without ROS by the package rosbags (extra `bags`).
 
-Topics are found by their types: the first with colour images (`sensor_msgs/Image` or `CompressedImage`), the first with
-depth (encoding 16UC1, millimetres, or 32FC1, metres), the camera's `CameraInfo`, and a path of poses for the truth
-(`PoseStamped`, `Odometry` or `TransformStamped`), whose name contains `truth`, `gt`, `vicon` or `mocap`.
+Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage`; colour before grey and infrared),
+depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
+any other), the camera's `CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
+name contains `truth`, `gt`, `vicon` or `mocap`. What is chosen of several is told.
 """
 
 import warnings
@@ -12,33 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import cv2
 import numpy as np
 
+from vggtgeo.datasets.bag_topics import IMAGES, chosen_topics, image_of, metres_of, told, truth_topic
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.intrinsics import guess_with_warning, is_fisheye
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
 from vggtgeo.models.extras import install_hint
 
 _DELAY = 0.02
 """Seconds between an image and its depth."""
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_POSES = ("geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped")
-_TRUTH = ("truth", "gt", "vicon", "mocap")
-_DEPTH = {"16UC1": (np.uint16, 1e-3), "mono16": (np.uint16, 1e-3), "32FC1": (np.float32, 1.0)}
-_COLOUR = {
-    "rgb8": (3, None),
-    "bgr8": (3, cv2.COLOR_BGR2RGB),
-    "rgba8": (4, cv2.COLOR_RGBA2RGB),
-    "bgra8": (4, cv2.COLOR_BGRA2RGB),
-    "mono8": (1, cv2.COLOR_GRAY2RGB),
-    "8UC3": (3, cv2.COLOR_BGR2RGB),
-}
-
-
 _BEGINS = b"#ROSBAG V"
 
 
@@ -65,15 +52,20 @@ class RosBag:
         """Looks through the topics; InputError where there are no colour images, or rosbags is not installed."""
         with _reader(path) as reader:
             topics = {name: str(info.msgtype) for name, info in reader.topics.items()}
-            colour, depth = _image_topics(reader, topics)
-            if not colour:
-                raise InputError(f"`{path}` has no topic with colour images; it has {', '.join(topics) or 'none'}")
-            poses = next((name for name, kind in topics.items() if kind in _POSES and _is_truth(name)), "")
-            first = next(_messages(reader, colour))[1]
-            height, width = _image(first).shape[:2]
-            camera = _camera(reader, topics, colour, width, height) or guess_with_warning(str(path), width, height)
-            times = tuple(time for time, _ in _messages(reader, colour))
-        return cls(path, path.name, camera, colour, depth, poses, times, bool(depth))
+            first = {name: next(_messages(reader, name), (0.0, None))[1] for name in topics if topics[name] in IMAGES}
+            first = {name: message for name, message in first.items() if message is not None}
+            try:
+                chosen = chosen_topics(first)
+                height, width = image_of(first[chosen.colour]).shape[:2]
+            except InputError as error:
+                raise InputError(f"`{path}` {error}") from None
+            poses = truth_topic(topics)
+            if text := told(chosen, [poses]):
+                _warn(f"`{path}`: {text}", NoteWarning)
+            camera = _camera(reader, topics, chosen.colour, width, height)
+            camera = camera or guess_with_warning(str(path), width, height)
+            times = tuple(time for time, _ in _messages(reader, chosen.colour))
+        return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, times, bool(chosen.depth))
 
     def __len__(self) -> int:
         return len(self.times)
@@ -104,7 +96,7 @@ class RosBag:
                         return
                     continue
                 try:
-                    image = _image(message)
+                    image = image_of(message)
                 except InputError as error:
                     _warn(f"`{self.name}`, image {index}: {error}; the frame is skipped", LeftOutWarning)
                     continue
@@ -119,7 +111,11 @@ class RosBag:
         near = [entry for entry in waiting if abs(entry[0] - time) <= _DELAY]
         if not near:
             return nothing
-        depth = _metres(min(near, key=lambda entry: abs(entry[0] - time))[1])
+        try:
+            depth = metres_of(min(near, key=lambda entry: abs(entry[0] - time))[1])
+        except InputError as error:
+            _warn(f"`{self.name}`, image {index}: {error}; used without depth")
+            return nothing
         if depth.shape != nothing.shape:
             _warn(f"`{self.name}`, depth of image {index} is {depth.shape[1]} x {depth.shape[0]}; used without depth")
             return nothing
@@ -157,48 +153,6 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
         header = message.header.stamp
         time = header.sec + 1e-9 * header.nanosec
         yield (time if time > 0 else 1e-9 * stamp), message
-
-
-def _image_topics(reader: Any, topics: dict[str, str]) -> tuple[str, str]:
-    colour = depth = ""
-    for name in [name for name, kind in topics.items() if kind in _IMAGES]:
-        message = next(_messages(reader, name), (0.0, None))[1]
-        if message is None:
-            continue
-        encoding = getattr(message, "encoding", "")
-        if encoding in _DEPTH:
-            depth = depth or name
-        elif encoding in _COLOUR or (not encoding and "depth" not in name.lower()):
-            colour = colour or name
-    return colour, depth
-
-
-def _is_truth(topic: str) -> bool:
-    return any(word in topic.lower() for word in _TRUTH)
-
-
-def _image(message: Any) -> np.ndarray:
-    """uint8 [H, W, 3], RGB."""
-    if not hasattr(message, "encoding"):  # compressed
-        image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
-        if image is None:
-            raise InputError("it cannot be decoded")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-    if message.encoding not in _COLOUR:
-        raise InputError(f"its encoding is {message.encoding}; known are {', '.join(_COLOUR)}")
-    channels, change = _COLOUR[message.encoding]
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
-    image = np.ascontiguousarray(rows[:, : message.width * channels]).reshape(message.height, message.width, channels)
-    return image if change is None else np.asarray(cv2.cvtColor(image, change))
-
-
-def _metres(message: Any) -> np.ndarray:
-    kind, unit = _DEPTH[message.encoding]
-    order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    rows = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), order).reshape(message.height, -1)
-    depth = rows[:, : message.width].astype(np.float32) * np.float32(unit)
-    depth[~(depth > 0) | ~np.isfinite(depth)] = np.nan
-    return depth
 
 
 def _camera(reader: Any, topics: dict[str, str], colour: str, width: int, height: int) -> Camera | None:

@@ -14,7 +14,7 @@ from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.images import rows_of
 from vggtgeo.datasets.opening import open_sequence
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 
 SAMPLES = 20
 """Frames that are decoded."""
@@ -50,6 +50,7 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
             truth = sequence.ground_truth()
         except InputError as error:
             return Inspection((), (*_texts(caught), str(error)))
+    notes = tuple(str(one.message) for one in caught if issubclass(one.category, NoteWarning))
     problems = [
         *_texts(caught),
         *missing,
@@ -61,7 +62,7 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
     problems += _of_truth(truth, frames)
     if not sequence.camera.known and not any("intrinsics" in text for text in problems):
         problems.append("the intrinsics are a guess; give --intrinsics, or put them into calibration.txt")
-    return Inspection(_facts(sequence, frames, truth), tuple(dict.fromkeys(problems)))
+    return Inspection((*_facts(sequence, frames, truth), *dict.fromkeys(notes)), tuple(dict.fromkeys(problems)))
 
 
 def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
@@ -91,7 +92,9 @@ def _sample(sequence: Sequence) -> list[Frame]:
 
 
 def _texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:
-    return [str(one.message) for one in caught if issubclass(one.category, InputWarning)]
+    """Of what may be wrong: a note says what was done as it should be."""
+    told = (one for one in caught if issubclass(one.category, InputWarning))
+    return [str(one.message) for one in told if not issubclass(one.category, NoteWarning)]
 
 
 def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) -> tuple[str, ...]:

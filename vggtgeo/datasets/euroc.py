@@ -17,7 +17,7 @@ from vggtgeo.datasets.intrinsics import intrinsics_of, is_fisheye
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_text, states_list, trajectory_of, yaml_numbers
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
 _MOST_DIGITS = 20
@@ -43,7 +43,7 @@ class Euroc(FolderSequence):
             raise InputError(f"`{folder}` has no `mav0/cam0/data.csv`; expected a sequence of EuRoC")
         if (base / "imu0" / "data.csv").is_file():
             warnings.warn(
-                f"`{folder}`: the IMU is not used; images alone leave the scale free", InputWarning, stacklevel=3
+                f"`{folder}`: the IMU is not used; images alone leave the scale free", NoteWarning, stacklevel=3
             )
         camera_folder = base / "cam0"
         files = tuple(

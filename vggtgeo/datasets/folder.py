@@ -22,7 +22,7 @@ from vggtgeo.datasets.image_files import (
 )
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
 
 _SAMPLES = 3
 _NAMED_EMPTY_DEPTHS = 3
@@ -194,7 +194,10 @@ def depth_is_usable(
             )
         if np.isfinite(depth).any():
             if of_fewer:
-                _warn(_other_size(file.depth, depth, width, height) + ": taken for the same view, and enlarged to them")
+                _warn(
+                    _other_size(file.depth, depth, width, height) + ": taken for the same view, and enlarged to them",
+                    NoteWarning,
+                )
             return True
     if with_depth:
         gone = not any(file.depth is not None and file.depth.exists() for file in with_depth)

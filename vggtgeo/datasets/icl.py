@@ -14,7 +14,7 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
-from vggtgeo.datasets.images import FRAMES_PER_SECOND
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of
 from vggtgeo.datasets.tum import MOST_LETTERS, read_pairs
@@ -42,7 +42,7 @@ class IclNuim(FolderSequence):
             head = (line[:MOST_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
             words = next(filter(None, head), [])
         counted = len(words) == 4 and words[0].isdecimal() and "depth" in words[1]
-        return counted or any(folder.glob("*.gt.freiburg"))
+        return counted or bool(files_like(folder, "*.gt.freiburg"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
@@ -60,7 +60,7 @@ class IclNuim(FolderSequence):
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses of the mirrored world."""
-        there = [*sorted(self.folder.glob("*.gt.freiburg")), self.folder / "groundtruth.txt"]
+        there = [*files_like(self.folder, "*.gt.freiburg"), self.folder / "groundtruth.txt"]
         file = next((file for file in there if file.is_file()), None)
         if file is None:
             return None

@@ -64,6 +64,15 @@ def _tell_of_more(folder: Path, count: int) -> None:
         warnings.warn(f"`{folder}`: {text}", InputWarning, stacklevel=4)
 
 
+def files_like(folder: Path, pattern: str) -> list[Path]:
+    """The files in `folder` whose names match, in natural order, without hidden ones.
+
+    macOS puts a hidden one beside each file that it copies to another disk (`._0.txt` beside `0.txt`).
+    """
+    found = (path for path in folder.glob(pattern) if path.name[0] != "." and path.is_file())
+    return sorted(found, key=lambda path: (natural_key(path.name), path.name))
+
+
 def natural_key(name: str) -> list[int | str]:
     """Sorts digits in `name` as numbers: `a2` before `a10`."""
     # The groups of the pattern are every second part; `isdigit` also holds of signs that are no numbers, as in `m²`.
@@ -71,13 +80,8 @@ def natural_key(name: str) -> list[int | str]:
 
 
 def image_files(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[Path]:
-    """The images in `folder`, in natural order; suffixes: of what counts as one.
-
-    Hidden files are none of them: macOS puts one beside each file that it copies to another disk (`._1.png`).
-    """
-    names = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.name[0] != ".")
-    found = (path for path in names if path.is_file())
-    return sorted(found, key=lambda path: (natural_key(path.name), path.name))
+    """The images in `folder`, as `files_like` has them; suffixes: of what counts as one."""
+    return [path for path in files_like(folder, "*") if path.suffix.lower() in suffixes]
 
 
 def times_by_name(images: list[Path]) -> list[float]:

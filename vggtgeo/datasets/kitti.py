@@ -18,7 +18,7 @@ from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, 
 from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
 RATE = 10.0
@@ -59,7 +59,7 @@ class Kitti(FolderSequence):
         width, height = common_size(str(folder), files)
         if (folder / "oxts").is_dir():
             warnings.warn(
-                f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", InputWarning, stacklevel=3
+                f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", NoteWarning, stacklevel=3
             )
         camera, baseline = _camera(folder, place.relative_to(folder).parts[0], width, height)
         return cls(folder, folder.resolve().name, camera, files, baseline=baseline, rows=rows)

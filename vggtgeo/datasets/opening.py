@@ -97,6 +97,14 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
     return sequence if rate is None else with_rate(sequence, rate)
 
 
+def is_readable(place: Path) -> bool:
+    """Whether a folder looks like a recording, or the path is a file; nothing is opened."""
+    try:
+        return place.is_file() or any(reader.matches(place) for reader in FOLDER_KINDS.values())
+    except OSError:  # a folder that may not be looked into
+        return False
+
+
 def _open_place(place: Path, kind: str | None) -> Sequence:
     if not place.exists():
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
@@ -158,7 +166,7 @@ def _readable_below(folder: Path) -> Iterator[Path]:
             inside = sorted(path for path in place.iterdir() if not path.name.startswith((".", "__")))
             yield from (path for path in inside if path.suffix.lower() in _FILES and path.is_file())
             for path in (path for path in inside if path.is_dir()):
-                if any(reader.matches(path) for reader in FOLDER_KINDS.values()):
+                if is_readable(path):
                     yield path
                 elif depth < _DEEPEST:
                     waiting.append((path, depth + 1))

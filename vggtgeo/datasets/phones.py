@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, read_depth
-from vggtgeo.datasets.images import natural_key
+from vggtgeo.datasets.images import files_like
 from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_matrix, trajectory_of
 from vggtgeo.datasets.video import VideoFile
@@ -78,7 +78,7 @@ class StrayScanner:
                 InputWarning,
                 stacklevel=3,
             )
-        has_depth = any((folder / "depth").glob("*.png"))
+        has_depth = bool(files_like(folder / "depth", "*.png"))
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
 
     def __len__(self) -> int:
@@ -167,7 +167,7 @@ def _odometry(folder: Path) -> np.ndarray:
 
 def _timed(folder: Path) -> list[tuple[float, Path]]:
     found = []
-    for path in sorted(folder.glob("*.png"), key=lambda path: natural_key(path.name)):
+    for path in files_like(folder, "*.png"):
         try:
             found.append((float(path.stem.rsplit("_", 1)[-1]), path))
         except ValueError:
@@ -184,7 +184,7 @@ def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
 
 def _pincam(folder: Path, width: int, height: int) -> Camera:
     """The middle of the intrinsics of all frames: autofocus changes them by a few tenths of a per cent."""
-    files = sorted((folder / "lowres_wide_intrinsics").glob("*.pincam"))
+    files = files_like(folder / "lowres_wide_intrinsics", "*.pincam")
     if not files:
         raise InputError(f"`{folder}/lowres_wide_intrinsics` has no `.pincam` file: width height fx fy cx cy")
     rows = np.concatenate([read_matrices(file, 6)[:1] for file in files])

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
 _MOST_STRETCH = 0.1
@@ -37,9 +37,10 @@ def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray
 
 
 def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
-    """One matrix; InputError where the file holds another count of numbers."""
+    """One matrix; InputError where the file is not there, or holds another count of numbers."""
+    text = read_text(file)
     try:
-        return np.array(read_text(file).replace(",", " ").split(), np.float64).reshape(shape)
+        return np.array(text.replace(",", " ").split(), np.float64).reshape(shape)
     except ValueError:
         raise InputError(f"`{file}`: expected a matrix of {shape[0]} x {shape[1]} numbers") from None
 
@@ -56,7 +57,7 @@ def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where:
     if not known.all():
         warnings.warn(
             f"`{where}`: {int((~known).sum())} of {len(poses)} poses have a NaN or an infinity; left out of the truth",
-            InputWarning,
+            NoteWarning,
             stacklevel=3,
         )
     turned = known & _have_rotations(np.nan_to_num(poses, nan=0.0, posinf=0.0, neginf=0.0))

@@ -1,10 +1,18 @@
-"""ScanNet as its reader exports it: `color/N.jpg`, `depth/N.png`, `pose/N.txt`, `intrinsic/intrinsic_*.txt`.
+"""ScanNet as its readers export it.
+
+| SensReader in Python | in C++ (BundleFusion's scans, too) | |
+|---|---|---|
+| `color/0.jpg` | `frame-000000.color.jpg` | |
+| `depth/0.png` | `frame-000000.depth.pgm` or `.png` | millimetres |
+| `pose/0.txt` | `frame-000000.pose.txt` | camera -> world |
+| `intrinsic/intrinsic_color.txt`, `..._depth.txt` | `_info.txt` or `info.txt` | of both cameras |
 
 The colour images are larger than the depth and of another camera; each is brought to the depth camera, whose pixels are
 fewer, so that no depth is made up. The two cameras are taken to be at one place, as the published extrinsics say.
 Source: A. Dai et al., "ScanNet", CVPR 2017.
 """
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
@@ -14,12 +22,14 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
-from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of
-from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
+from vggtgeo.datasets.pose_files import numbers_of, read_matrix, read_text, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+
+_COLOUR = frozenset({".jpg", ".jpeg", ".png"})
 
 
 @dataclass(frozen=True)
@@ -31,24 +41,26 @@ class ScanNet(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `color`, `depth`, `pose` and `intrinsic`."""
-        return all((folder / name).is_dir() for name in ("color", "depth", "pose", "intrinsic"))
+        """Whether `folder` has `color`, `depth`, `pose` and `intrinsic`, or images beside `_info.txt`."""
+        if all((folder / name).is_dir() for name in ("color", "depth", "pose", "intrinsic")):
+            return True
+        return _info(folder) is not None and bool(files_like(folder, "frame-*.color.*"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Lists the frames that have an image."""
-        images = sorted((folder / "color").iterdir(), key=lambda path: natural_key(path.name))
-        images = [image for image in images if image.suffix.lower() in (".jpg", ".jpeg", ".png")]
+        place = folder / "color"
+        images = image_files(place, _COLOUR) if place.is_dir() else files_like(folder, "frame-*.color.*")
         if not images:
-            raise InputError(f"`{folder}/color` has no images; expected a scan of ScanNet, exported")
+            raise InputError(f"`{place}` has no images; expected a scan of ScanNet, exported")
         files = tuple(
             FrameFile(index, _number(image, index) / FRAMES_PER_SECOND, image, _depth(folder, image))
             for index, image in enumerate(images)
         )
-        colour, depth = (_intrinsics(folder / "intrinsic" / f"intrinsic_{name}.txt") for name in ("color", "depth"))
+        colour, depth = _intrinsics(folder, "color"), _intrinsics(folder, "depth")
         width, height = _size(folder, files)
         # An absurd ratio of the two cameras would make a filter of any width.
-        check_plausible(f"`{folder}/intrinsic/intrinsic_color.txt`", Camera(colour, *common_size(str(folder), files)))
+        check_plausible(f"`{folder}`: the colour camera", Camera(colour, *common_size(str(folder), files)))
         has_depth = any(file.depth is not None for file in files)
         camera = Camera(depth, width, height)
         return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour)
@@ -70,7 +82,7 @@ class ScanNet(FolderSequence):
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses."""
-        there = [(one.timestamp, self.folder / "pose" / f"{one.image.stem}.txt") for one in self.files]
+        there = [(one.timestamp, _beside(self.folder, one.image, "pose", ".txt")) for one in self.files]
         there = [(time, file) for time, file in there if file.is_file()]
         if not there:
             return None
@@ -79,16 +91,39 @@ class ScanNet(FolderSequence):
 
 
 def _number(image: Path, index: int) -> int:
-    return int(image.stem) if image.stem.isdecimal() else index
+    found = re.fullmatch(r"(?:frame-)?([0-9]{1,9})(?:[.]color)?", image.stem)
+    return int(found.group(1)) if found else index
+
+
+def _beside(folder: Path, image: Path, what: str, suffix: str) -> Path:
+    """The file of an image's depth or pose, in either layout."""
+    if image.parent == folder:
+        return folder / (image.stem.removesuffix(".color") + f".{what}{suffix}")
+    return folder / what / f"{image.stem}{suffix}"
 
 
 def _depth(folder: Path, image: Path) -> Path | None:
-    path = folder / "depth" / f"{image.stem}.png"
-    return path if path.is_file() else None
+    return next((path for end in (".png", ".pgm") if (path := _beside(folder, image, "depth", end)).is_file()), None)
 
 
-def _intrinsics(file: Path) -> tuple[float, float, float, float]:
-    matrix = read_matrix(file, (4, 4))
+def _info(folder: Path) -> Path | None:
+    """The file of both cameras that SensReader in C++ writes; another program's `info.txt` is none."""
+    there = (folder / name for name in ("_info.txt", "info.txt"))
+    return next((file for file in there if file.is_file() and "m_calibration" in read_text(file)), None)
+
+
+def _intrinsics(folder: Path, camera: str) -> tuple[float, float, float, float]:
+    """Of `color` or `depth`."""
+    file = folder / "intrinsic" / f"intrinsic_{camera}.txt"
+    if (info := _info(folder)) is not None and not file.is_file():
+        file, key = info, f"m_calibration{camera.capitalize()}Intrinsic"
+        found = re.search(rf"^{key}\s*=(.*)$", read_text(file), re.MULTILINE)
+        values = numbers_of(found.group(1).split() if found else [], f"`{file}`: `{key}`")
+        if len(values) != 16:
+            raise InputError(f"`{file}`: `{key}` has {len(values)} numbers; expected 16")
+        matrix = np.array(values).reshape(4, 4)
+    else:
+        matrix = read_matrix(file, (4, 4))
     return intrinsics_of(file, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
 
 

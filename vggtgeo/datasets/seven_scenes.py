@@ -23,7 +23,7 @@ from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.registration import registered_depth
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
 FRAMES_PER_SECOND = 30.0
@@ -130,7 +130,7 @@ def _published_camera(folder: Path, width: int, height: int) -> Camera:
         f"`{folder}` has no intrinsics of its colour camera: taken as published, with that of a Kinect, {_KINECT}; "
         "depth and poses belong to its depth camera (f = 585) and are moved to the colour camera by a generic "
         "calibration",
-        InputWarning,
+        NoteWarning,
         stacklevel=3,
     )
     return Camera(_KINECT, width, height)
@@ -146,6 +146,6 @@ def _read_pose(file: Path) -> np.ndarray | None:
     if np.isfinite(pose).all() and not np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), atol=1e-3):
         raise InputError(f"`{file}`: the last row of the matrix is {pose[3].tolist()}; it must be 0 0 0 1")
     if not np.isfinite(pose).all():
-        warnings.warn(f"`{file}` has a NaN or an infinity; left out of the truth", InputWarning, stacklevel=3)
+        warnings.warn(f"`{file}` has a NaN or an infinity; left out of the truth", NoteWarning, stacklevel=3)
         return None
     return pose

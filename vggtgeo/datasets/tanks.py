@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
-from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.pose_files import read_json, read_matrix, read_text, trajectory_of
 from vggtgeo.geometry.point_cloud import PointCloud
@@ -32,23 +31,27 @@ class TanksAndTemples(FolderSequence):
     @classmethod
     def matches(cls, folder: Path) -> bool:
         """Whether `folder` has a `*_COLMAP_SfM.log`."""
-        return any(folder.glob(f"*{_LOG}"))
+        return bool(files_like(folder, f"*{_LOG}"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Lists the images, in the folder itself, in `images`, or in a folder of the scene's name."""
         places = [folder, folder / "images", folder / folder.resolve().name]
-        images = next((found for place in places if place.is_dir() and (found := _images(place))), [])
+        images = next((found for place in places if place.is_dir() and (found := image_files(place))), [])
         if not images:
             raise InputError(f"`{folder}` has no images; expected a scene of Tanks and Temples")
-        files = tuple(FrameFile(index, index / FRAMES_PER_SECOND, image) for index, image in enumerate(images))
+        # The first image is `000001.jpg`, and 0 in the log.
+        rows = rows_of(images, None)
+        first = min(1, *rows)
+        times = [(row - first) / FRAMES_PER_SECOND for row in rows]
+        files = tuple(map(FrameFile, range(len(images)), times, images))
         width, height = common_size(str(folder), files)
         camera = camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
         return cls(folder, folder.resolve().name, camera, files)
 
     def ground_truth(self) -> Trajectory | None:
         """COLMAP's poses of the images, a similarity applied where the scanner's frame is known."""
-        file = next(iter(sorted(self.folder.glob(f"*{_LOG}"))), None)
+        file = next(iter(files_like(self.folder, f"*{_LOG}")), None)
         if file is None:
             return None
         numbers, poses = _read_log(file)
@@ -74,7 +77,7 @@ class TanksAndTemples(FolderSequence):
 
     def _scene(self) -> str | None:
         """The name that the files begin with."""
-        file = next(iter(sorted(self.folder.glob(f"*{_LOG}"))), None)
+        file = next(iter(files_like(self.folder, f"*{_LOG}")), None)
         return None if file is None else file.name.removesuffix(_LOG)
 
 
@@ -112,11 +115,6 @@ def _in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
             crossing = ax + (points[:, 1] - ay) / (by - ay) * (bx - ax)
         inside ^= spans & (points[:, 0] < crossing)
     return inside
-
-
-def _images(folder: Path) -> list[Path]:
-    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
-    return sorted(found, key=lambda path: (natural_key(path.name), path.name))
 
 
 def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_text, trajectory_of
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, NoteWarning
 
 _KITTI, _EUROC = 12, 17
 _ROUNDING = 1e-5
@@ -43,7 +43,7 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
     found = Trajectory.load_tum(file)
     if found.timestamps[0] < _NANOSECONDS:
         return found
-    warnings.warn(f"`{file}`: its times are nanoseconds, and were taken as such", InputWarning, stacklevel=2)
+    warnings.warn(f"`{file}`: its times are nanoseconds, and were taken as such", NoteWarning, stacklevel=2)
     return Trajectory(1e-9 * found.timestamps, found.poses)
 
 

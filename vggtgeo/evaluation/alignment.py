@@ -15,8 +15,10 @@ from vggtgeo.io.errors import InputError
 
 Alignment = Literal["none", "se3", "sim3", "yaw"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
-VERTICAL = (0.0, 0.0, 1.0)
-"""Up in the truth's world, where nothing else is said: z, as in EuRoC and TUM RGB-D."""
+Axis = Literal["x", "y", "z"]
+AXES: dict[Axis, tuple[float, float, float]] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+VERTICAL = AXES["z"]
+"""In the truth's world, where nothing else is said: z, as in EuRoC and TUM RGB-D; ARKit's and KITTI's is y."""
 
 
 @dataclass(frozen=True, eq=False)

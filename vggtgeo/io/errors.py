@@ -18,6 +18,10 @@ class InputWarning(UserWarning):
     """Something the user gave was left out or assumed, and the work goes on; the message names it."""
 
 
+class NoteWarning(InputWarning):
+    """What a reader did as its layout wants it (an IMU left out, the better of two depths taken): nothing is wrong."""
+
+
 class GuessedCameraWarning(InputWarning):
     """Nobody gave the camera: a guess is where the run starts."""
 

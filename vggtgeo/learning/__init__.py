@@ -18,4 +18,4 @@ from vggtgeo.learning.window_dataset import LabelledWindow as LabelledWindow
 from vggtgeo.learning.window_dataset import RunWindows as RunWindows
 from vggtgeo.learning.window_dataset import WindowDataset as WindowDataset
 from vggtgeo.learning.window_dataset import WindowWriter as WindowWriter
-from vggtgeo.learning.window_dataset import stacked as stacked
+from vggtgeo.learning.window_dataset import stack_windows as stack_windows

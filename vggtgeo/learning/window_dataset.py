@@ -2,7 +2,8 @@
 
 A folder with one file a window (`vggtgeo.save_problem`, no pickles) and one of its labels. All windows have one padded
 shape, so that any of them can be stacked, and the solver is compiled once. It is a map-style data set, `len(d)` and
-`d[i]`, with numpy leaves, which the loaders of grain and torch take as it is; `batches` needs neither.
+`d[i]`, with numpy leaves, read without JAX, so that the loaders of grain and torch may read it in processes of their
+own, forked ones too (collate function: `vggtgeo.stack_windows`); `batches` needs neither.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.problem_file import load_problem, save_problem
+from vggtgeo.bundle.problem_file import load_arrays, save_problem
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open, write_json
@@ -161,10 +162,10 @@ class WindowDataset:
         """Window `row`, read from the disk, with numpy leaves."""
         if not 0 <= row < self.count:
             raise IndexError(f"window {row} of {self.count}")
-        problem, initial, _ = load_problem(self.folder / f"{row:07d}.npz", terms=self.terms)
+        problem, initial, _ = load_arrays(self.folder / f"{row:07d}.npz", self.terms)
         with np.load(self.folder / f"{row:07d}.labels.npz", allow_pickle=False) as file:
             labels = {name: file[name] for name in file.files}
-        return LabelledWindow(jax.tree.map(np.asarray, problem), jax.tree.map(np.asarray, initial), labels)
+        return LabelledWindow(problem, initial, labels)
 
     def order(self, seed: int, epoch: int = 0) -> np.ndarray:
         """Every row once, int [n], shuffled; it follows from `seed` and `epoch` alone."""
@@ -204,7 +205,7 @@ class WindowDataset:
         with ThreadPoolExecutor(1) as pool:
             coming = None
             for chosen in rows:
-                following = pool.submit(lambda chosen: stacked([self[int(row)] for row in chosen]), chosen)
+                following = pool.submit(lambda chosen: stack_windows([self[int(row)] for row in chosen]), chosen)
                 if coming is not None:
                     yield coming.result()
                 coming = following
@@ -212,8 +213,15 @@ class WindowDataset:
                 yield coming.result()
 
 
-def stacked(windows: Sequence[LabelledWindow]) -> LabelledWindow:
-    """Windows with a leading axis on every array: what a loader calls its collate function."""
+def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
+    """Windows with a leading axis on every array: what a loader calls its collate function.
+
+    Example:
+        >>> from torch.utils.data import DataLoader  # doctest: +SKIP
+        >>> data = vg.WindowDataset.open("windows")
+        >>> loader = DataLoader(data, batch_size=8, shuffle=True, num_workers=2, collate_fn=vg.stack_windows)
+
+    """
     stack: LabelledWindow = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
     return stack
 

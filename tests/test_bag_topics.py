@@ -1,0 +1,131 @@
+"""Which topics of a bag are read, and what their messages hold. Oracle: what the messages were made of."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tiny_layouts as tiny
+import tiny_sequences
+
+from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, image_of, metres_of, told
+from vggtgeo.datasets.check import inspect
+from vggtgeo.io.errors import InputError
+
+COMPRESSED = "16UC1; compressedDepth png"
+
+
+def raw(encoding: str, pixels: np.ndarray | None = None) -> Any:
+    """A message of `sensor_msgs/Image`."""
+    pixels = np.zeros((4, 6), np.uint8) if pixels is None else pixels
+    data = np.frombuffer(pixels.tobytes(), np.uint8)
+    height, width = pixels.shape[:2]
+    shape = {"height": height, "width": width, "step": len(data) // height}
+    return SimpleNamespace(encoding=encoding, data=data, is_bigendian=0, **shape)
+
+
+def packed(kind: str, data: bytes = b"") -> Any:
+    """A message of `sensor_msgs/CompressedImage`."""
+    return SimpleNamespace(format=kind, data=np.frombuffer(data, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("topics", "colour", "depth"),
+    [
+        (
+            {"/c/depth/image_raw": "16UC1", "/c/depth_registered/image_raw": "16UC1", "/c/rgb/image_color": "rgb8"},
+            "/c/rgb/image_color",
+            "/c/depth_registered/image_raw",
+        ),
+        (
+            {"/depth/image_raw": "16UC1", "/depth_to_rgb/image_raw": "16UC1", "/rgb/image_raw": "bgra8"},
+            "/rgb/image_raw",
+            "/depth_to_rgb/image_raw",
+        ),
+        ({"/camera/ir/image": "mono8", "/camera/rgb/image_color": "rgb8"}, "/camera/rgb/image_color", ""),
+        ({"/camera/ir/image": "16UC1", "/camera/rgb/image_color": "rgb8"}, "/camera/rgb/image_color", ""),
+        ({"/camera/infra1/image_rect_raw": "mono8", "/camera/left/image": "mono8"}, "/camera/left/image", ""),
+        ({"/camera/infra1/image": "mono8", "/camera/infra2/image": "mono8"}, "/camera/infra1/image", ""),
+        ({"/cam0/image_raw": "mono8", "/cam1/image_raw": "mono8"}, "/cam0/image_raw", ""),
+        ({"/cam/grey": "mono8", "/cam/raw": "bayer_rggb8"}, "/cam/raw", ""),
+        ({"/depth/false_colours": "rgb8", "/front/image": "mono8"}, "/front/image", ""),
+    ],
+)
+def test_the_best_topics_are_chosen(topics: dict[str, str], colour: str, depth: str) -> None:
+    # Proves colour before grey, infrared last, and never as depth, and registered depth before any other.
+    chosen = chosen_topics({name: raw(encoding) for name, encoding in topics.items()})
+    assert (chosen.colour, chosen.depth) == (colour, depth)
+    assert set(chosen.others) == set(topics) - {colour, depth}
+
+
+def test_compressed_topics() -> None:
+    # Proves that depth is known by its format, or by the name of its topic.
+    colour = packed("bgr8; jpeg compressed bgr8")
+    for name, kind in (("/d/image_raw/compressedDepth", COMPRESSED), ("/d/compressed", "16UC1; png compressed ")):
+        assert chosen_topics({name: packed(kind), "/c/compressed": colour}) == Chosen("/c/compressed", name, ())
+
+
+def test_what_cannot_be_read_is_named() -> None:
+    # Proves that the sentence has the topics with what they hold, since one encoding is all that is wrong.
+    with pytest.raises(InputError, match=r"its topics of images: `/a` \(rgb16\), `/d` \(16UC1\)"):
+        chosen_topics({"/a": raw("rgb16"), "/d": raw("16UC1")})
+    with pytest.raises(InputError, match=r"its topics of images: none"):
+        chosen_topics({})
+
+
+def test_what_was_chosen_is_told() -> None:
+    # Proves a sentence where there was a choice, and none where there was none.
+    chosen = Chosen("/rgb", "/depth_registered", ("/depth", "/ir"))
+    assert told(chosen, ["/gt"]) == (
+        "images of `/rgb`, depth of `/depth_registered`, truth of `/gt`; not read: `/depth`, `/ir`"
+    )
+    assert told(Chosen("/rgb", "", ("/ir",)), [""]) == "images of `/rgb`, no depth; not read: `/ir`"
+    assert not told(Chosen("/rgb", "/depth", ()), [])
+
+
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+def test_images_behind_a_mosaic(encoding: str) -> None:
+    # Proves which pixel has which colour. Oracle: a wall of one colour, seen through the filter that the name says.
+    colour = {"r": 200, "g": 120, "b": 40}
+    pattern = np.array([colour[letter] for letter in encoding.removeprefix("bayer_")[:4]], np.uint8).reshape(2, 2)
+    image = image_of(raw(encoding, np.tile(pattern, (8, 10))))
+    np.testing.assert_array_equal(image[4:-4, 4:-4].reshape(-1, 3), np.tile([200, 120, 40], (96, 1)))
+
+
+@pytest.mark.parametrize(("encoding", "places"), [("yuv422", "uyvy"), ("yuv422_yuy2", "yuyv")])
+def test_images_in_brightness_and_colour(encoding: str, places: str) -> None:
+    # Proves the order of the bytes. Oracle: grey of brightness 126 (16 to 235), which has no colour, is 128.
+    values = {"y": 126, "u": 128, "v": 128}
+    pixels = np.tile(np.array([values[letter] for letter in places], np.uint8).reshape(2, 2), (4, 3, 1))
+    np.testing.assert_allclose(image_of(raw(encoding, pixels)), 128, atol=1)
+
+
+def test_compressed_depth() -> None:
+    # Proves millimetres with and without the head, and floats by their inverse. Oracle: the depths that were coded.
+    codes = tiny_sequences.depth_codes(1)
+    png = cv2.imencode(".png", codes)[1].tobytes()
+    for kind, content in ((COMPRESSED, bytes(12) + png), ("16UC1; png compressed ", png)):
+        depth = metres_of(packed(kind, content))
+        assert np.isnan(depth[0, 0])
+        np.testing.assert_allclose(depth[1:], codes[1:] / 1000, rtol=1e-6)
+    a, b = np.float32(1000.0), np.float32(-3.5)
+    inverse = np.array([[0, 200, 1000]], np.uint16)
+    head = bytes(4) + np.array([a, b], "<f4").tobytes()
+    floats = packed("32FC1; compressedDepth png", head + cv2.imencode(".png", inverse)[1].tobytes())
+    np.testing.assert_allclose(metres_of(floats), [[np.nan, 1000 / 203.5, 1000 / 1003.5]], rtol=1e-6)
+    with pytest.raises(InputError, match=r"its depth \(16UC1; compressedDepth rvl\) cannot be decoded"):
+        metres_of(packed("16UC1; compressedDepth rvl", bytes(60)))
+
+
+def test_a_choice_is_a_note_and_no_problem(tmp_path: Path) -> None:
+    # Proves that `data check` tells what was taken of two depths, and ends well.
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    found = inspect(tiny.bag(tmp_path / "a.bag", ros2=False, more=("/camera/depth/image_raw",)))
+    assert not any("not read" in problem for problem in found.problems)
+    (note,) = (fact for fact in found.facts if "not read" in fact)
+    assert (
+        "depth of `/camera/aligned_depth/image_raw`, truth of `/mocap/pose`; not read: `/camera/depth/image_raw`"
+        in note
+    )
