@@ -9,10 +9,11 @@ COUNT   ?= 2000
 TIME    ?= 60
 LOWEST  := .cache/lowest
 NEWEST  := .cache/newest
+MORE    := .cache/more
 CORE    := tests/test_packing.py tests/test_solve.py tests/test_properties.py tests/test_report.py tests/test_point_cloud.py \
 	tests/test_plots.py tests/test_settings_file.py
 
-.PHONY: help venv demo test test-long test-slow test-lowest test-newest fuzz fuzz-parsers fuzz-decoders docs audit sbom lint types format lock clean
+.PHONY: help venv demo test test-long test-slow test-lowest test-newest test-more fuzz fuzz-parsers fuzz-decoders docs audit sbom lint types format lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -62,6 +63,14 @@ test-newest: $(READY)  ## test the core with the newest versions that are out, i
 	$(BIN)/uv venv --quiet --clear --python $(PYTHON) $(NEWEST)
 	$(BIN)/uv pip install --quiet --python $(NEWEST)/bin/python --upgrade --editable ".[dev]"
 	$(NEWEST)/bin/python -m pytest $(or $(ARGS),$(CORE))
+
+# Ray, Open3D and grain are large, and not in the lock: the tests that need them skip elsewhere. All markers: kills, too.
+test-more: $(READY)  ## run the tests that need Ray, Open3D or grain (a cluster, an oracle, a loader), in an environment of its own
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv venv --quiet --clear --python $(PYTHON) $(MORE)
+	$(BIN)/uv pip install --quiet --python $(MORE)/bin/python --constraint requirements.lock --editable ".[dev,cluster]" open3d grain
+	$(MORE)/bin/python -m pytest -m "" -o filterwarnings=ignore $(or $(ARGS),tests/test_bench_cluster.py \
+		tests/test_map_metrics.py tests/test_window_dataset.py)
 
 # The reference is read from an installed copy, where `vggtgeo.solvers` and `vggtgeo.models` are in place.
 docs: $(READY)  ## build the documentation site into site/ (open site/index.html); broken links are errors

@@ -126,9 +126,9 @@ def test_nerfstudio_s_poses_and_depth_are_those_of_the_run(folder: Path, tmp_pat
     row, column = 120, 200
     for view, frame in enumerate(written["frames"]):
         depth = cv2.imread(str(tmp_path / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)[row, column] / 1000
+        assert "mask_path" not in frame
         if not depth:
             continue
-        assert cv2.imread(str(tmp_path / frame["mask_path"]), cv2.IMREAD_UNCHANGED)[row, column] == 255
         x, y = (column + 0.5 - written["cx"]) / written["fl_x"], (row + 0.5 - written["cy"]) / written["fl_y"]
         found = np.array(frame["transform_matrix"]) @ [x * depth, -y * depth, -depth, 1.0]
         own = cv2.imread(str(folder / f"depth/{scene.frames[view]:06d}.depth.png"), cv2.IMREAD_UNCHANGED)[row, column]
@@ -140,14 +140,57 @@ def test_nerfstudio_s_poses_and_depth_are_those_of_the_run(folder: Path, tmp_pat
 
 
 def test_the_mesh_opens_elsewhere(folder: Path, tmp_path: Path) -> None:
-    # Proves that the GLB holds the run's mesh, upright. Oracle: trimesh, and the run's own PLY.
+    # Proves that the GLB holds the run's mesh, upright, in its colours, dull. Oracle: trimesh, and its own PLY.
     trimesh = pytest.importorskip("trimesh")
     counts = export(folder, "glb", tmp_path)
-    found = trimesh.load(tmp_path / "map.glb", force="mesh")
+    (found,) = trimesh.load(tmp_path / "map.glb").geometry.values()
     mesh = Mesh.load_ply(folder / "mesh.ply")
     assert counts == {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     assert len(found.faces) == len(mesh.faces) > 100
     np.testing.assert_allclose(found.bounds, _bounds(mesh.vertices * [1, -1, -1]), atol=1e-5)
+    np.testing.assert_array_equal(found.visual.vertex_attributes["color"][:, :3], mesh.colours)
+    assert found.visual.material.metallicFactor == 0
+
+
+def test_every_frame_with_its_picture(tmp_path: Path) -> None:
+    # Proves that frames which are no keyframes are in the exports, with their poses, pictures and depth, once the run
+    # kept them. Oracle: the run's trajectory and frames; pycolmap, whose reprojection error stays the stated one.
+    run, frames = recorded_run(), recorded_run().sequence
+    result = vg.Result.of(run.slam)
+    folder = tmp_path / "room"
+    result.save(folder, depth="every", frames=frames)
+    scene = Scene.load(folder)
+    assert scene.frames.tolist() == [record.frame for record in run.slam.frames]
+    np.testing.assert_allclose(np.linalg.inv(scene.poses), result.trajectory.poses, atol=1e-9)
+    export(folder, "nerfstudio", tmp_path / "n")
+    written = json.loads((tmp_path / "n/transforms.json").read_text())["frames"]
+    assert len(written) == len(scene.frames) > len(run.slam.keyframes)
+    assert all((tmp_path / "n" / frame["depth_file_path"]).is_file() for frame in written)
+    true = np.array([frame.image for frame in frames.frames()], int)
+    for row, read in enumerate(open_sequence(tmp_path / "n").frames()):
+        assert np.abs(true - read.image).mean(axis=(1, 2, 3)).argmin() == row
+    stated = export(folder, "colmap", tmp_path / "c")
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction(str(tmp_path / "c/sparse/0"))
+    assert model.num_images() == len(scene.frames)
+    model.update_point_3d_errors()
+    error = stated["mean_reprojection_error_over_points_px"]
+    assert model.compute_mean_reprojection_error() == pytest.approx(error, abs=1e-3)
+
+
+def test_borders_that_no_pixel_fills_are_masked(tmp_path: Path) -> None:
+    # Proves that both formats say which pixels an undistorted picture made up, and neither does where there are none.
+    result = vg.Result.of(recorded_run().slam)
+    height, width = result.record.slam.keyframes[0].size
+    seen = np.ones((height, width), bool)
+    seen[:, :3] = False
+    replace(result, record=replace(result.record, seen=seen)).save(tmp_path / "run", depth=True)
+    export(tmp_path / "run", "nerfstudio", tmp_path / "n")
+    export(tmp_path / "run", "colmap", tmp_path / "c")
+    frames = json.loads((tmp_path / "n/transforms.json").read_text())["frames"]
+    names = [f"c/masks/{Path(frame['file_path']).name}.png" for frame in frames]
+    for name in (*names, *(f"n/{frame['mask_path']}" for frame in frames)):
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED) > 0, seen)
 
 
 def _bounds(points: np.ndarray) -> np.ndarray:
@@ -155,11 +198,12 @@ def _bounds(points: np.ndarray) -> np.ndarray:
 
 
 def test_points_for_surveyors(folder: Path, tmp_path: Path) -> None:
-    # Proves places to half a millimetre and colours of the LAS file. Oracle: laspy, and the run's own cloud.
+    # Proves places to half a millimetre, upwards as z, and colours of the LAS file. Oracle: laspy, and the run's cloud.
     laspy = pytest.importorskip("laspy")
     export(folder, "las", tmp_path)
     found, cloud = laspy.read(tmp_path / "map.las"), vg.Result.load(folder).cloud
-    np.testing.assert_allclose(np.column_stack([found.x, found.y, found.z]), cloud.points, atol=6e-4)
+    x, y, z = np.array(found.x), np.array(found.y), np.array(found.z)
+    np.testing.assert_allclose(np.column_stack([x, -z, y]), cloud.points, atol=6e-4)
     np.testing.assert_array_equal(np.asarray(found.red) // 257, cloud.colours[:, 0])
 
 

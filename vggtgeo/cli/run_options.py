@@ -102,7 +102,7 @@ SaveEveryDepthOption = Annotated[
     bool,
     typer.Option(
         "--save-every-depth/--no-save-every-depth",
-        help="Write the depth of every frame: the sensor's, and where it has none what near keyframes saw.",
+        help="Write depth and picture of every frame; depth where no sensor has it: what near keyframes saw.",
     ),
 ]
 MapOption = Annotated[

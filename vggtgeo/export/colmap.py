@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from vggtgeo.export.contents import EmptyRunError
-from vggtgeo.export.pictures import copy_pictures
+from vggtgeo.export.pictures import copy_pictures, picture_mask
 from vggtgeo.geometry import rigid
 from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import Scene
@@ -24,7 +24,8 @@ PINHOLE = 1
 
 
 def write_colmap(source: Path, target: Path) -> dict[str, float]:
-    """`images/` and `sparse/0/` below `target`, of the run in `source`.
+    """`images/` and `sparse/0/` below `target`, of the run in `source`; and, where undistorted pictures have borders
+    that no pixel fills, `masks/`, named and coloured as COLMAP takes them (black: not used).
 
     Returns what was written: counts, and the mean over the points of each one's mean reprojection error, pixels.
     EmptyRunError where no point was seen from two keyframes.
@@ -33,6 +34,10 @@ def write_colmap(source: Path, target: Path) -> dict[str, float]:
     if not len(scene.tracks):
         raise EmptyRunError(f"`{source / 'scene.npz'}` has no point that two keyframes saw: there is nothing to export")
     copy_pictures(scene, source, target)
+    mask = picture_mask(scene, source)
+    for view in range(len(scene.frames) if mask is not None else 0):
+        with atomic_open(target / "masks" / f"{scene.image_name(view)}.png", "wb") as handle:
+            handle.write(mask)
     place_of = _places(scene)
     model = target / "sparse" / "0"
     for name, content in (

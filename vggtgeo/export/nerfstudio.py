@@ -15,7 +15,7 @@ import numpy as np
 
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.export.contents import cloud_of
-from vggtgeo.export.pictures import copy_pictures
+from vggtgeo.export.pictures import copy_pictures, picture_mask
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_path, write_json
@@ -26,20 +26,25 @@ MILLI = 1000.0
 
 
 def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
-    """`transforms.json`, `images/`, `depth/` and `masks/` (where the run saved depth), `points.ply`, below `target`.
-
-    A mask is white where the picture has a depth that other views confirm.
+    """`transforms.json`, `images/`, `depth/` (where the run saved it) and `points.ply`, below `target`; and `mask.png`
+    where undistorted pictures have borders that no pixel fills: what is black is not trained on. Depth that is not
+    known is 0, and needs no mask.
     """
     scene, cloud = Scene.load(source), cloud_of(source)
     poses = rigid.invert(scene.poses) @ FROM_OPENGL
     copy_pictures(scene, source, target)
+    mask = picture_mask(scene, source)
+    if mask is not None:
+        with atomic_path(target / "mask.png") as temporary:
+            temporary.write_bytes(mask)
     frames, deep = [], 0
     for view in range(len(scene.frames)):
         name = scene.image_name(view)
         frame: dict[str, Any] = {"file_path": f"images/{name}", "transform_matrix": poses[view].tolist()}
+        frame |= {} if mask is None else {"mask_path": "mask.png"}
         depth = source / "depth" / f"{scene.frames[view]:06d}.depth.png"
         if depth.is_file():
-            frame |= _depth(depth, target, f"{scene.frames[view]:06d}.png")
+            frame["depth_file_path"] = _depth(depth, target, f"depth/{scene.frames[view]:06d}.png")
             deep += 1
         frames.append(frame)
     if not deep:
@@ -53,14 +58,12 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     return {"images": len(frames), "depth_images": deep}
 
 
-def _depth(file: Path, target: Path, name: str) -> dict[str, str]:
-    """Depth and mask of one picture in nerfstudio's units, and what `transforms.json` says of them."""
+def _depth(file: Path, target: Path, name: str) -> str:
+    """Writes the depth of one picture in nerfstudio's units, and returns its name."""
     counts = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
     if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
         found = "no image" if counts is None else f"{counts.dtype} {counts.shape}"
         raise InputError(f"`{file}` is {found}; expected 16-bit depth as `vggtgeo run --save-depth` writes it")
-    milli = np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16)
-    for folder, image in (("depth", milli), ("masks", np.where(counts > 0, 255, 0).astype(np.uint8))):
-        with atomic_path(target / folder / name) as temporary:
-            cv2.imwrite(str(temporary), image)
-    return {"depth_file_path": f"depth/{name}", "mask_path": f"masks/{name}"}
+    with atomic_path(target / name) as temporary:
+        cv2.imwrite(str(temporary), np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16))
+    return name

@@ -1,4 +1,4 @@
-"""The pictures of a run's keyframes, for the formats that want them."""
+"""The pictures of a run, for the formats that want them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,18 @@ from pathlib import Path
 
 from vggtgeo.datasets.image_defects import declared_size
 from vggtgeo.io.errors import InputError
-from vggtgeo.results.scene import Scene
+from vggtgeo.results.scene import MASK, Scene
+
+
+def picture_mask(scene: Scene, source: Path) -> bytes | None:
+    """The PNG of the pixels that come from the images, white; None where all do. InputError for one of another size."""
+    file = source / MASK
+    if not file.is_file():
+        return None
+    content = file.read_bytes()
+    if declared_size(content) != scene.size:
+        raise InputError(f"`{file}` is no picture of {scene.size[0]} x {scene.size[1]} pixels; run again")
+    return content
 
 
 def copy_pictures(scene: Scene, source: Path, target: Path) -> None:

@@ -15,6 +15,8 @@ from vggtgeo.models.extras import install_hint
 
 UPRIGHT = np.array([1.0, -1.0, -1.0])
 """From y down, z forward (the first camera's axes) to glTF's y up, z backward."""
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""From the same to z up, y forward, as surveying has it."""
 LAS_UNIT = 1e-3
 _LAS_COUNTS = 2**31 - 1
 
@@ -34,32 +36,33 @@ def write_glb(source: Path, target: Path) -> dict[str, float]:
     """`map.glb`: the mesh; the first camera's down is down."""
     trimesh = _package("trimesh")
     mesh = mesh_of(source)
-    shape = trimesh.Trimesh(
-        mesh.vertices * UPRIGHT,
-        mesh.faces,
-        vertex_normals=mesh.normals * UPRIGHT,
-        vertex_colors=mesh.colours,
-        process=False,
-    )
+    # Without a material glTF means metal, which is dark where nothing is around it to reflect.
+    matte = trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
+    shape = trimesh.Trimesh(mesh.vertices * UPRIGHT, mesh.faces, vertex_normals=mesh.normals * UPRIGHT, process=False)
+    shape.visual = trimesh.visual.TextureVisuals(material=matte)
+    opaque = np.full(len(mesh.colours), 255, np.uint8)
+    shape.visual.vertex_attributes["color"] = np.column_stack([mesh.colours, opaque])
     with atomic_path(target / "map.glb") as temporary:
         temporary.write_bytes(trimesh.Scene(shape).export(file_type="glb"))
     return {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
 
 
 def write_las(source: Path, target: Path) -> dict[str, float]:
-    """`map.las`, version 1.4, point format 7: places to a millimetre, 16-bit colours."""
+    """`map.las`, version 1.4, point format 7: places to a millimetre, 16-bit colours; the first camera's up is z."""
     laspy = _package("laspy")
     cloud = cloud_of(source)
-    if np.ptp(cloud.points.astype(np.float64), axis=0).max() >= LAS_UNIT * _LAS_COUNTS:
+    points = cloud.points.astype(np.float64) @ Z_UP.T
+    if np.ptp(points, axis=0).max() >= LAS_UNIT * _LAS_COUNTS:
         raise InputError(
-            f"`{source / 'map.ply'}` is {np.ptp(cloud.points, axis=0).max():.3g} m across; LAS in millimetres holds "
+            f"`{source / 'map.ply'}` is {np.ptp(points, axis=0).max():.3g} m across; LAS in millimetres holds "
             f"{LAS_UNIT * _LAS_COUNTS:.0f} m: export it with `--to ply`"
         )
     header = laspy.LasHeader(point_format=7, version="1.4")
+    header.generating_software = "vggtgeo"
     header.scales = np.full(3, LAS_UNIT)
-    header.offsets = np.floor(cloud.points.min(axis=0))
+    header.offsets = np.floor(points.min(axis=0))
     record = laspy.LasData(header)
-    record.x, record.y, record.z = cloud.points.T.astype(np.float64)
+    record.x, record.y, record.z = points.T
     record.red, record.green, record.blue = (cloud.colours.astype(np.uint16) * 257).T
     with atomic_path(target / "map.las") as temporary:
         record.write(str(temporary))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from itertools import islice
 
@@ -10,10 +9,10 @@ import numpy as np
 
 from vggtgeo.datasets import Sequence as Frames
 from vggtgeo.geometry.camera import Undistorter
-from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.frame_depth import FrameDepths
 from vggtgeo.models.classical import SensorDepth
+from vggtgeo.results.frames_again import read_again
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 
@@ -41,29 +40,13 @@ def every_depth(
 
 def _own_depths(slam: Slam, frames: Frames | None) -> Iterator[tuple[int, DepthMap | None]]:
     """Rows of `slam.frames`, each with the depth that came with the frame."""
-    row_of = {record.frame: row for row, record in enumerate(slam.frames)}
-    if frames is None or not frames.has_depth or not slam.metric or not row_of:
-        yield from ((row, None) for row in range(len(slam.frames)))
-        return
-    camera, (height, width) = slam.lens or frames.camera, slam.keyframes[0].size
-    if (frames.camera.width, frames.camera.height) != (width, height):
-        raise InputError(
-            f"`frames` are of {frames.camera.width} x {frames.camera.height} pixels, those of the run of "
-            f"{width} x {height}; give the frames that the run read"
-        )
-    undistorter, sensor = camera.undistorter(), SensorDepth()
-    with warnings.catch_warnings():  # what cannot be read was told when the run came to it
-        warnings.simplefilter("ignore", InputWarning)
-        for frame in frames.frames(min(row_of), max(row_of) + 1, _step(list(row_of))):
-            if frame.index in row_of:
-                own = None if frame.depth is None else _measured(frame.image, frame.depth, undistorter, sensor)
-                yield row_of.pop(frame.index), own
-    yield from ((row, None) for row in row_of.values())
-
-
-def _step(numbers: list[int]) -> int:
-    """The stride that a run took frames with."""
-    return int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    left = set(range(len(slam.frames)))
+    if frames is not None and frames.has_depth and slam.metric:
+        undistorter, sensor = (slam.lens or frames.camera).undistorter(), SensorDepth()
+        for row, frame in read_again(slam, frames):
+            left.remove(row)
+            yield row, None if frame.depth is None else _measured(frame.image, frame.depth, undistorter, sensor)
+    yield from ((row, None) for row in sorted(left))
 
 
 def _measured(image: np.ndarray, depth: np.ndarray, undistorter: Undistorter, sensor: SensorDepth) -> DepthMap:

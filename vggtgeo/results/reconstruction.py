@@ -10,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from vggtgeo.datasets import Sequence
 from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.geometry.camera import Camera
@@ -152,7 +154,17 @@ def reconstruct(
         }
         notices = (*warned, *(collected if before is None else before.unsaid(collected)))
         ending = _Ending(
-            slam, source.truth, report, notices, perception.refusals, title or source.name, known, clock, began, dense
+            slam,
+            source.truth,
+            report,
+            notices,
+            perception.refusals,
+            title or source.name,
+            known,
+            clock,
+            began,
+            dense,
+            (slam.lens or source.camera).undistorter().valid,
         )
         return _concluded(ending, settings, hooks, windows.records, (still, evidence))
 
@@ -191,6 +203,7 @@ class _Ending:
     clock: Clock
     began: float
     dense: str
+    seen: np.ndarray | None
 
 
 def _concluded(
@@ -228,7 +241,9 @@ def _concluded(
         **run.facts,
     )
     notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
-    return Result.assemble(RunRecord(slam, built, tuple(windows), run.truth, notices, run.title), verdict, summary)
+    return Result.assemble(
+        RunRecord(slam, built, tuple(windows), run.truth, notices, run.title, run.seen), verdict, summary
+    )
 
 
 def _first_state(known: Slam | None, source: Source, settings: SlamSettings, roles: Roles) -> Slam | None:

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self
 
+import numpy as np
+
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
@@ -56,7 +58,8 @@ class RunRecord:
 
     slam: the last state. dense: the dense map after adjustment.
     windows: one an adjustment of the window. truth: camera -> world, where it is known. warnings: about the input, and
-    about the weights of networks. title: of the run.
+    about the weights of networks. title: of the run. seen: bool [H, W], pixels of the undistorted images that come
+    from the image; None where all do.
     """
 
     slam: Slam
@@ -65,6 +68,7 @@ class RunRecord:
     truth: Trajectory | None = None
     warnings: tuple[str, ...] = ()
     title: str = "run"
+    seen: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +192,8 @@ class Result:
         Args:
             folder: made where it does not exist.
             depth: write each keyframe's dense depth and confidence as well, or, where it is "every", each frame's: its
-                own where `frames` have some, else what the nearest keyframes saw of its view.
+                own where `frames` have some, else what the nearest keyframes saw of its view; and, where `frames` are
+                given, each frame's picture.
             frames: what the run read; needed for the sensor's depth of frames that are no keyframes.
             settings: flags of the command line that tell how the run was made, beside the pipeline's own settings.
 
@@ -233,7 +238,7 @@ class Result:
             self.cloud.save_ply(place / "map.ply")
             self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
             if self.record is not None:
-                write_scene(place, self.record.slam)
+                write_scene(place, self.record.slam, self.record.seen, frames if depth == "every" else None)
             meshed.result()
         if depth and self.record is not None:
             slam, depth_maps = self.record.slam, self.record.dense.depth_maps

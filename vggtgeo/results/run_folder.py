@@ -46,6 +46,7 @@ NAMES = (
     "mesh.ply",
     "scene.npz",
     "images",
+    "image-mask.png",
     "trajectory.png",
     "report.html",
     "depth",

@@ -1,5 +1,5 @@
-"""The keyframes of a run as other programs want them: pictures, cameras, tracks; `scene.npz` and `images/` in its
-folder.
+"""The keyframes of a run, or all its frames, as other programs want them: pictures, cameras, tracks; `scene.npz` and
+`images/` in its folder, and `image-mask.png` where undistorted pictures have borders that no pixel fills.
 
 Nothing in the file is code: it is read without pickles. `version` is that of its layout.
 """
@@ -7,22 +7,26 @@ Nothing in the file is code: it is read without pickles. `version` is that of it
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from vggtgeo.datasets import Sequence as Frames
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.mapping.tracks import Tracks, make_tracks
+from vggtgeo.results.frames_again import read_again
 from vggtgeo.slam.connected import pieces_by_size
+from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 
 VERSION = 1
+MASK = "image-mask.png"
 QUALITY = 95
 """Of the JPEG pictures."""
 _LAYOUT: dict[str, tuple[int | str, ...]] = {
@@ -38,15 +42,22 @@ _LAYOUT: dict[str, tuple[int | str, ...]] = {
     "track_view": ("m",),
     "track_pixel": ("m", 2),
 }
-"""Shapes of the arrays: `k` keyframes, `n` points, `m` observations."""
+"""Shapes of the arrays: `k` views, `n` points, `m` observations."""
 _LARGEST, _RIGID = 100_000, 1e-3
 """Pixels of a side; how far a rotation's product with its transpose may be from the unit matrix."""
 _WHOLE = ("frames", "size", "track_point", "track_view")
 
 
+def picture_name(frame: int) -> str:
+    """Of a frame's picture in `images/`."""
+    return f"{frame:06d}.jpg"
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Fields: frames int [k], number of each keyframe's frame; timestamps float64 [k], s; poses float64 [k, 4, 4],
+    """Views: the keyframes, and other frames that a run kept pictures of.
+
+    Fields: frames int [k], number of each view's frame; timestamps float64 [k], s; poses float64 [k, 4, 4],
     world -> camera; intrinsics float64 [4], pixels, of the undistorted pictures; size (width, height); tracks, whose
     views are places in these arrays; metric: whether lengths are metres.
     """
@@ -79,8 +90,26 @@ class Scene:
         )
 
     def image_name(self, view: int) -> str:
-        """The picture of a keyframe, in `images/`."""
-        return f"{self.frames[view]:06d}.jpg"
+        """The picture of a view, in `images/`."""
+        return picture_name(int(self.frames[view]))
+
+    def with_frames(self, others: Sequence[tuple[int, float, np.ndarray]]) -> Scene:
+        """The same with views of other frames, which see no points: number, time and pose, world -> camera, of each;
+        all in the order of their numbers.
+        """
+        if not others:
+            return self
+        numbers, times, poses = zip(*others, strict=True)
+        frames = np.concatenate([self.frames, numbers])
+        order = np.argsort(frames, kind="stable")
+        place = np.argsort(order, kind="stable")
+        return replace(
+            self,
+            frames=frames[order],
+            timestamps=np.concatenate([self.timestamps, times])[order],
+            poses=np.concatenate([self.poses, poses])[order],
+            tracks=replace(self.tracks, view=place[self.tracks.view]),
+        )
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Scene:
@@ -101,7 +130,7 @@ class Scene:
         if not (len(tracks.point) == len(tracks.view) == len(tracks.pixel)):
             raise ValueError("its tracks have observations of unequal number")
         if len(tracks.point) and not (0 <= tracks.view.min() <= tracks.view.max() < count):
-            raise ValueError("its tracks name keyframes that are not there")
+            raise ValueError("its tracks name views that are not there")
         if len(tracks.point) and not (0 <= tracks.point.min() <= tracks.point.max() < len(tracks)):
             raise ValueError("its tracks name points that are not there")
         size, intrinsics = (int(width), int(height)), values["intrinsics"]
@@ -114,7 +143,7 @@ class Scene:
 def _impossible(poses: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], tracks: Tracks) -> str | None:
     """What no run writes, if anything: other programs would take it as it is."""
     if not len(poses):
-        return "it has no keyframe"
+        return "it has no view"
     if not (0 < min(size) <= max(size) <= _LARGEST):
         return f"its pictures are {size[0]} x {size[1]} pixels"
     if not (np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all()):
@@ -161,14 +190,20 @@ def _shown(slam: Slam) -> tuple[Keyframe, ...]:
     return tuple(slam.keyframes[number] for number in pieces_by_size(slam)[0])
 
 
-def write_scene(folder: Path, slam: Slam) -> None:
-    """`scene.npz` and a picture of each keyframe in `images/`, undistorted, each written atomically."""
+def write_scene(folder: Path, slam: Slam, seen: np.ndarray | None = None, frames: Frames | None = None) -> None:
+    """`scene.npz` and a picture of each keyframe in `images/`, undistorted, each written atomically.
+
+    seen: bool [H, W], which pixels of an undistorted picture come from the image; kept as `image-mask.png`, white for
+    these. frames: what the run read, for a picture of every frame that stands in the same piece of map, too.
+    """
     scene = Scene.of(slam)
     for view, keyframe in enumerate(_shown(slam)):
-        bgr = np.ascontiguousarray(keyframe.image[..., ::-1])
-        # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
-        with atomic_open(folder / "images" / scene.image_name(view), "wb") as handle:
-            handle.write(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes())
+        _write_picture(folder / "images" / scene.image_name(view), keyframe.image)
+    if frames is not None:
+        scene = scene.with_frames(list(_other_frames(folder / "images", slam, scene, frames)))
+    if seen is not None:
+        with atomic_open(folder / MASK, "wb") as handle:
+            handle.write(cv2.imencode(".png", np.where(seen, 255, 0).astype(np.uint8))[1].tobytes())
     tracks = scene.tracks
     with atomic_open(folder / "scene.npz", "wb") as handle:
         np.savez_compressed(
@@ -186,3 +221,23 @@ def write_scene(folder: Path, slam: Slam) -> None:
             track_view=tracks.view,
             track_pixel=tracks.pixel,
         )
+
+
+def _other_frames(folder: Path, slam: Slam, scene: Scene, frames: Frames) -> Iterator[tuple[int, float, np.ndarray]]:
+    """Number, time and pose, world -> camera, of the tracked frames that are no views yet, as their pictures are
+    written.
+    """
+    piece, poses = {keyframe.number for keyframe in _shown(slam)}, frame_poses(slam)[1]
+    known, undistorter = set(scene.frames.tolist()), (slam.lens or frames.camera).undistorter()
+    for row, frame in read_again(slam, frames):
+        record = slam.frames[row]
+        if record.tracked and record.reference in piece and record.frame not in known:
+            _write_picture(folder / picture_name(record.frame), undistorter.image(frame.image))
+            yield record.frame, record.timestamp, poses[row]
+
+
+def _write_picture(path: Path, image: np.ndarray) -> None:
+    bgr = np.ascontiguousarray(image[..., ::-1])
+    # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
+    with atomic_open(path, "wb") as handle:
+        handle.write(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes())
