@@ -8,15 +8,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tiny_layouts
+import tiny_sequences
 from recorded_run import RecordedRun, recorded_run
 
 import vggtgeo as vg
+from vggtgeo.cli.run_sequence import _once_more
+from vggtgeo.datasets import open_sequence
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.consistency import PosedDepth
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.frame_depth import rendered_depth
 from vggtgeo.results.every_depth import every_depth
+from vggtgeo.slam.run import default_roles
+from vggtgeo.slam.settings import SlamSettings
 from vggtgeo.slam.state import Slam
 
 CAMERA = np.array([200.0, 200.0, 79.5, 59.5])
@@ -134,3 +140,12 @@ def test_a_lost_frame_has_its_own_depth_alone(run: RecordedRun) -> None:
     slam = replace(run.slam, frames=(*run.slam.frames[:row], lost, *run.slam.frames[row + 1 :]))
     maps = dense_depths(slam.keyframes, slam.intrinsics)
     assert dict(every_depth(slam, maps))[lost.frame] is None
+
+
+def test_the_command_reads_every_frame_once_more(tmp_path: Path) -> None:
+    # Proves that pictures of frames without depth are kept, too, and that depth which no role used is not read.
+    images = tiny_layouts.quietly_opened(tiny_sequences.images(tmp_path / "images"))
+    both = open_sequence(tiny_sequences.tum(tmp_path / "tum"))
+    assert len(list(_once_more(images, default_roles(False), SlamSettings()).frames())) == len(images)
+    assert _once_more(both, default_roles(True), SlamSettings()).has_depth
+    assert not _once_more(both, default_roles(False), SlamSettings()).has_depth

@@ -15,7 +15,7 @@ from rich.console import Console
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.progress import ProgressBar, print_result
 from vggtgeo.cli.view import serve_until_interrupted
-from vggtgeo.datasets import Frame, Sequence
+from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.datasets.reduced import reduced
 from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.interruption import interruption
@@ -113,7 +113,7 @@ def run_and_write(
             bar.on_stage("writing")
             if output.save_map is not None:
                 result.save_map(output.save_map)
-            frames = _with_own_depth(sequence, roles, settings) if output.save_depth == "every" else None
+            frames = _once_more(sequence, roles, settings) if output.save_depth == "every" else None
             summary = result.save_into(folder, depth=output.save_depth, frames=frames, settings=output.flags)
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: everything was done and is written", err=True)
@@ -128,11 +128,13 @@ def run_and_write(
         raise typer.Exit(EXIT_FAILED)
 
 
-def _with_own_depth(sequence: Sequence, roles: Roles | Perception, settings: SlamSettings) -> Sequence | None:
-    """The frames as the run saw them, where they come again and their own depth is what it used."""
+def _once_more(sequence: Sequence, roles: Roles | Perception, settings: SlamSettings) -> Sequence | None:
+    """The frames as the run saw them, where they come again; with their own depth where that is what it used."""
+    if not len(sequence):
+        return None
     own = roles.roles if isinstance(roles, Perception) else roles
-    again = len(sequence) > 0 and sequence.has_depth and isinstance(own.depth, SensorDepth)
-    return reduced(sequence, settings.camera.most_pixels) if again else None
+    seen = sequence if sequence.has_depth and isinstance(own.depth, SensorDepth) else without_depth(sequence)
+    return reduced(seen, settings.camera.most_pixels)
 
 
 class _EarlyFiles(Callback):
