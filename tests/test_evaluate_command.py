@@ -47,6 +47,24 @@ def test_json_has_the_metrics(tmp_path: Path) -> None:
     assert json.loads(result.output) == json.loads(json.dumps(expected.as_dict()))
 
 
+def test_a_run_in_metres_of_another_size_is_of_another_sequence(tmp_path: Path) -> None:
+    # Proves that a run which says that it is metric, and has a quarter of the truth's size, is not comparable; a file,
+    # whose scale nobody knows, is compared.
+    _, truth = _files(tmp_path)
+    small = Trajectory.load_tum(truth)
+    poses = small.poses.copy()
+    poses[:, :3, 3] /= 4
+    Trajectory(small.timestamps, poses).save_tum(tmp_path / "trajectory.txt")
+    assert CliRunner().invoke(app, [str(tmp_path / "trajectory.txt"), str(truth)]).exit_code == 0
+    (tmp_path / "summary.json").write_text(json.dumps({"scale": "metric, by the depth"}))
+    with pytest.warns(
+        InputWarning, match="in metres, and the truth 4 times as large: it is of another sequence, or unit"
+    ):
+        found = CliRunner().invoke(app, [str(tmp_path), str(truth)])
+    assert found.exit_code == 3
+    assert "NOT COMPARABLE" in found.output
+
+
 def test_the_default_of_max_dt_is_that_of_the_library() -> None:
     # Proves that the copy of the constant, which keeps `--help` quick, is true.
     assert vggtgeo.cli.evaluate.MAX_TIME_DIFFERENCE == MAX_TIME_DIFFERENCE

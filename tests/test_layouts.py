@@ -465,7 +465,7 @@ def test_a_stream_is_read_until_it_ends(tmp_path: Path) -> None:
         writer.write(np.full((48, 64, 3), 40 * number, np.uint8))
     writer.release()
     with pytest.warns(InputWarning, match="no intrinsics found"):
-        stream = open_sequence(f"file:{file}", kind="live")
+        stream = open_sequence(f"file:{file}", kind="camera")
     frames = list(stream.frames(1, None, 2))
     assert [frame.index for frame in frames] == [1, 3]
     assert frames[0].timestamp < frames[1].timestamp

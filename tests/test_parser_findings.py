@@ -70,8 +70,8 @@ DEEP = b"[" * 20_000
 REFUSED: tuple[tuple[str, Change, str], ...] = (
     ("PNG", long_chunk, r"i.png` is damaged: a part of the PNG declares more bytes than the file has"),
     ("depth", long_chunk, r"d.png` is damaged: a part of the PNG declares more bytes"),
-    ("problem", header("alpha", b"{'descr': (((\n"), r"p.npz` cannot be read as .npz"),
-    ("scene", header("poses", b"{'descr': (((\n"), r"scene.npz` cannot be read"),
+    ("problem", header("alpha", b"{'descr': (((\n"), r"p.npz` is damaged, or no file of a bundle-adjustment problem"),
+    ("scene", header("poses", b"{'descr': (((\n"), r"scene.npz` is damaged, or no file of the scene of a run"),
     ("scene", array("poses", np.array(b"text")), r"its `poses` is \|S4 of shape \(\); expected numbers, \(2, 4, 4\)"),
     ("scene", array("track_view", np.array([0.5])), r"its `track_view` is float64 .*; expected whole numbers"),
     ("windows", lambda _: b"1", r"is no complete folder of windows"),

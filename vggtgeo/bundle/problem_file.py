@@ -69,7 +69,7 @@ def load_problem(
         >>> vg.load_problem(Path("no.npz"))
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `no.npz` is no file; give the .npz of a bundle-adjustment problem
+        vggtgeo.io.errors.InputError: `no.npz` is no file; give that of a bundle-adjustment problem
 
     """
     arrays = _read(Path(path))

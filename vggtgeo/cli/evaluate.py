@@ -50,7 +50,8 @@ def evaluate(
     true = load_truth(truth)
     found, scale = load_estimate(estimate, true), load_scale(estimate)
     report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
-    meaningless = warn_of_strangers(found, true, max_dt)
+    metric = scale is not None and scale.startswith("metric")
+    meaningless = warn_of_strangers(found, true, max_dt, metric)
     if as_json:
         typer.echo(json.dumps({**report.as_dict(), **({} if scale is None else {"estimate_scale": scale})}, indent=2))
     else:

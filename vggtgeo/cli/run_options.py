@@ -12,7 +12,10 @@ SequenceArgument = Annotated[
     str, typer.Argument(help="Folder of a sequence, video file, ROS bag, webcam:0, or rtsp://...", show_default=False)
 ]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
-KindOption = Annotated[str | None, typer.Option(help="Reader (see `vggtgeo data list`); found by looking.")]
+KindOption = Annotated[
+    str | None,
+    typer.Option(help="Reader: images, rgbd, tum, video, bag, camera, ... (`vggtgeo data list`); found by looking."),
+]
 StartOption = Annotated[int, typer.Option(min=0, help="First frame.")]
 EndOption = Annotated[int | None, typer.Option(min=1, help="Frame to stop before.")]
 StrideOption = Annotated[int, typer.Option(min=1, help="Take every n-th frame.")]

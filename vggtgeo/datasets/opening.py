@@ -60,7 +60,7 @@ FOLDER_KINDS: dict[str, FolderReader] = {
     "images": ImageFolder,
 }
 """Readers by name, in the order in which a folder is tried: the plain ones last."""
-KINDS = (*FOLDER_KINDS, "video", "bag", "live")
+KINDS = (*FOLDER_KINDS, "video", "bag", "camera")
 
 
 def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: float | None = None) -> Sequence:
@@ -85,7 +85,7 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
     """
     if kind is not None and kind not in KINDS:
         raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(KINDS)}")
-    if kind == "live" or (kind is None and is_live(os.fspath(path))):
+    if kind == "camera" or (kind is None and is_live(os.fspath(path))):
         return LiveCamera.open(os.fspath(path))
     try:
         place = Path(path).expanduser()

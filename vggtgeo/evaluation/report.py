@@ -58,7 +58,7 @@ class TrajectoryReport:
             )
         if not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE:
             found.append(
-                f"the scale is {scale:.3g}: the estimate is not in metres, and Sim(3) errors say nothing of that"
+                f"the scale is {scale:.3g}: the two are not in one unit, and Sim(3) errors say nothing of that"
             )
         return tuple(found)
 

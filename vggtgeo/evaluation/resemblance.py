@@ -13,7 +13,7 @@ import numpy as np
 from vggtgeo.evaluation.absolute import absolute_error
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
 from vggtgeo.evaluation.relative import relative_error, rotation_angle
-from vggtgeo.evaluation.report import FEW_MATCHES
+from vggtgeo.evaluation.report import ABSURD_SCALE, FEW_MATCHES
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputWarning
 
@@ -28,11 +28,13 @@ WORST_SHARE = 0.4
 their first poses on, are 0.43 to 0.85 of it apart after Sim(3)."""
 
 
-def warn_of_strangers(estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE) -> bool:
+def warn_of_strangers(
+    estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE, metric: bool = False
+) -> bool:
     """An InputWarning where few poses match in time, and where rotations or places have nothing to do with each other.
 
-    True where the errors of the two mean nothing: too few poses match for an alignment, or they are no better than
-    those of a camera that stands still.
+    True where the errors of the two mean nothing: too few poses match for an alignment, they are no better than those
+    of a camera that stands still, or an estimate that is known to be in metres (`metric`) has another size altogether.
     """
     matched, reference = associate(estimate, truth, max_dt)
     shorter = min(len(estimate), len(truth))
@@ -53,7 +55,13 @@ def warn_of_strangers(estimate: Trajectory, truth: Trajectory, max_dt: float = M
             f"the estimate explains the true path hardly better than a camera that stands still (error after Sim(3) "
             f"{share:.2f} of the path's spread): it is of another sequence, or it failed"
         )
-    return turned or elsewhere or (few and len(matched) < FEW_MATCHES)
+    scale = absolute_error(matched, reference, "sim3").alignment.scale if len(matched) >= FEW_MATCHES else 1.0
+    resized = metric and not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE
+    if resized:
+        _warn(
+            f"the estimate is in metres, and the truth {scale:.3g} times as large: it is of another sequence, or unit"
+        )
+    return turned or elsewhere or resized or (few and len(matched) < FEW_MATCHES)
 
 
 def _warn(message: str) -> None:

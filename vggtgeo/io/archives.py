@@ -118,7 +118,7 @@ def read_archive(path: Path, what: str, use: Callable[[Archive], dict[str, np.nd
 
     """
     if not path.is_file():
-        raise InputError(f"`{path}` is no file; give the .npz of {what}")
+        raise InputError(f"`{path}` is no file; give that of {what}")
     try:
         with path.open("rb") as handle, zipfile.ZipFile(handle) as file:
             members = {info.filename.removesuffix(".npy"): info for info in file.infolist()}
@@ -126,4 +126,4 @@ def read_archive(path: Path, what: str, use: Callable[[Archive], dict[str, np.nd
     except InputError:
         raise
     except UNREADABLE as error:
-        raise InputError(f"`{path}` cannot be read as .npz: {error}") from error
+        raise InputError(f"`{path}` is damaged, or no file of {what}: {error}") from error

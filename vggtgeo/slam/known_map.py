@@ -87,7 +87,7 @@ def load_map(path: str | os.PathLike[str]) -> Slam:
         >>> vg.load_map("office.map")
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `office.map` is no file; give the .npz of a map
+        vggtgeo.io.errors.InputError: `office.map` is no file; give that of a map
 
     """
     found, _ = MAP.read(Path(path))
