@@ -49,6 +49,8 @@ def _run(path: Path, changes: dict[str, str]) -> None:
             source = source.replace(text, shorter)
         exec(compile(source, f"{path.name}[{number}]", "exec"), namespace)
     plt.close("all")
+    keyframe: Any = namespace.get("keyframe")  # whose panels are drawn
+    assert keyframe is None or np.isfinite(keyframe.depth.astype(float)).mean() > 0.5
     assert not unused, f"`{path.name}` no longer holds {unused}"
 
 
