@@ -147,7 +147,7 @@ def test_only_the_same_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         run(monkeypatch, before)
     assert before.path.read_bytes() == content
     before.path.write_bytes(content[:-300])
-    with pytest.raises(InputError, match="cannot be read as"):
+    with pytest.raises(InputError, match="is damaged, or no file of a checkpoint"):
         run(monkeypatch, before)
 
 

@@ -218,8 +218,8 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
 
     Example:
         >>> from torch.utils.data import DataLoader  # doctest: +SKIP
-        >>> data = vg.WindowDataset.open("windows")
-        >>> loader = DataLoader(data, batch_size=8, shuffle=True, num_workers=2, collate_fn=vg.stack_windows)
+        >>> data = vg.WindowDataset.open("windows")  # doctest: +SKIP
+        >>> loader = DataLoader(data, batch_size=8, num_workers=2, collate_fn=vg.stack_windows)  # doctest: +SKIP
 
     """
     stack: LabelledWindow = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
