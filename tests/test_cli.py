@@ -253,6 +253,19 @@ def test_a_device_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest
     assert result.stderr == "error: JAX finds no device for JAX_PLATFORMS=cuda; unset it, or use cpu\n"
 
 
+def test_a_switch_that_makes_nan_an_error_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`JAX_DEBUG_NANS` was an internal error; oracle: the line."""
+
+    def raising(*_: object, **__: object) -> None:
+        raise FloatingPointError("invalid value (nan) encountered in jit(call)")
+
+    monkeypatch.setenv("JAX_DEBUG_NANS", "1")
+    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
+    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
+    assert result.exit_code == 2
+    assert result.stderr == "error: JAX_DEBUG_NANS makes every NaN an error, and here NaN means none; unset it\n"
+
+
 def test_a_solve_without_compilation_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`JAX_DISABLE_JIT=1` was an internal error after all the work; oracle: the line, and that nothing is written."""
     monkeypatch.setenv("JAX_DISABLE_JIT", "1")

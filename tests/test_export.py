@@ -372,8 +372,8 @@ def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
         values = dict(data)
     for name, wrong in (("track_view", values["track_view"] + 1000), ("poses", np.zeros(3)), ("frames", np.array(3.0))):
         np.savez(tmp_path / "scene.npz", **{**values, name: wrong})
-        with pytest.raises(vg.InputError, match="cannot be read|is damaged, or no file of the scene"):
+        with pytest.raises(vg.InputError, match=r"cannot be read|is damaged, or no file of the scene"):
             Scene.load(tmp_path)
     (tmp_path / "scene.npz").write_bytes((folder / "scene.npz").read_bytes()[:100])
-    with pytest.raises(vg.InputError, match="cannot be read|is damaged, or no file of the scene"):
+    with pytest.raises(vg.InputError, match=r"cannot be read|is damaged, or no file of the scene"):
         Scene.load(tmp_path)

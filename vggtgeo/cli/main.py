@@ -222,6 +222,10 @@ def _leave(error: BaseException) -> NoReturn:
         message, code = f"error: {_usage_message(error)}", EXIT_INPUT
     elif (wrong := _wrong_switch(error)) is not None:
         message, code = f"error: {wrong}", EXIT_INPUT
+    elif "FloatingPoint" in type(error).__name__ and "JAX_DEBUG_NANS" in os.environ:  # JAX has one of its own, too
+        # NaN stands for what is not known (depth, say), and none of it is an error.
+        message = "error: JAX_DEBUG_NANS makes every NaN an error, and here NaN means none; unset it"
+        code = EXIT_INPUT
     elif _lacks_platform():
         message = f"error: JAX finds no device for JAX_PLATFORMS={os.environ['JAX_PLATFORMS']}; unset it, or use cpu"
         code = EXIT_INPUT
