@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,11 @@ def somebodys(name: str, link: bool = False) -> Any:
             place.write_text("of the user")
 
     return make
+
+
+def below_output(flag: str, name: str) -> Callable[[Any], list[Any]]:
+    """A run with a file below its own output."""
+    return lambda made: [*run_with(flag, made.parent / "out" / name)(made)]
 
 
 def into_garbage(made: Path) -> Any:
@@ -301,6 +307,9 @@ RUN = rows(
         ("`--intrinsics` with 1e400", good, flags("--intrinsics", "1e400,55,31.5,23.5")),
         ("`--depth-scale 1e400`", good, flags("--depth-scale", "1e400")),
         ("`--save-map` onto a device", good, flags("--save-map", "/dev/full")),
+        ("`--save-map` where nothing can be written", good, flags("--save-map", "/proc/x.map")),
+        ("`--save-map` among the run's pictures", good, {"argv": below_output("--save-map", "images/x.map")}),
+        ("`--rerun` among the run's pictures", good, {"argv": below_output("--rerun", "images/x.rrd")}),
         ("`--set` of two lines", good, flags("--set", "tracking.least_inliers=5\nkeyframes.keyframe_distance=1")),
         ("the home folder of somebody unknown", nothing, {"argv": line("run", "~no-such-user/clip")}),
         ("two paths", good, {"argv": lambda made: ["run", made, made]}),

@@ -1,6 +1,7 @@
 """The camera of a folder: in a file of any name, in what a renamed folder says of itself, in `transforms.json`."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,16 @@ def test_a_wrong_transforms_file_is_told(tmp_path: Path, change: dict[str, objec
     (folder / "transforms.json").write_text(json.dumps({**content, **change}))
     with pytest.raises(InputError, match=told):
         open_sequence(folder)
+
+
+def test_depth_that_is_listed_and_not_there_is_told(tmp_path: Path) -> None:
+    # Proves that a folder whose depth was not copied is no folder without depth.
+    folder = tiny.nerfstudio(tmp_path / "scene")
+    shutil.rmtree(folder / "depth")
+    with pytest.warns(
+        InputWarning, match=r"none of the 3 depth images is there: `.*/depth/.*`, ...; reading the images"
+    ):
+        assert not open_sequence(folder).has_depth
 
 
 @pytest.mark.parametrize("ending", ["", ".JPEG", None])

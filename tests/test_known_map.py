@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import replace
 from functools import cache
@@ -256,9 +257,9 @@ def test_a_whole_run_in_a_map(known: Slam, tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.usefixtures("uncompiled")
-def test_the_command_saves_and_takes_a_map(tmp_path: Path) -> None:
+def test_the_command_saves_and_takes_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`--save-map`, then `--map --localise-only` on the same frames: all are placed, no keyframe is added; oracle: the
-    summaries.
+    summaries. A map that cannot be saved costs no result.
     """
     for _ in write_tum_folder(vg.simulate("room", 3, 0, (320, 240), rate=20.0), tmp_path / "room"):
         pass
@@ -271,3 +272,13 @@ def test_the_command_saves_and_takes_a_map(tmp_path: Path) -> None:
     assert [one["frames_tracked"] for one in found] == [3, 3]
     assert [one["keyframes"] for one in found] == [1, 1]
     assert found[1]["notes"] == ["frame 0 (0.000000.png) is the first that was found in the map"]
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("vggtgeo.results.result.save_map", full)
+    command = ["run", str(tmp_path / "room"), "-o", str(tmp_path / "kept"), "--dense", "none"]
+    done = CliRunner().invoke(make_app(), [*command, "--save-map", str(tmp_path / "b.map")])
+    assert done.exit_code == 2
+    assert "b.map` could not be saved: No space left on device; all other results are in" in done.stderr
+    assert (tmp_path / "kept" / "summary.json").is_file()

@@ -228,6 +228,15 @@ def test_a_jitted_function_may_close_over_the_problem(solved: Solve) -> None:
         jax.jit(lambda state: solve(nothing, state))(start)
 
 
+@pytest.mark.parametrize("value", [np.nan, -1.0, np.inf])
+def test_weights_that_are_none_are_refused(value: float) -> None:
+    # Proves that a weight which would leave its observation out, or pull without end, is no solution that converged.
+    problem, start, _ = exact_problem()
+    weight = problem.points.weight.at[0].set(value)
+    with pytest.raises(InputError, match=r"`points.weight` has \d+ values of \d+ that are negative or not finite"):
+        solve(problem.with_term(problem.points.reweighted(weight)), start)
+
+
 def test_vmap_solves_each(solved: Solve) -> None:
     # Proves that a batch of problems of one shape is solved one by one, each with its own count. Oracle: two solves.
     problems = [scene.pack(**OPTIONS)[:2] for scene in (NOISY, make_scene(noise=1.0, depth_error=0.1, seed=5))]

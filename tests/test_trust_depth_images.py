@@ -45,6 +45,10 @@ def test_a_room_that_ends_at_arms_length_is_told(healthy: Walk) -> None:
     assert "19 in 20 are within 0.9 m" in check_range(healthy.estimate, small)[0].text
     desk = with_depth(healthy.evidence, lambda f: np.where(np.arange(len(f.depth)) % 12 == 0, 2.0, 0.6))
     assert check_range(healthy.estimate, desk) == []
+    far = with_depth(healthy.evidence, lambda f: 300 * f.depth)
+    free = replace(healthy.estimate, metric=False)
+    assert "it was not used, and the scale stays free" in check_range(free, far)[0].text
+    assert check_range(free, healthy.evidence) == []
 
 
 def test_holes_are_far_where_a_sensor_ends(healthy: Walk) -> None:

@@ -12,14 +12,17 @@ from scipy.sparse.csgraph import connected_components
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.io.errors import InputError, InputWarning
 
 
 def check_observed(problem: Problem) -> None:
-    """At least one observation that ties a landmark or a pose; a problem that is traced may be anything.
+    """At least one observation that ties a landmark or a pose, and weights that are such; a problem that is traced may
+    be anything.
 
     Raises:
-        InputError: there is none: all weights are zero, and every state is an optimum.
+        InputError: there is none: all weights are zero, and every state is an optimum; or a weight is negative or not
+            finite, which would count as an observation that is not there.
 
     """
     about = [term for term in problem.terms if not isinstance(term, CameraTerm)]
@@ -27,12 +30,24 @@ def check_observed(problem: Problem) -> None:
         return
     with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
         for term in about:
+            _check_weights(term)
+        for term in about:
             if np.any(np.asarray(term.present())) and not (isinstance(term, DenseTerm) and not int(term.rows())):
                 return
     raise InputError(
         "nothing is observed: all weights of the terms on landmarks and poses are zero, so every state is an optimum; "
         "give at least one observation a positive weight"
     )
+
+
+def _check_weights(term: AbstractTerm) -> None:
+    weight = np.asarray(getattr(term, "weight", 0.0))
+    wrong = weight[~(np.isfinite(weight) & (weight >= 0))]
+    if wrong.size:
+        raise InputError(
+            f"`{term.name}.weight` has {wrong.size} values of {weight.size} that are negative or not finite (the "
+            f"first: {wrong.flat[0]:g}); give 0 to an observation that is to count for nothing"
+        )
 
 
 def check_tied(observations: Observations, keyframes: int) -> None:

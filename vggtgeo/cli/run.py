@@ -5,6 +5,7 @@ What is heavy is imported when a run begins, so that `vggtgeo run --help` answer
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -81,6 +82,8 @@ def run(
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
+    if rerun:
+        check_recording_file(rerun, output)
     check_flags(memory_limit_gb, fps)
     check_provider(provider)
     if save_depth and dense == "none":
@@ -140,6 +143,21 @@ def check_map_file(file: Path, output: Path) -> None:
     if is_result(output, file):
         raise InputError(
             f"`--save-map` is `{file}`, the name of a result of the run itself; give another, such as `{output}.map`"
+        )
+    there = next(folder for folder in file.absolute().parents if folder.exists())
+    try:
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise InputError(f"`--save-map` is `{file}`, which cannot be written: {error.strerror or error}") from None
+
+
+def check_recording_file(target: str, output: Path) -> None:
+    """InputError for a recording where the run's results would take it away."""
+    from vggtgeo.results.run_folder import is_in_results
+
+    if target not in ("spawn", "serve") and is_in_results(output, Path(target)):
+        raise InputError(
+            f"`--rerun` is `{target}`, in a folder that the run itself replaces; give another: `{output}/run.rrd`, say"
         )
 
 

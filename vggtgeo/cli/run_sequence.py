@@ -18,13 +18,14 @@ from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.datasets.reduced import reduced
 from vggtgeo.io.checkpoint_pace import EVERY
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
-from vggtgeo.results.result import DepthChoice
+from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, taken
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.presets import Perception
@@ -111,21 +112,35 @@ def run_and_write(
                 known_map=known_map,
             )
             bar.on_stage("writing")
-            if output.save_map is not None:
-                result.save_map(output.save_map)
             frames = _once_more(sequence, roles, settings) if output.save_depth == "every" else None
             summary = result.save_into(folder, depth=output.save_depth, frames=frames, settings=output.flags)
+            unsaved = _save_map(result, output.save_map)  # last: whatever becomes of it, the results are there
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: everything was done and is written", err=True)
     print_result(console, result, summary, output.folder)
     if output.as_json:
         typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
+    if unsaved:
+        raise InputError(f"{unsaved}; all other results are in `{output.folder}`")
     if output.rerun == "serve":
         serve_until_interrupted(url, silent)
     if result.summary["interrupted"]:
         raise typer.Exit(EXIT_INTERRUPTED)
     if result.verdict.level == "failed":
         raise typer.Exit(EXIT_FAILED)
+
+
+def _save_map(result: Result, file: Path | None) -> str:
+    """Why the map could not be saved; empty where it was, or nobody asked."""
+    if file is None:
+        return ""
+    try:
+        result.save_map(file)
+    except OSError as error:
+        return f"the map `{file}` could not be saved: {error.strerror or error}"
+    except InputError as error:
+        return f"the map `{file}` could not be saved: {error}"
+    return ""
 
 
 def _once_more(sequence: Sequence, roles: Roles | Perception, settings: SlamSettings) -> Sequence | None:

@@ -69,7 +69,11 @@ class Nerfstudio(FolderSequence):
         )
         width, height = common_size(str(folder), files)
         camera = _camera(file, content, list(images.values()), width, height)
-        has_depth = any(one.depth is not None and one.depth.is_file() for one in files)
+        listed = [one.depth for one in files if one.depth is not None]
+        has_depth = any(depth.is_file() for depth in listed)
+        if listed and not has_depth:
+            text = f"none of the {len(listed)} depth images is there: `{listed[0]}`, ...; reading the images only"
+            warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=3)
         unit = _positive(file, "integer_depth_scale", content.get("integer_depth_scale", 1e-3))
         coding = replace(MILLIMETRES, units_per_metre=1.0 / unit)
         return cls(folder, folder.resolve().name, camera, files, coding, has_depth)

@@ -277,8 +277,14 @@ def _inside(place: Path, source: Path) -> str | None:
 
 
 def is_result(folder: Path, file: Path) -> bool:
-    """Whether `file` has the name and place of a result of a run into `folder`."""
-    return file.resolve().parent == folder.resolve() and _is_known(file.name)
+    """Whether `file` has the name and place of a result of a run into `folder`, or lies in a folder of them."""
+    part = _inside(folder, file)
+    return part is not None and (_is_known(part) or part == UNFINISHED)
+
+
+def is_in_results(folder: Path, file: Path) -> bool:
+    """Whether `file` lies in a folder that a run into `folder` replaces: `images`, `depth`, `unfinished`."""
+    return is_result(folder, file) and file.resolve().parent != folder.resolve()
 
 
 def _is_known(name: str) -> bool:

@@ -31,6 +31,8 @@ by it. Depth at a fifth of the rate of the images repeats itself in as many, and
 building-walk, all of them 1 m away, 34 cm off, agreed with themselves and were called good."""
 NEAREST = 0.2
 """Metres: at most a tenth of the corners is nearer to a sensor for rooms."""
+SENSED = 0.2, 8.0
+"""Metres that `SensorDepth` takes: a map whose depth is elsewhere has none, and would be called good without a word."""
 SMALLEST_ROOM = 1.0
 """Metres: of the depths at corners, over the whole run, more than a twentieth is farther."""
 
@@ -61,9 +63,17 @@ def check_range(estimate: Estimate, evidence: Evidence) -> list[Finding]:
     """A depth that no room has: most likely a wrong unit."""
     medians = np.array([frame.depth_median for frame in evidence])
     medians = medians[np.isfinite(medians)]
-    if not estimate.metric or not len(medians):
+    if not len(medians):
         return []
     middle = float(np.median(medians))
+    if not estimate.metric:
+        if SENSED[0] <= middle <= SENSED[1]:
+            return []
+        text = (
+            f"the median depth is {middle:.3g} m, where no sensor for rooms sees: it was not used, and the scale stays "
+            "free; is the unit of the depth images right?"
+        )
+        return [Finding("depth range", "degraded", text)]
     corners = np.concatenate([frame.depth for frame in evidence])
     corners = corners[np.isfinite(corners)]
     # A hole counts as far: where a sensor ends at 1.7 m, say, what is left of a wide view is what is near.
