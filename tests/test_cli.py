@@ -266,6 +266,19 @@ def test_a_switch_that_makes_nan_an_error_is_named(tmp_path: Path, monkeypatch: 
     assert result.stderr == "error: JAX_DEBUG_NANS makes every NaN an error, and here NaN means none; unset it\n"
 
 
+def test_a_switch_of_jax_that_may_be_why_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an internal error, what the environment asks of JAX; oracle: the line."""
+
+    def raising(*_: object, **__: object) -> None:
+        raise RuntimeError("types are promoted strictly")
+
+    monkeypatch.setenv("JAX_NUMPY_DTYPE_PROMOTION", "strict")
+    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
+    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
+    assert result.exit_code == 1
+    assert "JAX_NUMPY_DTYPE_PROMOTION" in result.stderr.split("the environment sets ")[1]
+
+
 def test_a_solve_without_compilation_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`JAX_DISABLE_JIT=1` was an internal error after all the work; oracle: the line, and that nothing is written."""
     monkeypatch.setenv("JAX_DISABLE_JIT", "1")

@@ -370,7 +370,12 @@ def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
         Scene.load(tmp_path)
     with np.load(folder / "scene.npz") as data:
         values = dict(data)
-    for name, wrong in (("track_view", values["track_view"] + 1000), ("poses", np.zeros(3)), ("frames", np.array(3.0))):
+    for name, wrong in (
+        ("track_view", values["track_view"] + 1000),
+        ("poses", np.zeros(3)),
+        ("frames", np.array(3.0)),
+        ("frames", 0 * values["frames"]),
+    ):
         np.savez(tmp_path / "scene.npz", **{**values, name: wrong})
         with pytest.raises(vg.InputError, match=r"cannot be read|is damaged, or no file of the scene"):
             Scene.load(tmp_path)

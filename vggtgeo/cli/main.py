@@ -21,7 +21,8 @@ from vggtgeo.cli.jax_flags import check_jit, set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.streams import exit_code, use_lasting_streams, use_readable_width
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.interruption import end_on_signals
+from vggtgeo.io.interruption import end_on_signals, ignore_signals
+from vggtgeo.io.jax_environment import jax_environment
 from vggtgeo.io.one_line import one_line
 
 EXIT_INPUT = 2
@@ -230,7 +231,7 @@ def _leave(error: BaseException) -> NoReturn:
         message = f"error: JAX finds no device for JAX_PLATFORMS={os.environ['JAX_PLATFORMS']}; unset it, or use cpu"
         code = EXIT_INPUT
     else:
-        message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`)"
+        message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`){_switches_of_jax()}"
         code = EXIT_INTERNAL
     typer.echo(one_line(message), err=True)
     raise typer.Exit(code) from None
@@ -255,6 +256,13 @@ def _wrong_switch(error: BaseException) -> str | None:
     """What is wrong with a variable of JAX's that is neither true nor false: it says `invalid truth value ...`."""
     found = re.fullmatch(r"invalid truth value '(.*)' for environment '(\w+)'", str(error))
     return found and f"the environment variable `{found[2]}` is `{found[1]}`; JAX expects true or false"
+
+
+def _switches_of_jax() -> str:
+    """What the environment asks of JAX, beside what this program sets: any of it may be why."""
+    ours = jax_environment()
+    theirs = [name for name in os.environ if name.startswith("JAX_") and name not in ours]
+    return f"; the environment sets {', '.join(theirs)}: unset that, and try again" if theirs else ""
 
 
 def _lacks_platform() -> bool:
@@ -325,6 +333,8 @@ def main() -> None:
         make_app()(prog_name="vggtgeo")
     except SystemExit as end:
         raise SystemExit(exit_code(end.code, EXIT_INPUT)) from None
+    finally:
+        ignore_signals()
 
 
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:

@@ -139,9 +139,10 @@ def read_json(file: Path) -> Any:
 def _have_rotations(poses: np.ndarray) -> np.ndarray:
     """Whether the axes of each pose have nearly unit length and are no mirror image, above a last row 0 0 0 1."""
     last = (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) < _MOST_STRETCH).all(axis=1)
-    lengths = np.linalg.norm(poses[:, :3, :3], axis=1)
-    near = (np.abs(lengths - 1.0) < _MOST_STRETCH).all(axis=1)
-    return np.asarray(last & near & (np.linalg.det(poses[:, :3, :3]) > 0.0), bool)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is no rotation may be of any size
+        lengths = np.linalg.norm(poses[:, :3, :3], axis=1)
+        near = (np.abs(lengths - 1.0) < _MOST_STRETCH).all(axis=1)
+        return np.asarray(last & near & (np.linalg.det(poses[:, :3, :3]) > 0.0), bool)
 
 
 def _orthonormal(poses: np.ndarray) -> np.ndarray:

@@ -50,6 +50,13 @@ def end_on_signals() -> None:
             signal.signal(number, signal.default_int_handler)
 
 
+def ignore_signals() -> None:
+    """The same signals change nothing any more: all is done, and what ends then (JAX's devices) is no error's place."""
+    for number in _signals():
+        if signal.getsignal(number) is not signal.SIG_DFL:
+            signal.signal(number, signal.SIG_IGN)
+
+
 @contextmanager
 def interruption() -> Iterator[Interruption]:
     """Notes the signals that would raise KeyboardInterrupt, in place of raising it; inside another, the same object.

@@ -133,6 +133,8 @@ class Scene:
             raise ValueError("its tracks name views that are not there")
         if len(tracks.point) and not (0 <= tracks.point.min() <= tracks.point.max() < len(tracks)):
             raise ValueError("its tracks name points that are not there")
+        if len(np.unique(values["frames"])) != count or not np.isfinite(values["timestamps"]).all():
+            raise ValueError("two of its views are of one frame, or a time is none")
         size, intrinsics = (int(width), int(height)), values["intrinsics"]
         wrong = _impossible(poses, intrinsics, size, tracks)
         if wrong:
