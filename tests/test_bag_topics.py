@@ -78,11 +78,11 @@ def test_what_cannot_be_read_is_named() -> None:
 def test_what_was_chosen_is_told() -> None:
     # Proves a sentence where there was a choice, and none where there was none.
     chosen = Chosen("/rgb", "/depth_registered", ("/depth", "/ir"))
-    assert told(chosen, ["/gt"]) == (
+    assert told(chosen, "/gt") == (
         "images of `/rgb`, depth of `/depth_registered`, truth of `/gt`; not read: `/depth`, `/ir`"
     )
-    assert told(Chosen("/rgb", "", ("/ir",)), [""]) == "images of `/rgb`, no depth; not read: `/ir`"
-    assert not told(Chosen("/rgb", "/depth", ()), [])
+    assert told(Chosen("/rgb", "", ("/ir",)), "") == "images of `/rgb`, no depth; not read: `/ir`"
+    assert not told(Chosen("/rgb", "/depth", ()), "")
 
 
 @pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
@@ -115,8 +115,11 @@ def test_compressed_depth() -> None:
     head = bytes(4) + np.array([a, b], "<f4").tobytes()
     floats = packed("32FC1; compressedDepth png", head + cv2.imencode(".png", inverse)[1].tobytes())
     np.testing.assert_allclose(metres_of(floats), [[np.nan, 1000 / 203.5, 1000 / 1003.5]], rtol=1e-6)
-    with pytest.raises(InputError, match=r"its depth \(16UC1; compressedDepth rvl\) cannot be decoded"):
-        metres_of(packed("16UC1; compressedDepth rvl", bytes(60)))
+    for rest in (bytes(60), bytes(12), b""):
+        with pytest.raises(InputError, match=r"its depth \(16UC1; compressedDepth rvl\) cannot be decoded"):
+            metres_of(packed("16UC1; compressedDepth rvl", rest))
+    with pytest.raises(InputError, match="it cannot be decoded"):
+        image_of(packed("bgr8; jpeg compressed bgr8"))
 
 
 def test_a_choice_is_a_note_and_no_problem(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import importlib.metadata
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -253,30 +254,26 @@ def test_a_device_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest
     assert result.stderr == "error: JAX finds no device for JAX_PLATFORMS=cuda; unset it, or use cpu\n"
 
 
-def test_a_switch_that_makes_nan_an_error_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`JAX_DEBUG_NANS` was an internal error; oracle: the line."""
+@pytest.mark.parametrize(
+    ("switch", "error", "code", "line"),
+    [
+        ("JAX_DEBUG_NANS", FloatingPointError("nan"), 2, "error: JAX_DEBUG_NANS makes every NaN an error"),
+        ("JAX_NUMPY_DTYPE_PROMOTION", RuntimeError("strict"), 1, "the environment sets .*JAX_NUMPY_DTYPE_PROMOTION"),
+    ],
+)
+def test_a_switch_of_jax_that_ends_a_command_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, switch: str, error: Exception, code: int, line: str
+) -> None:
+    """What the environment asks of JAX was an internal error without a word of it; oracle: the line."""
 
     def raising(*_: object, **__: object) -> None:
-        raise FloatingPointError("invalid value (nan) encountered in jit(call)")
+        raise error
 
-    monkeypatch.setenv("JAX_DEBUG_NANS", "1")
+    monkeypatch.setenv(switch, "1")
     monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
     result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
-    assert result.exit_code == 2
-    assert result.stderr == "error: JAX_DEBUG_NANS makes every NaN an error, and here NaN means none; unset it\n"
-
-
-def test_a_switch_of_jax_that_may_be_why_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of an internal error, what the environment asks of JAX; oracle: the line."""
-
-    def raising(*_: object, **__: object) -> None:
-        raise RuntimeError("types are promoted strictly")
-
-    monkeypatch.setenv("JAX_NUMPY_DTYPE_PROMOTION", "strict")
-    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
-    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
-    assert result.exit_code == 1
-    assert "JAX_NUMPY_DTYPE_PROMOTION" in result.stderr.split("the environment sets ")[1]
+    assert result.exit_code == code
+    assert re.search(line, result.stderr)
 
 
 def test_a_solve_without_compilation_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -149,6 +149,16 @@ def test_a_camera_for_other_images_is_not_used(tmp_path: Path) -> None:
     assert "a camera for 960 x 30 pixels; the images are 40 x 30: not used" in str(caught[0].message)
 
 
+def test_a_part_that_unpacks_to_too_much_is_refused(tmp_path: Path) -> None:
+    # Proves that a text of 65 MB in a small archive is not unpacked. Oracle: the sentence.
+    bomb = tmp_path / "bomb.r3d"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", bytes(65 * 2**20))
+        archive.writestr("rgbd/0.jpg", b"")
+    with pytest.raises(InputError, match=r"bomb.r3d/metadata` has 68157440 bytes, more than 67108864: not unpacked"):
+        open_sequence(bomb)
+
+
 def test_an_archive_without_images_or_end(tmp_path: Path) -> None:
     # Proves two sentences: a recording without images, and a file that was not copied to its end.
     empty = tmp_path / "empty.r3d"

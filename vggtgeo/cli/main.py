@@ -223,10 +223,6 @@ def _leave(error: BaseException) -> NoReturn:
         message, code = f"error: {_usage_message(error)}", EXIT_INPUT
     elif (wrong := _wrong_switch(error)) is not None:
         message, code = f"error: {wrong}", EXIT_INPUT
-    elif "FloatingPoint" in type(error).__name__ and "JAX_DEBUG_NANS" in os.environ:  # JAX has one of its own, too
-        # NaN stands for what is not known (depth, say), and none of it is an error.
-        message = "error: JAX_DEBUG_NANS makes every NaN an error, and here NaN means none; unset it"
-        code = EXIT_INPUT
     elif _lacks_platform():
         message = f"error: JAX finds no device for JAX_PLATFORMS={os.environ['JAX_PLATFORMS']}; unset it, or use cpu"
         code = EXIT_INPUT
@@ -253,7 +249,11 @@ def _is_short_of_memory(error: BaseException) -> bool:
 
 
 def _wrong_switch(error: BaseException) -> str | None:
-    """What is wrong with a variable of JAX's that is neither true nor false: it says `invalid truth value ...`."""
+    """What is wrong with a variable of JAX's: neither true nor false (it says `invalid truth value ...`), or one that
+    makes an error of NaN, which stands for what is not known, depth, say.
+    """
+    if "FloatingPoint" in type(error).__name__ and "JAX_DEBUG_NANS" in os.environ:  # JAX has an error of its own, too
+        return "JAX_DEBUG_NANS makes every NaN an error, and here NaN means none; unset it"
     found = re.fullmatch(r"invalid truth value '(.*)' for environment '(\w+)'", str(error))
     return found and f"the environment variable `{found[2]}` is `{found[1]}`; JAX expects true or false"
 

@@ -1,7 +1,7 @@
 """Which topics of a bag are the images, their depth, and the truth; and what a message of each holds."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,7 +103,7 @@ def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:
 def image_of(message: Any) -> np.ndarray:
     """uint8 [H, W, 3], RGB; InputError where it cannot be decoded."""
     if not hasattr(message, "encoding"):  # compressed
-        image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
+        image = _decoded(np.asarray(message.data, np.uint8).tobytes(), cv2.IMREAD_COLOR)
         if image is None:
             raise InputError("it cannot be decoded")
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
@@ -135,7 +135,7 @@ def _compressed_metres(message: Any) -> np.ndarray:
     """
     content = np.asarray(message.data, np.uint8).tobytes()
     headed = not content.startswith(_PNG)
-    codes = cv2.imdecode(np.frombuffer(content[_HEAD if headed else 0 :], np.uint8), cv2.IMREAD_UNCHANGED)
+    codes = _decoded(content[_HEAD if headed else 0 :], cv2.IMREAD_UNCHANGED)
     if codes is None or codes.dtype != np.uint16 or codes.ndim != 2:
         raise InputError(f"its depth ({_kind(message)}) cannot be decoded; expected a PNG of 16 bits, not RVL")
     if headed and message.format.split(";")[0].strip() == "32FC1":
@@ -145,11 +145,16 @@ def _compressed_metres(message: Any) -> np.ndarray:
     return np.asarray(codes * np.float32(1e-3), np.float32)
 
 
-def told(chosen: Chosen, poses: Iterable[str]) -> str:
-    """What was chosen, as a sentence; empty where there was no choice."""
+def _decoded(content: bytes, flags: int) -> np.ndarray | None:
+    """None for what is no picture; OpenCV raises where there are no bytes at all."""
+    return cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+
+
+def told(chosen: Chosen, poses: str) -> str:
+    """What was chosen, as a sentence; empty where there was no choice. poses: the topic of the truth, "" for none."""
     if not chosen.others:
         return ""
     depth = f", depth of `{chosen.depth}`" if chosen.depth else ", no depth"
-    truth = "".join(f", truth of `{name}`" for name in poses if name)
+    truth = f", truth of `{poses}`" if poses else ""
     left = ", ".join(f"`{name}`" for name in chosen.others[:6]) + (", ..." if len(chosen.others) > 6 else "")
     return f"images of `{chosen.colour}`{depth}{truth}; not read: {left}"

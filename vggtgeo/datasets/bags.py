@@ -60,7 +60,7 @@ class RosBag:
             except InputError as error:
                 raise InputError(f"`{path}` {error}") from None
             poses = truth_topic(topics)
-            if text := told(chosen, [poses]):
+            if text := told(chosen, poses):
                 _warn(f"`{path}`: {text}", NoteWarning)
             camera = _camera(reader, topics, chosen.colour, width, height)
             camera = camera or guess_with_warning(str(path), width, height)

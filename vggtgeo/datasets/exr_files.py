@@ -31,9 +31,9 @@ def exr_depth(path: Path) -> np.ndarray:
         (left, top), (right, bottom) = header["dataWindow"]
         width, height = int(right) - int(left) + 1, int(bottom) - int(top) + 1
         names = [channel.name for channel in header["channels"]]
-        if not 0 < width * height <= MOST_PIXELS:
-            limit = f"{MOST_PIXELS // 10**6} million"
-            raise InputError(f"`{path}` declares {width} x {height} pixels, more than {limit}: not decoded")
+        if not 0 < width * height * len(names) <= MOST_PIXELS:  # all channels are decoded
+            size, limit = f"{width} x {height} pixels in {len(names)} channels", f"{MOST_PIXELS // 10**6} million"
+            raise InputError(f"`{path}` declares {size}, none or more than {limit}: not decoded")
         found = [name for name in names if _DEPTH.fullmatch(name)]
         if len(found) > 1:  # Blender writes colours, too: R, G, B beside Z
             found = [name for name in found if name.lower().endswith(("z", "depth", "depth.v"))] or found

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -149,13 +149,15 @@ class FolderSequence:
         return depth
 
 
-def common_size(name: str, files: Sequence[FrameFile]) -> tuple[int, int]:
+def common_size(
+    name: str, files: Sequence[FrameFile], read: Callable[[Path], np.ndarray] = read_image
+) -> tuple[int, int]:
     """Width and height of most of a few readable images: first, middle, last. InputError where none can be read."""
     sizes: list[tuple[int, int]] = []
     reason = ""
     for file in _spread(files):
         try:
-            height, width = read_image(file.image).shape[:2]
+            height, width = read(file.image).shape[:2]
         except InputError as error:
             reason = reason or str(error)
             continue

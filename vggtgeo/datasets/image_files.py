@@ -140,14 +140,14 @@ MOST_BYTES = 700_000_000
 """Of an image's file: all that is decoded, a hundred million pixels, unpacked, of 16 bits in three channels."""
 
 
-def file_content(path: Path) -> bytes:
-    """All bytes of a regular file that is no larger than an image can be."""
+def file_content(path: Path, most: int = MOST_BYTES) -> bytes:
+    """All bytes of a regular file that is no larger than an image can be, or than `most`."""
     try:
         if path.exists() and not path.is_file():  # a list may name a pipe, which has no end
             raise InputError(f"`{path}` is no regular file")
         size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise InputError(f"`{path}` has {size} bytes, more than {MOST_BYTES}: not decoded")
+        if size > most:
+            raise InputError(f"`{path}` has {size} bytes, more than {most}: not decoded")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # a name from a list may be none that a file system takes
         raise InputError(f"`{path}` cannot be read: {getattr(error, 'strerror', None) or error}") from None

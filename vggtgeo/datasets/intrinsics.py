@@ -3,7 +3,9 @@
 import math
 import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -92,12 +94,26 @@ def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
         return None
     if not isinstance(content, dict) or (content.get("w"), content.get("h")) != (width, height):
         return None
-    matrix = content.get("K")
-    if not (isinstance(matrix, list) and len(matrix) == 9 and all(isinstance(value, int | float) for value in matrix)):
+    values = record3d_intrinsics(content)
+    if values is None:
         return None
-    camera = Camera(intrinsics_of(file, (matrix[0], matrix[4], matrix[6], matrix[7])), width, height)
+    camera = Camera(intrinsics_of(file, values), width, height)
     check_plausible(f"`{file}`", camera)
     return camera
+
+
+def record3d_intrinsics(content: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """fx, fy, cx, cy of what Record3D says of a recording: the middle of the frames' own, which autofocus changes a
+    little, else of the matrix `K`, by columns; None where neither is what the app writes.
+    """
+    frames, matrix = content.get("perFrameIntrinsicCoeffs"), content.get("K")
+    try:
+        if isinstance(frames, list) and frames:
+            return tuple(np.median(np.array(frames, np.float64).reshape(len(frames), 4), axis=0).tolist())
+        columns = np.array(matrix, np.float64).reshape(9)
+    except (ValueError, TypeError):
+        return None
+    return tuple(columns[[0, 4, 6, 7]].tolist())
 
 
 def _camera_of_another_name(folder: Path, width: int, height: int) -> Camera | None:

@@ -26,16 +26,25 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, enlarged
-from vggtgeo.datasets.image_files import FARTHEST, MILLIMETRES, ImageFile, file_content, image_in, read_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged
+from vggtgeo.datasets.image_files import (
+    FARTHEST,
+    MILLIMETRES,
+    MOST_BYTES,
+    ImageFile,
+    file_content,
+    image_in,
+    read_depth,
+)
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
-from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, intrinsics_of
+from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, intrinsics_of, record3d_intrinsics
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.text_files import MOST_BYTES as MOST_TEXT
 from vggtgeo.models.extras import install_hint
 
 METADATA, EXPORTED = "metadata", "metadata.json"
@@ -84,7 +93,7 @@ class Record3d(FolderSequence):
         unread = cls(folder, folder.resolve().name, Camera.guess(1, 1), ())
         metadata = unread.metadata()
         files = tuple(map(FrameFile, range(len(numbers)), _times(metadata, numbers), images, there))
-        height, width = unread.first_image(files).shape[:2]
+        width, height = common_size(str(folder), files, lambda path: unread.load_image(path).image)
         camera = _camera(unread.file, metadata, width, height) or guess_with_warning(str(folder), width, height)
         whole = cls(folder, unread.name, camera, files, MILLIMETRES, any(there), _depth_size(metadata))
         return whole if not any(there) or whole.depth_is_usable() else replace(whole, has_depth=False)
@@ -98,22 +107,12 @@ class Record3d(FolderSequence):
         """What the file of the metadata holds; InputError where it is no JSON object."""
         where = self.file
         try:
-            content = json.loads(self._content(where))
+            content = json.loads(self._content(where, MOST_TEXT))
         except (ValueError, RecursionError) as error:
             raise InputError(f"`{where}` is no JSON: {error}") from None
         if not isinstance(content, dict):
             raise InputError(f"`{where}` holds no object of JSON; expected one with `K`, `fps` and `poses`")
         return content
-
-    def first_image(self, files: tuple[FrameFile, ...]) -> np.ndarray:
-        """The first of the images that can be read; InputError where none can."""
-        reason = ""
-        for file in files:
-            try:
-                return self.load_image(file.image).image
-            except InputError as error:
-                reason = reason or str(error)
-        raise InputError(f"none of the {len(files)} images of `{self.folder}` can be read; the first: {reason}")
 
     def holds(self, path: Path) -> bool:
         """Whether the archive, or the folder, has such a part."""
@@ -166,12 +165,17 @@ class Record3d(FolderSequence):
         found = poses_of(rows[:, 4:], rows[:, :4])[[numbers[row] for row in there]] @ FROM_OPENGL
         return trajectory_of([self.files[row].timestamp for row in there], found, where)
 
-    def _content(self, path: Path) -> bytes:
-        """All bytes of a part, by its path in the folder or, as if it were one, in the archive."""
+    def _content(self, path: Path, most: int = MOST_BYTES) -> bytes:
+        """All bytes of a part, by its path in the folder or, as if it were one, in the archive; no more than `most`."""
         if self.folder.is_dir():
-            return file_content(path)
+            return file_content(path, most)
         try:
-            return self._archive.read(path.relative_to(self.folder).as_posix())
+            part = self._archive.getinfo(path.relative_to(self.folder).as_posix())
+            if part.file_size > most:
+                raise InputError(f"`{path}` has {part.file_size} bytes, more than {most}: not unpacked")
+            return self._archive.read(part)
+        except InputError:
+            raise
         except UNREADABLE as error:
             raise InputError(f"`{path}` cannot be read: {error}") from None
 
@@ -258,7 +262,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -> Camera | None:
-    """The middle of the cameras of all frames, which autofocus changes a little; else the one of the file."""
+    """Of the metadata; None where they have none, or one of other images, which is told."""
     size = metadata.get("w"), metadata.get("h")
     if None not in size and size != (width, height):
         warnings.warn(
@@ -267,18 +271,11 @@ def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -
             stacklevel=4,
         )
         return None
-    try:
-        frames = metadata.get("perFrameIntrinsicCoeffs")
-        if isinstance(frames, list) and frames:
-            values = np.median(np.array(frames, np.float64).reshape(len(frames), 4), axis=0)
-        elif (matrix := metadata.get("K")) is not None:
-            columns = np.array(matrix, np.float64).reshape(3, 3)
-            columns = columns if columns[2, :2].any() else columns.T
-            values = np.array([columns[0, 0], columns[1, 1], *columns[2, :2]])
-        else:
-            return None
-    except (ValueError, TypeError):
-        raise InputError(f"`{where}`: `K` must hold 9 numbers, `perFrameIntrinsicCoeffs` 4 for each frame") from None
-    camera = Camera(intrinsics_of(where, tuple(values.tolist())), width, height)
+    values = record3d_intrinsics(metadata)
+    if values is None and not {"K", "perFrameIntrinsicCoeffs"} & metadata.keys():
+        return None
+    if values is None:
+        raise InputError(f"`{where}`: `K` must hold 9 numbers, `perFrameIntrinsicCoeffs` 4 for each frame")
+    camera = Camera(intrinsics_of(where, values), width, height)
     check_plausible(f"`{where}`", camera)
     return camera
