@@ -15,7 +15,7 @@ sought without it (redkitchen: 538 px without, 521 with; COLMAP 522 and 520).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.threads import map_in_threads
 
 LEAST_PAIRS = 8
 PARAMETERS = 4
@@ -31,6 +32,8 @@ ITERATIONS, SETTLED = 20, 0.002
 """At most, and the step, in the longest ones, below which there are no more. Half the focal length is seven of these
 away."""
 POSE_ITERATIONS = 4
+AT_ONCE = 200
+"""Pairs, of some hundred points: 20 MB."""
 HUBER = 1.0
 FARTHEST = 30.0
 """Pixels: residuals beyond are none of this camera's."""
@@ -43,8 +46,8 @@ LONGEST_STEP = np.array([0.1, 30.0, 30.0, 0.1])
 class CameraOpinion:
     """What pairs say of the camera: log factor on the focal lengths, shift of the principal point in pixels (x, y),
     radial coefficient k1; float64 [4], zero means: as it was taken to be. covariance: float64 [4, 4] of these, from
-    `blocks` independent ones. better: share of the pairs that this camera fits better than the one they began with,
-    each pose free; better_half: the same in that half of the time where it is largest.
+    `blocks` independent ones. better: where asked for, share of the pairs that this camera fits better than the one
+    they began with, each pose free; better_half: the same in that half of the time where it is largest.
     """
 
     value: np.ndarray
@@ -74,8 +77,13 @@ class CameraPair:
     block: int
 
 
-def camera_of_pairs(pairs: Sequence[CameraPair], intrinsics: np.ndarray) -> CameraOpinion | None:
-    """Solve for the camera, starting at `intrinsics` and the pairs' poses; None where there are too few pairs."""
+def camera_of_pairs(
+    pairs: Sequence[CameraPair], intrinsics: np.ndarray, compared: bool = False
+) -> CameraOpinion | None:
+    """Solve for the camera, starting at `intrinsics` and the pairs' poses; None where there are too few pairs.
+
+    compared: say how many pairs it fits better, too, which takes longer than the solve.
+    """
     kinds, block = np.unique([pair.block for pair in pairs], return_inverse=True)
     count = len(kinds)
     if len(pairs) < 2 * LEAST_PAIRS or count < LEAST_BLOCKS:
@@ -87,6 +95,8 @@ def camera_of_pairs(pairs: Sequence[CameraPair], intrinsics: np.ndarray) -> Came
     np.add.at(blocks, block, reduced.gradient)
     # Few blocks fit themselves: the usual correction of the sandwich.
     covariance = count / (count - PARAMETERS) * (inverse @ blocks.T @ blocks @ inverse)
+    if not compared:
+        return CameraOpinion(value, covariance, count)
     better = _costs(points, poses, value, intrinsics) < _costs(points, points.given, np.zeros(4), intrinsics)
     return CameraOpinion(value, covariance, count, float(np.mean(better)), _in_best_half(better, block))
 
@@ -132,6 +142,12 @@ class _Points:
         number = np.repeat(np.arange(len(pairs)), [len(pair.depth) for pair in pairs])
         given = np.array([pair.relative for pair in pairs])
         return cls(before, after, np.concatenate([pair.depth for pair in pairs]), number, given)
+
+    def of_pairs(self, own: slice) -> _Points:
+        """Those of some pairs in a row."""
+        start, end = np.searchsorted(self.pair, [own.start, own.stop])
+        of = slice(start, end)
+        return _Points(self.before[of], self.after[of], self.depth[of], self.pair[of] - own.start, self.given[own])
 
     def residuals(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
         """Predicted minus seen pixels float64 [n, 2]; NaN behind a camera. poses: float64 [pairs, 4, 4]."""
@@ -232,6 +248,14 @@ class _Reduced:
 
 
 def _reduce(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Reduced:
+    """All pairs, some at a time: what is computed of them stays in the cache of a core."""
+    part = lambda own: _reduce_part(points.of_pairs(own), poses[own], value, intrinsics)
+    parts = map_in_threads(part, (slice(start, start + AT_ONCE) for start in range(0, len(poses), AT_ONCE)))
+    together = lambda field: np.concatenate([getattr(part, field.name) for part in parts])
+    return _Reduced(*(together(field) for field in fields(_Reduced)))
+
+
+def _reduce_part(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Reduced:
     rows = points.linearized(poses, value, intrinsics)
     size = np.linalg.norm(rows[:, :, 10], axis=1)
     good = np.isfinite(rows).all((1, 2)) & (size < FARTHEST)

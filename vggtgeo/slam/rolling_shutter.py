@@ -31,6 +31,7 @@ from vggtgeo.geometry.cameras import SquarePinhole
 from vggtgeo.slam.camera_gain import LEAST_HOSTS, gain, match_energies
 from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.state import Readout, Slam
+from vggtgeo.slam.threads import map_in_threads
 
 MOST_APART = 3.0
 """Frames beside a keyframe say how it moves where they are at most this many usual intervals away."""
@@ -41,8 +42,8 @@ FASTEST = 1e6
 PROBE = 0.05
 """Pixels, the same: for derivatives."""
 SOLVES = 6
-AT_ONCE = 512
-"""Edges that are looked at together: a building's 15,000 would take gigabytes."""
+AT_ONCE = 128
+"""Edges that are looked at together, by a thread: a building's 15,000 would take gigabytes."""
 LONGEST = 2.0
 """Of a step, in the one before."""
 WORTH_A_TRIAL = 0.05
@@ -124,16 +125,18 @@ def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[
     pixels, inverse = np.asarray(problem.pixels, np.float64), np.asarray(state.inverse_depth, np.float64)
     shift = lambda at, depth, motion: image_shift(at, depth, motion, camera, size, columns)
     count = problem.points.weight.shape[1]
-    points = np.zeros(problem.points.target.shape, np.float32)
-    lines = np.zeros((*problem.lines.weight.shape, 2), np.float32)
     edges = np.stack([np.asarray(problem.edges.source), np.asarray(problem.edges.target)], 1)
     matched = np.asarray(problem.points.target, np.float64)
-    for first in range(0, len(edges), AT_ONCE):
-        part = slice(first, first + AT_ONCE)
+
+    def of_edges(part: slice) -> tuple[np.ndarray, np.ndarray]:
         host, target = edges[part].T
         seen, depth = carried(pixels[host], inverse[host], poses[target] @ rigid.invert(poses[host]), camera)
-        points[part] = shift(matched[part], depth[:, :count], motions[target])
-        lines[part] = shift(seen[:, count:], depth[:, count:], motions[target])
+        points = shift(matched[part], depth[:, :count], motions[target])
+        lines = shift(seen[:, count:], depth[:, count:], motions[target])
+        return points.astype(np.float32), lines.astype(np.float32)
+
+    parts = map_in_threads(of_edges, (slice(first, first + AT_ONCE) for first in range(0, len(edges), AT_ONCE)))
+    points, lines = (np.concatenate(each) for each in zip(*parts, strict=True))
     return Shifts(shift(pixels, inverse, motions), points, lines)
 
 

@@ -90,7 +90,7 @@ CONFIRMED = 0.3
 
 def camera_opinion(estimate: Estimate, evidence: Evidence) -> CameraOpinion | None:
     """The camera by the run's corners, starting at that of the run and its poses; None where there is too little."""
-    return camera_of_pairs(_pairs(estimate, evidence), estimate.intrinsics)
+    return camera_of_pairs(_pairs(estimate, evidence), estimate.intrinsics, compared=True)
 
 
 def check_camera(estimate: Estimate, opinion: CameraOpinion | None, size: tuple[int, int]) -> list[Finding]:
