@@ -28,7 +28,7 @@ from vggtgeo.slam.global_adjustment import _taken_lens
 from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
 from vggtgeo.slam.pending_window import settled
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state import SeenPoints, Slam
 from vggtgeo.slam.trust import judge as judging
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import FrameEvidence
@@ -168,9 +168,12 @@ def redrawn(pixels: np.ndarray) -> np.ndarray:
 
 
 def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
-    # Proves that key points, matches, segments and samples are where the ideal camera has them, pictures and depth are
-    # resampled alike, and poses and depths stay. Oracle: each goes back through the lens to where it was.
+    # Proves that key points (those of frames, too), matches, segments and samples are where the ideal camera has them,
+    # pictures and depth are resampled alike, and poses and depths stay. Oracle: each goes back through the lens to its
+    # old place.
     before = run_of_room()
+    kept = SeenPoints(np.arange(2, dtype=np.int32), np.array([[20.0, 15.0], [140.0, 90.0]], np.float32))
+    before = replace(before, frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
     assert can_undistort(before)
     after = undistorted(before, LENS)
     assert after.lens is LENS
@@ -192,6 +195,9 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
     for old_pair, new_pair in zip(before.pairs, after.pairs, strict=True):
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_i), old_pair.points.pixels_i, atol=1e-3)
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_j), old_pair.points.pixels_j, atol=1e-3)
+    last = after.frames[-1].seen
+    assert last is not None
+    np.testing.assert_allclose(redrawn(last.pixels), kept.pixels, atol=1e-3)
 
 
 def test_corners_of_the_verdict_go_through_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:

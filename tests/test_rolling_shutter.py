@@ -18,8 +18,8 @@ from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
 from vggtgeo.slam import calibration
 from vggtgeo.slam.calibration import keyframe_pairs
+from vggtgeo.slam.carried_poses import carried_poses
 from vggtgeo.slam.covisibility import Directed, directions
-from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.rolling_shutter import (
     _descend,
     _Search,
@@ -218,7 +218,7 @@ def test_the_motion_of_a_keyframe_is_that_between_its_neighbours() -> None:
     """For the time between the frames beside a keyframe it leads from one pose to the other; oracle: these poses."""
     slam = recorded_run().slam
     motions = camera_motions(slam, len(slam.keyframes) + 2)
-    times, poses = frame_poses(slam)
+    times, poses = carried_poses(slam)
     assert np.all(motions[len(slam.keyframes) :] == 0)
     assert frame_interval(slam) == pytest.approx(0.1)
     for keyframe, motion in zip(slam.keyframes, motions, strict=False):
@@ -234,7 +234,7 @@ def test_frames_far_apart_say_nothing_of_the_motion() -> None:
     second = slam.keyframes[1].frame
     paused = tuple(replace(f, timestamp=f.timestamp + 5.0 * (f.frame > second)) for f in slam.frames)
     whole, short = camera_motions(slam, len(slam.keyframes)), camera_motions(replace(slam, frames=paused), 3)
-    times, poses = frame_poses(slam)
+    times, poses = carried_poses(slam)
     there = lie.exp(jnp.asarray(short[1] * (times[second] - times[second - 1]))).as_matrix() @ poses[second - 1]
     assert np.allclose(there, poses[second], atol=1e-6)
     assert not np.allclose(short[1], whole[1], atol=1e-6)

@@ -33,7 +33,7 @@ from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.keyframe_images import CompressedImage
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.state import PendingWindow, Readout, Slam, Waiting
+from vggtgeo.slam.state import PendingWindow, Readout, SeenPoints, Slam, Waiting
 from vggtgeo.slam.state_file import STATE, load_state, save_state
 from vggtgeo.slam.window_prior import WindowPrior
 
@@ -62,8 +62,10 @@ def full(slam: Slam) -> Slam:
     under_way: Future[Slam] = Future()
     under_way.set_result(slam)
     tries = IterationRecord(one, one, jnp.full(1, jnp.nan), state.poses.wxyz_xyz[None])
+    seen = SeenPoints(np.zeros(1, np.int32), np.ones((1, 2), np.float32))
     return replace(
         slam,
+        frames=(*slam.frames[:-1], replace(slam.frames[-1], seen=seen)),
         keyframes=compressed,
         waiting=(waiting,),
         prior=WindowPrior(adjustment.keyframes, no_prior(4)),
@@ -282,6 +284,11 @@ def _first(slam: Slam, **changes: Any) -> Slam:
     return replace(slam, keyframes=(replace(slam.keyframes[0], **changes), *slam.keyframes[1:]))
 
 
+def _last(slam: Slam, **values: Any) -> Slam:
+    """The state with other values in its last frame."""
+    return replace(slam, frames=(*slam.frames[:-1], replace(slam.frames[-1], **values)))
+
+
 def _cut(slots: Slots) -> Slots:
     return Slots(*(getattr(slots, field.name)[1:] for field in dataclasses.fields(slots)))
 
@@ -308,6 +315,9 @@ def _cut(slots: Slots) -> Slots:
             lambda slam: replace(slam, pairs=(replace(slam.pairs[0], second=9), *slam.pairs[1:])),
             "names keyframes that are not there",
         ),
+        (lambda slam: _last(slam, seen=SeenPoints(np.array([99_999], np.int32), np.ones((1, 2)))), "`slots` has the"),
+        (lambda slam: _last(slam, seen=SeenPoints(np.zeros(2, np.int32), np.ones((1, 2)))), "`pixels` has shape"),
+        (lambda slam: _last(slam, arrival=(9, np.eye(4))), "names keyframes that are not there"),
         (lambda slam: Evidence(), "holds a Evidence; expected the state of a run"),
     ],
 )

@@ -16,6 +16,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import PatchFlow
 from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches, PoseGuess, PoseQuery
 from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.state import SeenPoints
 
 MOST_POINTS = 300
 """Key points that are followed, the best of each part of the image; a pose needs no more."""
@@ -27,6 +28,8 @@ LEAST_ARRIVED = 0.4
 LEAST_SHARE = 0.7
 """Of those that arrived, in one pose: far above what wrong poses ever had (0.5, see `evidence.py`)."""
 LEAST_INLIERS = 60
+MOST_KEPT = 128
+"""Matches that a frame keeps for the end, 1.5 kB: with a pixel of noise they place it to a tenth of one."""
 FLOW_SIGMA = 4.0
 """Standard deviation of a match, pixels: a tenth of that is the flow's own, the rest the depth of the keyframe at its
 points, whose errors are the same in all frames that follow. ATE of icl-office (exact truth): 0.13 cm with 4, 8 and 1000
@@ -37,13 +40,25 @@ px, 0.22 with descriptors; with points at jumps of depth among the others, and 2
 class Located:
     """A pose by key points, the number of matches that it was sought by, and their points in the world, float64 [m, 3].
 
-    sigma: standard deviation of a match, pixels.
+    sigma: standard deviation of a match, pixels. slots: int [m] in the points of the keyframe, and pixels: float64
+    [m, 2] in the frame, of these matches; none where they are of several keyframes.
     """
 
     guess: PoseGuess
     matches: int
     points: np.ndarray
     sigma: float
+    slots: np.ndarray | None = None
+    pixels: np.ndarray | None = None
+
+    @property
+    def seen(self) -> SeenPoints | None:
+        """Some of the matches that agree with the pose, in even steps."""
+        if self.slots is None or self.pixels is None:
+            return None
+        agree = np.flatnonzero(self.guess.inliers)
+        some = agree[np.unique(np.linspace(0, len(agree) - 1, min(MOST_KEPT, len(agree))).astype(int))]
+        return SeenPoints(self.slots[some].astype(np.int32), self.pixels[some].astype(np.float32))
 
 
 def located_by_flow(
@@ -83,6 +98,6 @@ def located_by_flow(
     points = points[arrived]
     guess = geometry.locate(PoseQuery(image, intrinsics, points, matches.pixels_j, matches.confidence, predicted))
     agree = guess.inlier_count >= max(LEAST_SHARE * len(arrived), LEAST_INLIERS)
-    return (
-        Located(guess, len(matches), points, FLOW_SIGMA) if guess.result is GeometryResult.SUCCESS and agree else None
-    )
+    if guess.result is not GeometryResult.SUCCESS or not agree:
+        return None
+    return Located(guess, len(matches), points, FLOW_SIGMA, matches.index_i, matches.pixels_j)

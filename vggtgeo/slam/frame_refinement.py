@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import SensorDepth
-from vggtgeo.slam.evidence import LEAST_CORRELATION, LEAST_OVERLAP, LEAST_SURFACE
+from vggtgeo.slam.evidence import LEAST_CORRELATION, LEAST_OVERLAP, LEAST_SURFACE, Evidence
 from vggtgeo.slam.fusion import AGREEMENT_GATE, with_systematic
 from vggtgeo.slam.map_points import in_view
 from vggtgeo.slam.relocalisation import view_of
@@ -91,9 +91,7 @@ def by_both(slam: Slam, poses: np.ndarray) -> np.ndarray:
     records = [slam.frames[row] for row in rows]
     seconds = [record.second for record in records if record.second is not None]
     placed = np.array([second.relative @ slam.keyframes[second.keyframe].pose for second in seconds])
-    own = np.array(
-        [_tracked_information(record.evidence.sigma_translation, record.evidence.sigma_rotation) for record in records]
-    )
+    own = np.array([tracked_information(record.evidence) for record in records])
     other = np.array([second.information for second in seconds])
     apart = placed @ rigid.invert(poses[rows])
     off = np.concatenate([apart[:, :3, 3], Rotation.from_matrix(apart[:, :3, :3]).as_rotvec()], 1)
@@ -119,7 +117,7 @@ def _shows(found: Aligned) -> bool:
     return bool(found.correlation >= LEAST_CORRELATION and found.overlap >= LEAST_OVERLAP and surface)
 
 
-def _tracked_information(sigma_translation: float, sigma_rotation: float) -> np.ndarray:
-    """Of the tracked pose, by what it was known to in its worst directions."""
-    sigma = np.array([sigma_translation, sigma_rotation])
+def tracked_information(evidence: Evidence) -> np.ndarray:
+    """Of a tracked pose [6, 6], by what it was known to in its worst directions; none where that is not known."""
+    sigma = np.array([evidence.sigma_translation, evidence.sigma_rotation])
     return np.diag(1 / np.repeat(np.maximum(sigma, 1e-6), 3) ** 2) if np.isfinite(sigma).all() else np.zeros((6, 6))

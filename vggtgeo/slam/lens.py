@@ -30,7 +30,7 @@ from vggtgeo.slam.camera_gain import gain
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.keyframe_images import KeyframeImages
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state import FramePose, Slam
 
 RADIAL = 0.3
 """Standard deviation of k1 and k2 before anything is seen: lenses of phones and action cameras are within."""
@@ -129,8 +129,16 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
     undistorter = lens.undistorter()
     keyframes = tuple(_keyframe(keyframe, lens, undistorter) for keyframe in slam.keyframes)
     pairs = tuple(_pair(pair, lens) for pair in slam.pairs)
+    frames = tuple(_frame(record, lens) for record in slam.frames)
     intrinsics = np.array(lens.intrinsics, np.float64)
-    return replace(slam, keyframes=keyframes, pairs=pairs, intrinsics=intrinsics, solved=None, prior=None, lens=lens)
+    moved = replace(slam, keyframes=keyframes, pairs=pairs, frames=frames, intrinsics=intrinsics, lens=lens)
+    return replace(moved, solved=None, prior=None)
+
+
+def _frame(record: FramePose, lens: Camera) -> FramePose:
+    if record.seen is None:
+        return record
+    return replace(record, seen=replace(record.seen, pixels=_like(record.seen.pixels, lens)))
 
 
 def _keyframe(keyframe: Keyframe, lens: Camera, undistorter: Undistorter) -> Keyframe:

@@ -126,4 +126,5 @@ def record_of(frame: Frame, found: Track) -> FramePose:
         True,
         found.evidence.inliers,
         found.evidence,
+        seen=found.seen,
     )

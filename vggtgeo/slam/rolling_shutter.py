@@ -29,7 +29,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.geometry.cameras import SquarePinhole
 from vggtgeo.slam.camera_gain import LEAST_HOSTS, gain, match_energies
-from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.carried_poses import carried_poses
 from vggtgeo.slam.state import Readout, Slam
 from vggtgeo.slam.threads import map_in_threads
 
@@ -97,7 +97,7 @@ def frame_motions(slam: Slam) -> np.ndarray:
     """How the camera moves at each frame, float64 [n, 6]: the tangent of world -> camera, units of the map a second,
     then rad a second; from the frames before and after, zero where none of them says so.
     """
-    times, poses = frame_poses(slam)
+    times, poses = carried_poses(slam)
     if len(times) < 2:
         return np.zeros((len(times), lie.TANGENT))
     rows = np.arange(len(times))

@@ -11,9 +11,11 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, GeometryResult, PointMatches, PoseQuery, StartGuess
 from vggtgeo.slam.description import Description
+from vggtgeo.slam.following import Located
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import FramePose, Slam, Waiting
+from vggtgeo.slam.tracking import PIXEL_SIGMA
 from vggtgeo.slam.window import adjust, enter, scale_anchor
 
 NOMINAL_DEPTH = 2.5
@@ -162,7 +164,7 @@ def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
         guess = roles.geometry.locate(query)
         if guess.result is GeometryResult.SUCCESS:
             relative = guess.pose @ rigid.invert(first.pose)
-            placed[frame.frame] = FramePose(
-                frame.frame, frame.timestamp, first.number, relative, True, guess.inlier_count
-            )
+            located = Located(guess, len(matches), points, PIXEL_SIGMA, matches.index_i, matches.pixels_j)
+            record = FramePose(frame.frame, frame.timestamp, first.number, relative, True, guess.inlier_count)
+            placed[frame.frame] = replace(record, seen=located.seen)
     return replace(slam, frames=tuple(placed.get(record.frame, record) for record in slam.frames))

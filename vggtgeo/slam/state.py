@@ -45,6 +45,16 @@ class SecondMotion:
 
 
 @dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """Key points of a keyframe that a frame shows, see `frame_poses.py`. slots: int32 [m], in `Keyframe.points`.
+    pixels: float32 [m, 2], where the frame shows them.
+    """
+
+    slots: np.ndarray
+    pixels: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class FramePose:
     """Pose of one frame relative to a keyframe, so that it follows when the keyframe is adjusted.
 
@@ -63,6 +73,8 @@ class FramePose:
     """Of a frame that became a keyframe: the earlier keyframe it was tracked against, and its pose relative to that
     one as tracked, before any adjustment."""
     second: SecondMotion | None = None
+    seen: SeenPoints | None = None
+    """Points of its keyframe, where its pose came from points alone."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,14 @@ def check_state(slam: Slam) -> None:
         _check_pair(pair, slam)
     named = [number for factor in slam.factors for number in factor.keyframes]
     named += [*slam.window, *slam.origins, *slam.held, *(record.reference for record in slam.frames)]
+    named += [record.second.keyframe for record in slam.frames if record.second is not None]
+    named += [record.arrival[0] for record in slam.frames if record.arrival is not None]
     if not all(0 <= number < count for number in named):
         raise ValueError("it names keyframes that are not there")
+    for record in slam.frames:
+        if record.seen is not None:
+            _check_rows("slots", record.seen.slots, len(slam.keyframes[record.reference].points.pixels))
+            check_array("pixels", record.seen.pixels, (len(record.seen.slots), 2))
 
 
 def _check_keyframe(keyframe: Keyframe) -> None:

@@ -40,7 +40,7 @@ from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.keyframe_images import CompressedImage, KeyframeImages
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.rgbd_view import Points, RgbdView
-from vggtgeo.slam.state import FramePose, PendingWindow, Readout, SecondMotion, Slam, Waiting
+from vggtgeo.slam.state import FramePose, PendingWindow, Readout, SecondMotion, SeenPoints, Slam, Waiting
 from vggtgeo.slam.state_checks import check_state
 from vggtgeo.slam.window_prior import WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
@@ -53,6 +53,7 @@ STATE_CLASSES: tuple[type, ...] = (
         PendingWindow,
         FramePose,
         SecondMotion,
+        SeenPoints,
         Waiting,
         Evidence,
         Keyframe,
@@ -67,7 +68,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 11
+VERSION = 12
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -131,6 +132,12 @@ def _with_fisheyes(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
+def _with_seen_points(header: Header) -> Header:
+    """Version 11 did not place frames against the points of the map as it is in the end."""
+    tree, classes = with_field(header["tree"], header["classes"], "FramePose", "seen")
+    return {**header, "tree": tree, "classes": classes}
+
+
 UPGRADES = {
     1: _with_recorded_times,
     2: _with_lens,
@@ -142,6 +149,7 @@ UPGRADES = {
     8: _with_focal_without_lens,
     9: _with_focal_with_lens,
     10: _with_fisheyes,
+    11: _with_seen_points,
 }
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)

@@ -29,6 +29,7 @@ from vggtgeo.slam.map_points import joint_matches, refine_by_map
 from vggtgeo.slam.rgbd_alignment import Aligned
 from vggtgeo.slam.rgbd_view import RgbdView
 from vggtgeo.slam.settings import Roles
+from vggtgeo.slam.state import SeenPoints
 
 PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
@@ -88,6 +89,7 @@ class Track:
 
     pose: float64 [4, 4], world -> camera. measured: float64 [6, 6], what all samples know of the motion from the
     keyframe to the frame, over its left tangent, translation first. result: why there is no pose, where there is none.
+    seen: points of the keyframe that it came from, where the picture as a whole took no part.
     """
 
     keyframe: Keyframe
@@ -96,6 +98,7 @@ class Track:
     evidence: Evidence
     result: GeometryResult
     alone: Track | None = None
+    seen: SeenPoints | None = None
 
     @property
     def accepted(self) -> bool:
@@ -188,7 +191,9 @@ def _placed(
         found, evidence = with_lines(found, prior, evidence, keyframe, sight.lines, intrinsics, roles.line_matches)
     if found is None:
         return Track(keyframe, guess.pose, np.zeros((6, 6)), evidence, guess.result)
-    return _judged(rigid.orthonormal(found.motion @ keyframe.pose), found.information, evidence, keyframe, expected)
+    pose = rigid.orthonormal(found.motion @ keyframe.pose)
+    track = _judged(pose, found.information, evidence, keyframe, expected)
+    return replace(track, seen=located.seen) if known and dense is None else track
 
 
 def refined_by_map(
@@ -218,7 +223,7 @@ def refined_by_map(
     measured = found.measured + refined.information
     evidence = replace(found.evidence, map_points=refined.points)
     better = _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, expected)
-    return replace(better, alone=found)
+    return replace(better, alone=found, seen=found.seen)
 
 
 def moved_with(found: Track, keyframe: Keyframe) -> Track:
@@ -274,7 +279,8 @@ def _by_descriptors(
         window_poses=tuple(member.pose for member in window),
         window_depths=tuple(member.depth for member in window) if roles.metric else (),
     )
-    return Located(roles.geometry.locate(query), len(matches), points, PIXEL_SIGMA)
+    guess = roles.geometry.locate(query)
+    return Located(guess, len(matches), points, PIXEL_SIGMA, matches.index_i, matches.pixels_j)
 
 
 def _judged(
