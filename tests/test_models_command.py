@@ -52,11 +52,12 @@ def test_every_network_is_listed_with_its_terms(tmp_path: Path) -> None:
 
 
 def test_the_registry_is_sound() -> None:
-    # Proves that each entry has a contract and each contract an entry, and that hashes are SHA-256.
+    # Proves that each entry has a contract and each contract an entry, and that hashes are SHA-256, revisions commits.
     assert {network.contract_name for network in NETWORKS.values()} == set(contracts.CONTRACTS)
     published = [network.hub for network in NETWORKS.values() if network.hub]
     assert published
     assert all(len(bytes.fromhex(hub.sha256)) == 32 for hub in published)
+    assert all(hub.revision == "main" or len(bytes.fromhex(hub.revision)) == 20 for hub in published)
 
 
 def test_paths_follow_option_variable_and_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

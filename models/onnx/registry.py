@@ -11,8 +11,8 @@ from vggtgeo.models.onnx.contracts import CONTRACTS, Contract
 class HubFile:
     """An ONNX file that its authors publish on the Hugging Face hub. sha256: of the file, hexadecimal.
 
-    The SHA-256 pins the content, whatever the branch holds by now: a file that was replaced is refused. A commit would
-    pin no more, and none is known for certain.
+    The SHA-256 pins the content, whatever a branch holds by now: a file that was replaced is refused. revision: the
+    commit that holds it, where one is known; else a branch.
     """
 
     repository: str
@@ -129,6 +129,7 @@ _ALL = (
             "Ruicheng/moge-2-vits-normal-onnx",
             "model.onnx",
             "24eacb5dc7a2c54c7bc98f7de085ffbed79ad006ea5b664c2c2cdc02ff3a52f0",
+            "e50ffda41565591092adea54c6ac83d6212e1e23",
         ),
     ),
     Network("letr", "letr", _LETR, "stage 2 with ResNet-50, linked in the repository", 244),
