@@ -48,6 +48,35 @@ def test_up_of_a_camera_that_never_turns_is_its_own() -> None:
     np.testing.assert_allclose(plots.view_axes(turned)[2], -turned.rotations[0, :, 1], atol=1e-12)
 
 
+def _level_flight() -> Trajectory:
+    """20 m along x with 1 cm of noise in height, the camera pitched down by 20 degrees and never turned; z is up."""
+    poses = np.tile(np.eye(4), (100, 1, 1))
+    ahead = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    poses[:, :3, :3] = ahead @ Rotation.from_euler("x", -20, degrees=True).as_matrix()
+    poses[:, 0, 3] = np.linspace(0, 20, 100)
+    poses[:, 2, 3] = np.random.default_rng(0).normal(scale=0.01, size=100)
+    return Trajectory(np.arange(100) / 10, poses)
+
+
+@pytest.mark.parametrize("with_truth", [False, True])
+def test_a_level_flight_is_drawn_level_or_the_picture_says_whose_up_it_has(with_truth: bool) -> None:
+    # Proves that a camera that looks down and never turns does not make its truth climb, that both views have one
+    # scale, and that without a truth, where nothing tells, the side view says so. Oracle: the flight, which is level.
+    flight = _level_flight()
+    figure = plots.trajectory_figure(flight, flight if with_truth else None)
+    top, side = figure.axes
+    figure.canvas.draw()
+    scales = [axes.get_window_extent().height / np.ptp(axes.get_ylim()) for axes in (top, side)]
+    assert scales[0] == pytest.approx(scales[1], rel=0.01)
+    assert np.ptp(side.get_ylim()) >= 0.15 * np.ptp(side.get_xlim())
+    heights = side.lines[0].get_ydata()
+    if with_truth:
+        assert np.ptp(heights) < 0.1, f"a level flight rises by {np.ptp(heights):.2f} m"
+    assert ("up is that of the images" in side.get_title(loc="left")) != with_truth
+    turning = plots.trajectory_figure(_walk())
+    assert turning.axes[1].get_title(loc="left") == "seen from the side"
+
+
 @pytest.mark.parametrize("with_truth", [False, True])
 @pytest.mark.parametrize("count", [1, 2, 40])
 def test_a_picture_is_written(tmp_path: Path, count: int, with_truth: bool) -> None:

@@ -145,7 +145,7 @@ def paths_figure(given: Sequence[Path3], width: float = 5.0) -> NotebookFigure:
     figure = NotebookFigure(figsize=(width, 1.25 * width), layout="constrained")
     FigureCanvasAgg(figure)
     above, along = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
-    view, origin = view_axes(given[0].truth), given[0].truth.positions[0]
+    view, origin = view_axes(given[0].truth, level_world=True), given[0].truth.positions[0]
     flat = lambda trajectory: ((trajectory.positions - origin) @ view.T)[:, :2].T
     above.plot(*flat(given[0].truth), color="#333333", lw=1.0, ls="--", label="truth")
     for number, one in enumerate(given):

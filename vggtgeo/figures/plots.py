@@ -1,8 +1,10 @@
 """The picture of a trajectory: seen from above and from the side, the truth beside it where it is known.
 
 The frame of a reconstruction is arbitrary, so the views are found from the cameras themselves: people hold them
-without roll, so up is the direction that is most nearly at right angles to all image rows (and, while these all
-look one way, nearest to the mean up of the images). The longest horizontal extent lies along the x axis.
+without roll, so up is the direction that is most nearly at right angles to all image rows. A camera that hardly turns
+leaves open how far it looks down: then up is the axis of the truth's world that is nearest to the mean up of the
+images, or, without a truth, that mean itself, and the picture says so: a level flight with a camera that looks down
+rises in it. The longest horizontal extent lies along the x axis.
 """
 
 from __future__ import annotations
@@ -26,6 +28,9 @@ _ESTIMATE, _TRUTH, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
 _WIDTH = 11.0
 """Inches."""
 _WEIGHT_OF_MEAN_UP = 0.02
+_LEAST_TURN = 0.05
+"""Mean square of the image rows along their second direction from which turns tell what is up: 13 degrees RMS of yaw.
+Below, the mean up of the images, by its weight, has more than a third of the word."""
 _LEAST_EXTENT = 0.1
 """Metres: how much the picture of a still camera shows."""
 
@@ -80,8 +85,14 @@ def trajectory_figure(
     if len(estimate) == 0:
         raise InputError("`estimate` has no pose; there is nothing to draw")
     drawn = _align(estimate, truth, keyframes, with_scale)
-    axes_of_view = view_axes(drawn.truth or drawn.estimate)
-    figure = _draw(drawn, axes_of_view, "m" if drawn.error or not with_scale else "no unit", width)
+    seen = drawn.truth or drawn.estimate
+    figure = _draw(
+        drawn,
+        view_axes(seen, level_world=drawn.truth is not None),
+        "m" if drawn.error or not with_scale else "no unit",
+        width,
+        "seen from the side" + ("" if drawn.truth or _turns(seen) else "; up is that of the images"),
+    )
     if title is not None:
         figure.suptitle(_title(drawn, title, with_scale), x=0.01, ha="left", fontsize=12, color=_INK)
     return figure
@@ -100,11 +111,15 @@ def _align(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory
     return _Drawn(alignment.trajectory(estimate), alignment.points(places), truth.select(inside), error)
 
 
-def view_axes(trajectory: Trajectory) -> Float[np.ndarray, "3 3"]:
+def view_axes(trajectory: Trajectory, level_world: bool = False) -> Float[np.ndarray, "3 3"]:
     """A level frame for looking at `trajectory`, found from its cameras: rows are the longest horizontal direction, the
-    other horizontal one, and up; right-handed.
+    other horizontal one, and up; right-handed. level_world: an axis of the world is vertical, as in benchmarks; used
+    where the cameras turn too little to tell.
     """
     up = _up(trajectory)
+    if level_world and not _turns(trajectory):
+        axis = np.argmax(np.abs(up))
+        up = np.sign(up[axis]) * np.eye(3)[axis]
     centred = trajectory.positions - trajectory.positions.mean(axis=0)
     horizontal = centred - np.outer(centred @ up, up)
     along = np.linalg.svd(horizontal, full_matrices=True)[2][0] if len(trajectory) > 1 else np.zeros(3)
@@ -117,6 +132,12 @@ def view_axes(trajectory: Trajectory) -> Float[np.ndarray, "3 3"]:
     return np.stack([along, np.cross(up, along), up])
 
 
+def _turns(trajectory: Trajectory) -> bool:
+    """Whether the cameras turn enough for their image rows to lie in one plane only, the horizontal one."""
+    rows = trajectory.rotations[:, :, 0]
+    return bool(np.linalg.eigvalsh(rows.T @ rows / len(rows))[1] > _LEAST_TURN)
+
+
 def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
     rows, mean_up = trajectory.rotations[:, :, 0], -trajectory.rotations[:, :, 1].mean(axis=0)
     doubt = np.eye(3) * (mean_up @ mean_up) - np.outer(mean_up, mean_up)
@@ -124,7 +145,7 @@ def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
     return up if up @ mean_up >= 0 else -up
 
 
-def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> NotebookFigure:
+def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float, side_title: str) -> NotebookFigure:
     origin = (drawn.truth or drawn.estimate).positions[0]
     everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
     points = (np.concatenate(everything) - origin) @ axes_of_view.T
@@ -137,7 +158,7 @@ def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float) -> N
     figure = NotebookFigure(figsize=(width, panel + 2.2), layout="constrained")
     FigureCanvasAgg(figure)
     top, side = figure.subplots(2, 1, height_ratios=[heights[1], heights[2]], sharex=True)
-    for axes, vertical, name in ((top, 1, "seen from above"), (side, 2, "seen from the side")):
+    for axes, vertical, name in ((top, 1, "seen from above"), (side, 2, side_title)):
         _draw_view(axes, drawn, origin, axes_of_view[[0, vertical]])
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[vertical], high[vertical])
