@@ -44,7 +44,7 @@ def test_json_has_the_metrics(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*map(str, files), "--json", "--delta", "3", "--all-pairs", "--max-dt", "0.02"])
     assert result.exit_code == 0, result.output
     expected = evaluate_trajectory(*_load(files), max_dt=0.02, delta=3, all_pairs=True)
-    assert json.loads(result.output) == json.loads(json.dumps(expected.as_dict()))
+    assert json.loads(result.output) == json.loads(json.dumps({**expected.as_dict(), "truth_in_metres": None}))
 
 
 def test_a_run_in_metres_of_another_size_is_of_another_sequence(tmp_path: Path) -> None:
@@ -73,6 +73,7 @@ def test_the_default_of_max_dt_is_that_of_the_library() -> None:
 def test_the_table_has_every_metric(tmp_path: Path) -> None:
     # Proves that a person reads ATE after either alignment and RPE, in centimetres and degrees.
     files = _files(tmp_path)
+    files = files[0], files[1].rename(tmp_path / "groundtruth.txt")
     result = CliRunner().invoke(app, list(map(str, files)))
     assert result.exit_code == 0, result.output
     report = evaluate_trajectory(*_load(files))
@@ -80,6 +81,38 @@ def test_the_table_has_every_metric(tmp_path: Path) -> None:
         assert f"{100 * value:.3f} cm" in result.output
     assert f"{np.degrees(report.relative.rotation_statistics.rmse):.3f} deg" in result.output
     assert "30 poses matched, of 30 estimated and 30 true" in " ".join(result.output.split())
+
+
+def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None:
+    # Proves that errors are called cm where the truth is known to be in metres, and bare numbers of the truth's unit
+    # where it is a run's of free scale, or a file that says nothing. Oracle: the summary of the run, the file's name.
+    estimate, truth = _files(tmp_path)
+    value = evaluate_trajectory(*_load((estimate, truth))).sim3.statistics.rmse
+    (tmp_path / "run").mkdir()
+    of_run = truth.rename(tmp_path / "run" / "trajectory.txt")
+    said = {
+        "free (no metric depth): lengths have no unit": "in the unit of GT, which is not the metre",
+        "metric": None,
+        None: "in the unit of GT, which its file does not say",
+    }
+    for scale, words in said.items():
+        (tmp_path / "run" / "summary.json").write_text(json.dumps({} if scale is None else {"scale": scale}))
+        found = CliRunner().invoke(app, [str(estimate), str(of_run)])
+        assert found.exit_code == 0, found.output
+        assert (" cm" in found.output) == (words is None), f"{scale}: {found.output}"
+        assert (words or f"{100 * value:.3f} cm") in " ".join(found.output.split())
+        assert words is None or f"{value:.5g}" in found.output
+    of_run.rename(tmp_path / "run" / "groundtruth.txt")
+    assert " cm" in CliRunner().invoke(app, [str(estimate), str(tmp_path / "run" / "groundtruth.txt")]).output
+
+
+def test_a_file_of_a_run_has_the_scale_of_its_summary(tmp_path: Path) -> None:
+    # Proves that `RUN/trajectory.txt` is judged as `RUN` is: of a free scale, without errors after SE(3).
+    estimate, truth = _files(tmp_path)
+    (tmp_path / "summary.json").write_text(json.dumps({"scale": "free (no metric depth): lengths have no unit"}))
+    found = CliRunner().invoke(app, [str(estimate), str(truth)])
+    assert "scale of the estimate: free" in found.output
+    assert "ATE, SE(3)" not in found.output
 
 
 def test_folders_stand_for_their_trajectories(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Readers of the benchmarks' layouts, each on a tiny recording of just that layout."""
 
 import itertools
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +19,9 @@ from vggtgeo.datasets.registration import registered_depth
 from vggtgeo.datasets.seven_scenes import _TO_COLOUR
 from vggtgeo.datasets.tanks import inside_crop
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.results.source import Source
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.results.source import Source, opened
+from vggtgeo.slam.settings import SlamSettings
 
 CAMERA = Camera(tiny_sequences.INTRINSICS, tiny_sequences.WIDTH, tiny_sequences.HEIGHT)
 LOSSLESS = (tiny.scannet, tiny.euroc, tiny.icl, tiny.kitti, tiny.arkit)
@@ -230,6 +232,24 @@ def test_tanks_and_temples(tmp_path: Path) -> None:
     assert [frame.timestamp for frame in part.frames()] == pytest.approx([truth.timestamps[0], truth.timestamps[2]])
     points = np.array([[1.0, 0, 0.5], [1.0, 2, 0.5], [1.0, 0, 1.5], [0.2, 0, 1.5], [3.0, 0, 0.5]])
     assert inside_crop(folder / "Ignatius.json", points).tolist() == [True, False, False, True, False]
+
+
+def test_a_truth_in_a_unit_of_its_own_is_told(tmp_path: Path) -> None:
+    # Proves that poses which COLMAP gave no metres are known as such, and told by a run. Oracle: the scanner's
+    # alignment, and depth in metres, which are there or not.
+    scene, phone = tiny.tanks(tmp_path / "Ignatius"), tiny.nerfstudio(tmp_path / "phone")
+    assert tiny.quietly_opened(scene).truth_in_metres
+    assert tiny.quietly_opened(phone).truth_in_metres
+    (scene / "Ignatius_trans.txt").unlink()
+    content = json.loads((phone / "transforms.json").read_text())
+    for frame in content["frames"]:
+        del frame["depth_file_path"]
+    (phone / "transforms.json").write_text(json.dumps(content))
+    for folder in (scene, phone):
+        sequence = tiny.quietly_opened(folder)
+        assert not sequence.truth_in_metres
+        with pytest.warns(NoteWarning, match="are in a unit of their own: errors that are called cm are hundredths"):
+            opened(sequence, None, SlamSettings())
 
 
 @pytest.mark.parametrize("lists", ["rgb.txt depth.txt associated.txt", "rgb.txt depth.txt", "associated.txt"])

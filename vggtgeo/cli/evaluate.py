@@ -14,6 +14,8 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.text_files import whole_text
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rich.table import Table
 
     from vggtgeo.evaluation import ErrorStatistics, TrajectoryReport
@@ -21,6 +23,11 @@ if TYPE_CHECKING:
 
 MAX_TIME_DIFFERENCE = 0.01
 """Seconds; that of `vggtgeo.evaluation`, repeated here so that `--help` need not load it (a test compares them)."""
+
+_WRITTEN_BY_RUNS = ("trajectory.txt", "keyframes.txt")
+_BENCHMARKS = ("groundtruth.txt", "data.csv")
+_ICL = ".gt.freiburg"
+"""Files of true poses as TUM RGB-D (and all of its layout), EuRoC and ICL-NUIM name them, in metres."""
 
 
 def evaluate(
@@ -47,15 +54,16 @@ def evaluate(
     from vggtgeo.evaluation.alignment import AXES
     from vggtgeo.evaluation.resemblance import warn_of_strangers
 
-    true = load_truth(truth)
+    true, metres = load_truth(truth)
     found, scale = load_estimate(estimate, true), load_scale(estimate)
     report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
-    metric = scale is not None and scale.startswith("metric")
+    metric = metres is not False and scale is not None and scale.startswith("metric")
     meaningless = warn_of_strangers(found, true, max_dt, metric)
     if as_json:
-        typer.echo(json.dumps({**report.as_dict(), **({} if scale is None else {"estimate_scale": scale})}, indent=2))
+        known = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
+        typer.echo(json.dumps({**report.as_dict(), **known}, indent=2))
     else:
-        print_report(report, scale)
+        print_report(report, scale, metres)
     if meaningless:
         typer.echo("NOT COMPARABLE: these errors say nothing, see the warnings", err=True)
         raise typer.Exit(EXIT_FAILED)
@@ -75,29 +83,44 @@ def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
 
 
 def load_scale(path: Path) -> str | None:
-    """What the summary of a run says of its scale; None for a file, whose scale nobody knows."""
+    """What the summary of a run says of its scale, the run's folder or a file of poses in it; None for any other file,
+    whose scale nobody knows.
+    """
+    folder = path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path
     try:
-        return str(json.loads(whole_text(path / "summary.json", errors="strict"))["scale"])
+        return str(json.loads(whole_text(folder / "summary.json", errors="strict"))["scale"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def load_truth(path: Path) -> Trajectory:
-    """The trajectory in the file `path`, or the truth of the dataset in the folder `path`."""
+def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
+    """The trajectory in the file `path`, or the truth of the dataset in the folder `path`; and whether its lengths are
+    metres, None where nobody says so.
+    """
     from vggtgeo.datasets import open_sequence
     from vggtgeo.datasets.trajectory_files import load_trajectory
 
     if not path.is_dir():
-        return load_trajectory(path)
-    truth = open_sequence(path).ground_truth()
+        return load_trajectory(path), _in_metres(path)
+    sequence = open_sequence(path)
+    truth = sequence.ground_truth()
     if truth is None:
         raise InputError(f"`{path}` has no truth; give a trajectory in the TUM format")
-    return truth
+    return truth, getattr(sequence, "truth_in_metres", True)
 
 
-def print_report(report: TrajectoryReport, scale: str | None = None) -> None:
+def _in_metres(file: Path) -> bool | None:
+    """Of a file: a run's own by its summary, a benchmark's by its name; any program writes the formats of poses."""
+    scale = load_scale(file)
+    if scale is not None:
+        return scale.startswith("metric")
+    return True if file.name in _BENCHMARKS or file.name.endswith(_ICL) else None
+
+
+def print_report(report: TrajectoryReport, scale: str | None = None, metres: bool | None = True) -> None:
     """Prints the table that people read; `TrajectoryReport.as_dict` is what programs read. scale: of the estimate, as
-    its summary has it; where it is free, errors in metres mean something after a Sim(3) alignment only.
+    its summary has it; where it is free, errors mean something after a Sim(3) alignment only. metres: whether those are
+    the unit of the truth; where that is not known (None), lengths are printed without one.
     """
     import numpy as np
     from rich.console import Console
@@ -117,20 +140,33 @@ def print_report(report: TrajectoryReport, scale: str | None = None) -> None:
     free = scale is not None and scale.startswith("free")
     if scale is not None:
         console.print(f"scale of the estimate: {scale}", soft_wrap=True)
+    if not metres:
+        console.print(_NO_UNIT[metres], soft_wrap=True)
+    length = _centimetres if metres else "{:.5g}".format
     if not free:
-        _add_row(table, "ATE, SE(3)", report.se3.statistics, 100, "cm")
-    _add_row(table, "ATE, Sim(3)", report.sim3.statistics, 100, "cm")
+        _add_row(table, "ATE, SE(3)", report.se3.statistics, length)
+    _add_row(table, "ATE, Sim(3)", report.sim3.statistics, length)
     if not free:
-        _add_row(table, "ATE, yaw only", report.yaw.statistics, 100, "cm")
-        _add_row(table, "ATE, not aligned", report.unaligned.statistics, 100, "cm")
-        _add_row(table, "RPE translation", report.relative.translation_statistics, 100, "cm")
-    _add_row(table, "RPE translation, Sim(3)", report.relative_sim3.translation_statistics, 100, "cm")
-    _add_row(table, "RPE rotation", angles, 1, "deg")
+        _add_row(table, "ATE, yaw only", report.yaw.statistics, length)
+        _add_row(table, "ATE, not aligned", report.unaligned.statistics, length)
+        _add_row(table, "RPE translation", report.relative.translation_statistics, length)
+    _add_row(table, "RPE translation, Sim(3)", report.relative_sim3.translation_statistics, length)
+    _add_row(table, "RPE rotation", angles, "{:.3f} deg".format)
     console.print(table)
     for warning in report.warnings:
         console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _add_row(table: Table, name: str, errors: ErrorStatistics, factor: float, unit: str) -> None:
+_NO_UNIT = {
+    None: "lengths are in the unit of GT, which its file does not say: metres only if those of GT are",
+    False: "lengths are in the unit of GT, which is not the metre",
+}
+
+
+def _centimetres(metres: float) -> str:
+    return f"{100 * metres:.3f} cm"
+
+
+def _add_row(table: Table, name: str, errors: ErrorStatistics, shown: Callable[[float], str]) -> None:
     values = (errors.rmse, errors.mean, errors.median, errors.maximum)
-    table.add_row(name, *(f"{factor * value:.3f} {unit}" if value == value else "-" for value in values))
+    table.add_row(name, *(shown(value) if value == value else "-" for value in values))

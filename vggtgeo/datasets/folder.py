@@ -77,6 +77,11 @@ class FolderSequence:
         """No truth, unless the layout knows one."""
         return None
 
+    @property
+    def truth_in_metres(self) -> bool:
+        """Whether lengths of `ground_truth` are metres, as those of the benchmarks are."""
+        return True
+
     def holds(self, path: Path) -> bool:
         """Whether a file of `files` is there."""
         return path.exists()

@@ -90,6 +90,11 @@ class Nerfstudio(FolderSequence):
         times = [one.timestamp for one in self.files if one.image in frames]
         return trajectory_of(times, np.array(poses) @ FROM_OPENGL, file) if poses else None
 
+    @property
+    def truth_in_metres(self) -> bool:
+        """Where depth in metres belongs to the poses (phones); those of COLMAP have no unit."""
+        return any(one.depth is not None for one in self.files)
+
 
 def _object(value: object, what: str) -> Mapping[str, Any]:
     if not isinstance(value, dict):

@@ -60,6 +60,11 @@ class TanksAndTemples(FolderSequence):
             poses = moved(poses, read_matrix(alignment, (4, 4)))
         return trajectory_of(np.array(numbers) / FRAMES_PER_SECOND, poses, file)
 
+    @property
+    def truth_in_metres(self) -> bool:
+        """Those of COLMAP alone have no unit."""
+        return (self.folder / f"{self._scene()}_trans.txt").is_file()
+
     def scanned_points(self) -> Float[np.ndarray, "n 3"] | None:
         """The laser scan within its volume (`SCENE.ply`, `SCENE.json`), metres, in the world of `ground_truth`; None
         where a file is missing, or `SCENE_trans.txt`, without which the poses are not in the scanner's frame.

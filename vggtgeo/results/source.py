@@ -20,7 +20,7 @@ from vggtgeo.datasets.in_memory import FrameStream, frame_stream
 from vggtgeo.datasets.reduced import reduced
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.summary import lens_of
 from vggtgeo.simulation.sequence import SyntheticSequence
@@ -124,7 +124,11 @@ def opened(
 def _truth(sequence: Sequence) -> Trajectory | None:
     """The truth for the comparison; one that cannot be read costs that only."""
     try:
-        return sequence.ground_truth()
+        truth = sequence.ground_truth()
+        if truth is not None and not getattr(sequence, "truth_in_metres", True):
+            text = "are in a unit of their own: errors that are called cm are hundredths of that"
+            warnings.warn(f"the true poses of `{sequence.name}` {text}", NoteWarning, stacklevel=4)
+        return truth
     except InputError as error:
         warnings.warn(f"the truth cannot be used and is left out: {error}", InputWarning, stacklevel=4)
         return None
