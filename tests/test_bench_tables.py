@@ -101,11 +101,52 @@ def test_yaw_is_about_the_vertical_of_the_truth() -> None:
 def test_tables_mark_the_best_and_the_second() -> None:
     # Proves the numbers of the tables and their marks, and that a bar in a title does not break a row. Oracle: by hand.
     text = markdown.page(tiny.suite(), ROWS)
-    assert "| full system | **3.00 ± 1.00** | <u>8.50 ± 0.50</u> | **5.75** |" in text
-    assert "| without \\| lines | <u>7.00 ± 2.00</u> | **7.50 ± 0.50** | <u>7.25</u> |" in text
+    assert "| full system | **3.00 ± 1.00** / 3.00 | <u>8.50 ± 0.50</u> / 8.50 | **5.75** / 5.75 |" in text
+    assert "| without \\| lines | <u>7.00 ± 2.00</u> / 7.00 | **7.50 ± 0.50** / 7.50 | <u>7.25</u> / 7.25 |" in text
     assert "| without \\| lines | walk | 3 | **+4.00 ± 2.48** | **+2.00 ± 1.24** |" in text
     assert "| without \\| lines | hall | 3 | -1.00 ± 1.24 |" in text
-    assert "| walk | full system | 3 | 27/30 | 3.00 ± 1.00 | 1.50 ± 0.50 | 1.0000 ± 0.0000 | 3 good |" in text
+    assert (
+        "| walk | full system | 3 | 27/30 | 3.00 ± 1.00 / 3.00 | 1.50 ± 0.50 / 1.50 | 1.0000 ± 0.0000 | 3 good |"
+        in text
+    )
+
+
+EVERYTHING = {
+    "coverage": 0.975, "nees_place": 0.4321, "focal_error": -0.0123, "depth_rmse_m": 0.0345, "depth_abs_rel": 0.0567,
+    "depth_below_1_25": 0.987, "f_score": 0.876, "precision": 0.765, "recall": 0.654, "accuracy_m": 0.0543,
+    "completeness_m": 0.0432, "mesh_completeness_m": 0.0321, "rte_1m_m": 0.0191, "peak_memory_gb": 1.23,
+}  # fmt: skip
+
+
+def test_what_was_measured_is_in_the_tables(tmp_path: Path) -> None:
+    # Proves that coverage, depth, map and cost stand in the Markdown and on the page where they were measured, in their
+    # units, and that a group without a number has no table. Oracle: the numbers.
+    shown = ("97.5", "0.43", "-1.23", "3.45", "5.67", "98.7", "87.6", "76.5", "65.4", "5.43", "4.32", "3.21", "1.91")
+    rows = [row("walk", "full", 0, 2.0, **EVERYTHING), row("hall", "full", 0, 3.0, coverage=1.0)]
+    for suite_rows, there in ((rows, True), (rows[1:], False)):
+        write_page(tmp_path / "report.html", tiny.suite(), suite_rows, tmp_path)
+        text, page = markdown.page(tiny.suite(), suite_rows), (tmp_path / "report.html").read_text()
+        for group in ("Depth", "Map", "Cost"):
+            assert (f"### {group}" in text) == (f"<h3>{group}</h3>" in page) == there, group
+        for number in shown:
+            assert (f" {number} |" in text) == (f">{number}</span>" in page) == there, number
+    lines = markdown.page(tiny.suite(), rows).partition("### Map")[2].partition("###")[0]
+    assert "| walk |" in lines
+    assert "| hall |" not in lines, "a sequence without a true surface has an empty line"
+
+
+def test_medians_stand_beside_means() -> None:
+    # Proves that from three seeds on a cell has the median over them, the mean over sequences that of the medians, and
+    # from three sequences on a column of its own the median over those. Oracle: by hand, with an outlier.
+    suite = tiny.suite(tiny.TEXT.replace("[[setting]]", '[[sequence]]\nname = "extra"\npath = "x"\n\n[[setting]]', 1))
+    errors = {"walk": (1.0, 2.0, 9.0), "hall": (3.0, 3.0, 3.0), "extra": (5.0, 6.0, 40.0)}
+    rows = [row(name, "full", seed, cm) for name, own in errors.items() for seed, cm in enumerate(own)]
+    assert cells.matrix_heads(suite, rows, cells.SE3) == ["walk", "hall", "extra", "mean", "median"]
+    ((_, line),) = cells.matrix(suite, rows, cells.SE3)
+    assert [one.text for one in line] == ["4.00 ± 4.36", "3.00 ± 0.00", "17.00 ± 19.92", "8.00", "4.00"]
+    assert [one.median for one in line] == ["2.00", "3.00", "6.00", "3.67", ""]
+    assert "standard deviation over seeds / median." in markdown.page(suite, rows)
+    assert "/" not in markdown.accuracy(suite, [one for one in rows if one["seed"] < 2], cells.SE3)
 
 
 def test_a_mean_is_over_the_sequences_that_all_have() -> None:
@@ -125,7 +166,7 @@ def test_a_free_scale_has_no_error_at_true_scale() -> None:
     text = markdown.page(tiny.suite(), rows)
     assert "| without \\| lines | free |" in text
     assert "| without \\| lines | walk | 3 |  | **+2.00 ± 1.24** |" in text
-    assert "| walk | without \\| lines | 3 | 27/30 | free | 3.50 ± 1.00 |" in text
+    assert "| walk | without \\| lines | 3 | 27/30 | free | 3.50 ± 1.00 / 3.50 |" in text
 
 
 def test_what_has_no_result_is_told() -> None:
@@ -153,7 +194,7 @@ def test_a_setting_that_loses_runs_is_not_the_best_by_that() -> None:
     suite = tiny.suite(tiny.TEXT + EXTERNAL)
     lines = dict(cells.matrix(suite, rows, cells.SE3))
     assert lines["without | lines"] == [cells.Cell("2.00 (1 of 3)"), cells.Cell("1 failed, 1 crash")]
-    assert lines["full system"][0] == cells.Cell("3.00 ± 1.00", 1)
+    assert lines["full system"][0] == cells.Cell("3.00 ± 1.00", 1, "3.00")
     assert lines["Other-SLAM"][0] == cells.Cell("5.00", 2)
     assert cells.matrix_heads(suite, rows, cells.SE3) == ["walk", "hall"]
 

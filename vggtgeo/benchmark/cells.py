@@ -28,32 +28,57 @@ class Column:
 
 SE3 = Column("ATE SE(3) cm", "ate_se3_m", 100.0)
 SIM3 = Column("ATE Sim(3) cm", "ate_sim3_m", 100.0)
-DETAILS = (
-    SE3,
-    SIM3,
-    Column("scale", "scale", 1.0, 4, 0),
-    Column("RTE cm/s", "rte_1s_m", 100.0),
-    Column("RRE deg/s", "rre_1s_deg"),
-    Column("depth RMSE cm", "depth_rmse_m", 100.0),
-    Column("AbsRel %", "depth_abs_rel", 100.0),
-    Column("F-score %", "f_score", 100.0, 1, 1),
-    Column("precision %", "precision", 100.0, 1, 1),
-    Column("recall %", "recall", 100.0, 1, 1),
-    Column("mesh F-score %", "mesh_f_score", 100.0, 1, 1),
-    Column("depth < 1.25 %", "depth_below_1_25", 100.0, 1, 1),
-    Column("NEES place", "nees_place", 1.0, 2, 0),
-    Column("NEES rotation", "nees_rotation", 1.0, 2, 0),
-    Column("frames/s", "frames_per_second", 1.0, 1, 0),
-    Column("memory GB", "peak_memory_gb", 1.0, 2, 0),
-)
+RRE = Column("RRE deg/s", "rre_1s_deg")
+DEPTH_RMSE = Column("depth RMSE cm", "depth_rmse_m", 100.0)
+F_SCORE = Column("F-score %", "f_score", 100.0, 1, 1)
+GROUPS: dict[str, tuple[Column, ...]] = {
+    "Poses": (
+        Column("covered %", "coverage", 100.0, 1, 1),
+        SE3,
+        SIM3,
+        Column("scale", "scale", 1.0, 4, 0),
+        Column("RTE cm/s", "rte_1s_m", 100.0),
+        RRE,
+        Column("RTE cm/m", "rte_1m_m", 100.0),
+        Column("RRE deg/m", "rre_1m_deg"),
+        Column("NEES place", "nees_place", 1.0, 2, 0),
+        Column("NEES rotation", "nees_rotation", 1.0, 2, 0),
+        Column("focal error %", "focal_error", 100.0, 2, 0),
+    ),
+    "Depth": (
+        DEPTH_RMSE,
+        Column("RMSE before adjustment cm", "depth_prior_rmse_m", 100.0),
+        Column("AbsRel %", "depth_abs_rel", 100.0),
+        Column("depth < 1.25 %", "depth_below_1_25", 100.0, 1, 1),
+    ),
+    "Map": (
+        F_SCORE,
+        Column("precision %", "precision", 100.0, 1, 1),
+        Column("recall %", "recall", 100.0, 1, 1),
+        Column("accuracy cm", "accuracy_m", 100.0),
+        Column("completeness cm", "completeness_m", 100.0),
+        Column("mesh F-score %", "mesh_f_score", 100.0, 1, 1),
+        Column("mesh accuracy cm", "mesh_accuracy_m", 100.0),
+        Column("mesh completeness cm", "mesh_completeness_m", 100.0),
+        Column("threshold cm", "threshold_m", 100.0, 1, 0),
+    ),
+    "Cost": (
+        Column("frames/s", "frames_per_second", 1.0, 1, 0),
+        Column("memory GB", "peak_memory_gb", 1.0, 2, 0),
+    ),
+}
+"""The numbers of each sequence and setting, a table a group; a column is left out where no run has a number."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A text, and its place among those it is compared with: 1 the best, 2 the second, 0 for all others."""
+    """A text, its place among those it is compared with (1 the best, 2 the second, 0 all others), and the median of
+    what it is the mean of; empty where that would say nothing new.
+    """
 
     text: str
     place: int = 0
+    median: str = ""
 
 
 def number_cell(summary: Summary, digits: int) -> str:
@@ -62,6 +87,17 @@ def number_cell(summary: Summary, digits: int) -> str:
         return ""
     mean = f"{summary.mean:.{digits}f}"
     return mean if np.isnan(summary.deviation) else f"{mean} ± {summary.deviation:.{digits}f}"
+
+
+LEAST_FOR_MEDIAN = 3
+"""Numbers: of two, the median is the mean."""
+
+
+def median_text(summary: Summary, column: Column) -> str:
+    """The median, which published tables often have in place of the mean; empty for too few numbers, and for a column
+    that is not compared.
+    """
+    return f"{summary.median:.{column.digits}f}" if column.better and summary.count >= LEAST_FOR_MEDIAN else ""
 
 
 def interval_cell(summary: Summary, digits: int) -> str:
@@ -105,6 +141,17 @@ def text_of(rows: Sequence[Row], column: Column) -> str:
     return text if not text or is_whole(rows, column) else f"{text} ({summary_of(rows, column).count} of {len(rows)})"
 
 
+def measured(groups: Sequence[Sequence[Row]], columns: Iterable[Column]) -> list[Column]:
+    """The columns that some run has a number for."""
+    return [column for column in columns if any(summary_of(own, column).count for own in groups)]
+
+
+def cell_of(rows: Sequence[Row], column: Column) -> Cell:
+    """`text_of` the runs that ended with a result, with its median, not compared with others."""
+    good = finished(rows)
+    return Cell(text_of(good, column), 0, median_text(summary_of(good, column), column))
+
+
 def _text_or_ending(rows: Sequence[Row], column: Column) -> str:
     """Where no run has a number, how those ended that failed."""
     lost = [row for row in rows if row["status"] != "ok" or row.get("verdict") == "failed"]
@@ -117,7 +164,8 @@ def ranked(groups: Sequence[Sequence[Row]], column: Column, beside_count: bool =
     """
     whole = [summary_of(own, column) if is_whole(own, column) else Summary.of(np.array([])) for own in groups]
     texts = [text_of(finished(own), column) if beside_count else _text_or_ending(own, column) for own in groups]
-    return placed(whole, texts, column)
+    medians = [median_text(summary_of(own, column), column) for own in groups]
+    return placed([summary.mean for summary in whole], texts, column, medians)
 
 
 def runs_text(rows: Sequence[Row]) -> str:
@@ -126,14 +174,13 @@ def runs_text(rows: Sequence[Row]) -> str:
     return str(good) if good == len(rows) else f"{good} of {len(rows)}"
 
 
-def placed(summaries: Sequence[Summary], texts: Sequence[str], column: Column) -> list[Cell]:
-    """Cells with the best and the second best marked, where there are two or more to compare."""
-    means = [summary.mean for summary in summaries]
-    known = sorted({round(mean, column.digits) for mean in means if np.isfinite(mean)}, reverse=column.better > 0)
-    if not column.better or len(known) < 2:
-        return [Cell(text) for text in texts]
-    place = lambda mean: known.index(round(mean, column.digits)) + 1 if np.isfinite(mean) else 0
-    return [Cell(text, rank if (rank := place(mean)) <= 2 else 0) for text, mean in zip(texts, means, strict=True)]
+def placed(numbers: Sequence[float], texts: Sequence[str], column: Column, medians: Sequence[str]) -> list[Cell]:
+    """Cells with the best and the second best marked, where there are two or more numbers to compare."""
+    known = sorted({round(one, column.digits) for one in numbers if np.isfinite(one)}, reverse=column.better > 0)
+    compared = column.better and len(known) >= 2
+    place = lambda one: known.index(round(one, column.digits)) + 1 if compared and np.isfinite(one) else 0
+    ranks = [rank if (rank := place(one)) <= 2 else 0 for one in numbers]
+    return [Cell(*parts) for parts in zip(texts, ranks, medians, strict=True)]
 
 
 def settings_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
@@ -149,21 +196,28 @@ def sequences_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
 
 
 def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str, list[Cell]]]:
-    """A row a setting, a column a sequence, and the mean over the sequences that all runs of all of them have a number
-    for. rows: those without a result, too.
+    """A row a setting, a column a sequence, and over the sequences that all runs of all of them have a number for the
+    mean, with the mean of the medians over seeds beside it, and the median. rows: those without a result, too.
     """
     settings, sequences = settings_of(suite, rows), sequences_of(suite, rows)
     groups = {name: [select(rows, name, setting) for setting in settings] for name in sequences}
     by_column = [ranked(groups[name], column) for name in sequences]
     common = _common(suite, rows, column)
     if len(common) > 1:
-        means = [
-            float(np.mean([summary_of(groups[name][row], column).mean for name in common]))
-            for row in range(len(settings))
-        ]
-        averages = [Summary(1, mean, np.nan, np.nan) for mean in means]
-        by_column.append(placed(averages, [number_cell(one, column.digits) for one in averages], column))
+        lists = [[summary_of(groups[name][row], column) for name in common] for row in range(len(settings))]
+        pooled = [Summary.of(np.array([one.mean for one in own])) for own in lists]
+        # Means of medians, as published: only where each sequence has enough seeds.
+        seeds = [min(one.count for one in own) >= LEAST_FOR_MEDIAN for own in lists]
+        medians = [f"{np.mean([one.median for one in own]):.{column.digits}f}" for own in lists]
+        shown = [text if enough else "" for text, enough in zip(medians, seeds, strict=True)]
+        by_column.append(_placed_alone([one.mean for one in pooled], column, shown))
+        if len(common) >= LEAST_FOR_MEDIAN:
+            by_column.append(_placed_alone([one.median for one in pooled], column, [""] * len(pooled)))
     return [(suite.title_of(setting), [cells[row] for cells in by_column]) for row, setting in enumerate(settings)]
+
+
+def _placed_alone(numbers: Sequence[float], column: Column, medians: Sequence[str]) -> list[Cell]:
+    return placed(numbers, [f"{one:.{column.digits}f}" for one in numbers], column, medians)
 
 
 def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
@@ -179,8 +233,9 @@ def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
 def matrix_heads(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
     """The heads of `matrix`."""
     sequences, common = sequences_of(suite, rows), _common(suite, rows, column)
-    mean = "mean" if len(common) == len(sequences) else f"mean of {len(common)}"
-    return [*sequences, mean] if len(common) > 1 else sequences
+    of = "" if len(common) == len(sequences) else f" of {len(common)}"
+    pooled = [f"mean{of}"] * (len(common) > 1) + [f"median{of}"] * (len(common) >= LEAST_FOR_MEDIAN)
+    return [*sequences, *pooled]
 
 
 @dataclass(frozen=True)
@@ -193,7 +248,7 @@ class Difference:
     cells: tuple[Cell, ...]
 
 
-COMPARED = (SE3, SIM3, DETAILS[4], DETAILS[5], DETAILS[7])
+COMPARED = (SE3, SIM3, RRE, DEPTH_RMSE, F_SCORE)
 
 
 def differences(suite: Suite, rows: Sequence[Row]) -> list[Difference]:

@@ -22,7 +22,7 @@ def page(suite: Suite, rows: Sequence[Row]) -> str:
         parts += ["ATE RMSE after Sim(3) alignment, cm.", accuracy(suite, there, cells.SIM3)]
         if cells.differences(suite, good):
             parts += [f"## Against {suite.title_of(suite.base)}", _DIFFERENCES, differences(suite, good)]
-        parts += ["## Each sequence and setting", details(suite, there)]
+        parts += ["## Each sequence and setting", *details(suite, there)]
     if any(row.get("warnings") for row in good):
         parts += ["## Warnings", doubts(good)]
     if len(good) < len(rows):
@@ -48,7 +48,9 @@ def notice(suite: Suite, rows: Sequence[Row]) -> str:
     }.get(frozenset(kinds), "")
     roles = "Perception is simulated, too: stubs of the five roles with stated error models. "
     stubs = roles if any(row.get("perception") == "simulated" for row in rows) else ""
-    seeds = f"Seeds from {suite.first_seed}; mean ± standard deviation over seeds."
+    seeds = f"Seeds from {suite.first_seed}; mean ± standard deviation over seeds"
+    most = max((len(select(rows, row["sequence"], row["setting"])) for row in rows), default=0)
+    seeds += " / median." if most >= cells.LEAST_FOR_MEDIAN else "."
     return f"{kind}{stubs}Suite `{suite.name}`, {_count(rows)}. {seeds} Protocol {cells.protocol_text(rows)}."
 
 
@@ -79,24 +81,38 @@ def differences(suite: Suite, rows: Sequence[Row]) -> str:
     return table(heads, lines)
 
 
-def details(suite: Suite, rows: Sequence[Row]) -> str:
-    """Every number of each sequence and setting that has a result; columns that no run has are left out."""
-    groups = [
-        (sequence, setting, own)
+def details(suite: Suite, rows: Sequence[Row]) -> list[str]:
+    """Every number of each sequence and setting that has a result, a table for each group of them."""
+    runs = [
+        ((sequence, suite.title_of(setting), cells.runs_text(own)), own)
         for sequence in cells.sequences_of(suite, rows)
         for setting in cells.settings_of(suite, rows)
         if cells.finished(own := select(rows, sequence, setting))
     ]
-    shown = [column for column in (*cells.DETAILS, *_references(rows)) if any(_has(own, column) for *_, own in groups)]
+    parts = ["### Poses", _poses(runs, _references(rows))]
+    for title, columns in cells.GROUPS.items():
+        shown = [] if title == "Poses" else cells.measured([own for _, own in runs], columns)
+        if shown:
+            lines = [
+                [*names, *(_marked(cells.cell_of(own, column)) for column in shown)]
+                for names, own in runs
+                if cells.measured([own], shown)
+            ]
+            parts += [f"### {title}", table([*_NAMES, *(column.head for column in shown)], lines)]
+    return parts
+
+
+_NAMES = ("sequence", "setting", "runs")
+
+
+def _poses(runs: Sequence[tuple[Sequence[str], Sequence[Row]]], references: Sequence[cells.Column]) -> str:
+    """That of the poses, with the verdicts; there is one of each run."""
+    shown = cells.measured([own for _, own in runs], (*cells.GROUPS["Poses"], *references))
     lines = [
-        [
-            *(sequence, suite.title_of(setting), cells.runs_text(own), cells.tracked(own)),
-            *(cells.text_of(cells.finished(own), column) for column in shown),
-            cells.verdicts(own),
-        ]
-        for sequence, setting, own in groups
+        [*names, cells.tracked(own), *(_marked(cells.cell_of(own, column)) for column in shown), cells.verdicts(own)]
+        for names, own in runs
     ]
-    return table(["sequence", "setting", "runs", "tracked", *(column.head for column in shown), "verdict"], lines)
+    return table([*_NAMES, "tracked", *(column.head for column in shown), "verdict"], lines)
 
 
 def doubts(rows: Sequence[Row]) -> str:
@@ -156,10 +172,7 @@ def _is_reference(name: str) -> bool:
     return name.startswith("ate_sim3_") and name.endswith("_m") and name != "ate_sim3_m"
 
 
-def _has(rows: Sequence[Row], column: cells.Column) -> bool:
-    return cells.summary_of(rows, column).count > 0
-
-
 def _marked(cell: Cell) -> str:
     marks = {0: "{}", 1: "**{}**", 2: "<u>{}</u>"}
-    return marks[cell.place].format(cell.text) if cell.text else ""
+    text = marks[cell.place].format(cell.text) if cell.text else ""
+    return f"{text} / {cell.median}" if text and cell.median else text

@@ -70,18 +70,19 @@ def _sequence(suite: Suite, rows: Sequence[Row], name: str, folder: Path) -> dic
     return {
         "name": name,
         "figure": svg(figures.paths_figure(given)) if given else None,
-        "rows": _details(suite, rows, name),
+        "tables": _details(suite, rows, name),
     }
 
 
-def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> dict[str, Any]:
+def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> list[dict[str, Any]]:
+    """A table for each group of numbers that some run has; that of the poses has the runs and their verdicts."""
     settings = cells.settings_of(suite, select(cells.finished(rows), sequence))
     groups = [select(rows, sequence, setting) for setting in settings]
-    shown = [one for one in cells.DETAILS if any(cells.summary_of(own, one).count for own in groups)]
-    by_column = [cells.ranked(groups, column, beside_count=True) for column in shown]
-    return {
-        "heads": [column.head for column in shown],
-        "lines": [
+    tables = []
+    for title, columns in cells.GROUPS.items():
+        shown = cells.measured(groups, columns)
+        by_column = [cells.ranked(groups, column, beside_count=True) for column in shown]
+        lines = [
             {
                 "title": suite.title_of(setting),
                 "runs": cells.runs_text(own),
@@ -90,8 +91,10 @@ def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> dict[str, Any]
                 "verdict": cells.verdicts(own),
             }
             for row, (setting, own) in enumerate(zip(settings, groups, strict=True))
-        ],
-    }
+        ]
+        if shown or title == "Poses":
+            tables.append({"title": title, "heads": [column.head for column in shown], "lines": lines})
+    return tables
 
 
 def _run(suite: Suite, row: Row, folder: Path) -> dict[str, Any]:

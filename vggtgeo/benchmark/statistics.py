@@ -20,14 +20,15 @@ SAME = 1e-6
 
 @dataclass(frozen=True)
 class Summary:
-    """Of n numbers: mean, sample standard deviation (NaN for one), and the half width of the 95 % interval of the mean
-    by Student's law (NaN for one).
+    """Of n numbers: mean, sample standard deviation (NaN for one), the half width of the 95 % interval of the mean by
+    Student's law (NaN for one), and median.
     """
 
     count: int
     mean: float
     deviation: float
     half: float
+    median: float
 
     @classmethod
     def of(cls, values: Float[np.ndarray, " n"]) -> Self:
@@ -35,10 +36,10 @@ class Summary:
         known = values[np.isfinite(values)]
         count = len(known)
         if not count:
-            return cls(0, np.nan, np.nan, np.nan)
+            return cls(0, np.nan, np.nan, np.nan, np.nan)
         deviation = float(np.std(known, ddof=1)) if count > 1 else np.nan
         half = float(student.ppf(0.5 + LEVEL / 2, count - 1)) * deviation / np.sqrt(count) if count > 1 else np.nan
-        return cls(count, float(known.mean()), deviation, float(half))
+        return cls(count, float(known.mean()), deviation, float(half), float(np.median(known)))
 
     @property
     def differs(self) -> bool:
