@@ -42,7 +42,7 @@ def main() -> None:
     suite, rows = load_suite(name), load_rows(folder / "runs.csv")
     if arguments.clips:
         good = [row for row in rows if row["status"] == "ok"]
-        page, tables = DOCS.parent / "README.md", markdown.details(suite, good)
+        page, tables = DOCS.parent / "README.md", "\n\n".join(markdown.details(suite, good))
     else:
         page, tables = DOCS / "paper-tables.md", (folder / "tables.md").read_text().partition("\n\n")[2]
         with atomic_path(DOCS / "paper-tables.png") as temporary:

@@ -3,6 +3,8 @@
 import csv
 import io
 import os
+import runpy
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny_suites as tiny
+from conftest import ROOT
 from scipy.stats import ttest_rel
 from typer.testing import CliRunner
 
@@ -133,6 +136,23 @@ def test_what_was_measured_is_in_the_tables(tmp_path: Path) -> None:
     lines = markdown.page(tiny.suite(), rows).partition("### Map")[2].partition("###")[0]
     assert "| walk |" in lines
     assert "| hall |" not in lines, "a sequence without a true surface has an empty line"
+
+
+def test_the_tables_of_the_documents_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that `docs/write_tables.py --clips` puts the numbers of a batch between the marks of the README, and leaves
+    # the rest. Oracle: the rows.
+    rows = [row("icl-office", "default", 0, 2.0, **EVERYTHING)]
+    (tmp_path / "runs.csv").write_text(as_csv(rows))
+    (tmp_path / "README.md").write_text("before\n<!-- tables: begin -->\nold\n<!-- tables: end -->\nafter\n")
+    write = runpy.run_path(str(ROOT / "docs" / "write_tables.py"))["main"]
+    monkeypatch.setitem(write.__globals__, "DOCS", tmp_path / "docs")
+    monkeypatch.setattr(sys, "argv", ["write_tables.py", "--clips", str(tmp_path)])
+    write()
+    text = (tmp_path / "README.md").read_text()
+    assert text.startswith("before\n<!-- tables: begin -->\n### Poses\n\n| sequence |")
+    assert text.endswith("<!-- tables: end -->\nafter\n")
+    assert "| icl-office | RGB-D | 1 | 9/10 | 97.5 | 2.00 |" in text
+    assert "old" not in text
 
 
 def test_medians_stand_beside_means() -> None:
