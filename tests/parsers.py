@@ -25,10 +25,12 @@ from vggtgeo.benchmark.suite import load_suite
 from vggtgeo.bundle.problem_file import load_problem
 from vggtgeo.cli.settings_file import _read as read_settings
 from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets.icl_raw import IclNuimRaw
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, read_depth, read_image
 from vggtgeo.datasets.intrinsics import camera_from_folder
 from vggtgeo.datasets.pose_files import read_matrix
 from vggtgeo.datasets.tanks import inside_crop
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
@@ -146,6 +148,11 @@ def _windows(folder: Path) -> bytes:
     return b'{"windows": 3, "version": 1}'
 
 
+def _distances(path: Path) -> None:
+    depth = IclNuimRaw(path.parent, "", Camera((50.0, 50.0, 3.5, 2.5), 8, 6), ()).load_depth(path)
+    assert not (depth <= 0).any()
+
+
 KINDS = (
     Kind("trajectory", "t.txt", lambda folder: bad.walk(folder / "g.txt", 0, 6).read_bytes(), Trajectory.load_tum, 300),
     Kind("calibration", "calibration.txt", lambda _: b"55 55 31.5 23.5 0.1 0.1 0 0\n", _camera, 300),
@@ -178,6 +185,8 @@ KINDS = (
     layout("EuRoC truth", layouts.euroc, "data/mav0/state_groundtruth_estimate0/data.csv"),
     layout("ICL list", layouts.icl, "data/associations.txt", count=8),
     layout("ICL truth", layouts.icl, "data/livingRoom0.gt.freiburg", count=8),
+    layout("ICL camera", layouts.icl_raw, "data/scene_00_0001.txt", count=8),
+    Kind("ICL distances", "d.depth", lambda _: b"1.5 2 1e10 0 2.25 3\n" * 8, _distances),
     layout("Tanks poses", layouts.tanks, "data/data_COLMAP_SfM.log"),
     Kind("Tanks crop", "c.json", _crop, lambda file: inside_crop(file, np.zeros((2, 3)))),
     Kind("matrix", "m.txt", lambda _: b"1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", lambda file: read_matrix(file, (4, 4))),

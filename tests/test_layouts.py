@@ -202,8 +202,46 @@ def test_icl_is_mirrored_with_its_truth(tmp_path: Path) -> None:
     assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1.0)
 
 
+def test_icl_without_its_list_is_paired_by_number(tmp_path: Path) -> None:
+    # Proves that the published camera and unit of depth are used where only images and truth were unpacked. Oracle: the
+    # same folder with its list.
+    folder = tiny.icl(tmp_path / "lr0")
+    listed = tiny.quietly_opened(folder)
+    (folder / "associations.txt").unlink()
+    found = tiny.quietly_opened(folder)
+    assert (type(found), found.files, found.camera) == (type(listed), listed.files, listed.camera)
+    depths = [one.load_depth(one.files[1].depth) for one in (found, listed)]
+    assert np.array_equal(*depths, equal_nan=True)
+    (folder / "livingRoom0.gt.freiburg").unlink()
+    assert type(tiny.quietly_opened(folder)).__name__ == "RgbdFolders"
+
+
+def test_icl_as_it_was_rendered(tmp_path: Path) -> None:
+    # Proves the published camera, that distances along rays become depth, that what is infinitely far is none, and
+    # poses of what the camera's file names. Oracle: a wall at 2 m; a point that the file's own axes put at a pixel.
+    folder = tiny.icl_raw(tmp_path / "living_room_traj0_loop")
+    sequence = tiny.quietly_opened(folder)
+    frames = _check(sequence, "IclNuimRaw", (481.2, 480.0, 319.5, 239.5))
+    assert np.isnan(frames[1].depth[0, 0])
+    assert np.abs(frames[1].depth.ravel()[1:] - 2.0).max() < 1e-6, "a wall at right angles to the axis is not flat"
+    truth = sequence.ground_truth()
+    np.testing.assert_allclose(truth.timestamps, np.arange(3) / 30)
+    ahead, right, up = np.array([[np.sin(0.2), 0, np.cos(0.2)], [np.cos(0.2), 0, -np.sin(0.2)], [0, 1, 0]])
+    point = np.array([1.5, 2, -2]) + 2.0 * ahead + 0.3 * right + 0.4 * up
+    seen = truth.rotations[2].T @ (point * [1, -1, 1] - truth.positions[2])
+    pixel = 481.2 * seen[0] / seen[2] + 319.5, 480.0 * seen[1] / seen[2] + 239.5
+    np.testing.assert_allclose(pixel, (319.5 + 481.2 * 0.15, 239.5 - 480.0 * 0.2), atol=1e-6)
+    assert np.linalg.det(truth.rotations[2]) == pytest.approx(1.0)
+    (folder / "scene_00_0001.depth").write_text("1 2 3")
+    with pytest.warns(InputWarning) as caught:
+        assert np.isnan(list(sequence.frames())[1].depth).all()
+    assert "has 3 numbers; its image has 640 x 480 pixels; the frame is used without depth" in str(caught[0].message)
+
+
 @pytest.mark.filterwarnings("ignore::vggtgeo.io.errors.NoteWarning")
-@pytest.mark.parametrize("write", [tiny.scannet, tiny.tanks, tiny.arkit, tiny.icl, tiny.kitti, tiny.stray])
+@pytest.mark.parametrize(
+    "write", [tiny.scannet, tiny.tanks, tiny.arkit, tiny.icl, tiny.icl_raw, tiny.kitti, tiny.stray]
+)
 def test_what_macos_leaves_beside_files_is_none(tmp_path: Path, write: Callable[[Path], Path]) -> None:
     # Proves that a recording that lay on a disk formatted elsewhere is read: a file `._NAME` stands beside each.
     folder = write(tmp_path / "room")

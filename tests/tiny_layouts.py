@@ -145,6 +145,25 @@ def icl(folder: Path) -> Path:
     return folder
 
 
+def icl_raw(folder: Path) -> Path:
+    """As POV-Ray rendered it: distances along the rays to a wall 2 m ahead, a camera that turns and rises; the first
+    pixel of each sees nothing.
+    """
+    across, down = np.meshgrid((np.arange(640) - 319.5) / 481.2, (np.arange(480) - 239.5) / 480.0)
+    distances = 2.0 * np.sqrt(1 + across**2 + down**2)
+    distances[0, 0] = 1e10
+    for number in range(COUNT):
+        stem = folder / f"scene_00_{number:04d}"
+        write_image(stem.with_suffix(".png"), image(number, 640, 480))
+        stem.with_suffix(".depth").write_text(" ".join(f"{value:.6f}" for value in distances.ravel()) + " \n")
+        sine, cosine = np.sin(0.1 * number), np.cos(0.1 * number)
+        vectors = {"pos": f"1.5, {number}, -2", "dir": f"{sine}, 0, {cosine}", "up": "0, 1, 0", "lookat": "0, 0, 1"}
+        vectors |= {"sky": "0, 1, 0", "right": f"{1.33 * cosine}, 0, {-1.33 * sine}", "fpoint": "0, 0, 10"}
+        lines = [f"cam_{name:8s} = [{value}]';\n" for name, value in vectors.items()]
+        stem.with_suffix(".txt").write_text("".join(lines) + "cam_angle    = 90;\n")
+    return folder
+
+
 def tanks(folder: Path, poses: Sequence[np.ndarray] = POSES) -> Path:
     """A scene with its log, its alignment to the scanner (twice as large, moved along z) and its crop."""
     log = []

@@ -1,4 +1,4 @@
-"""ICL-NUIM in its TUM-compatible form: `associations.txt`, `rgb/N.png`, `depth/N.png`, `*.gt.freiburg`.
+"""ICL-NUIM in its TUM-compatible form: `rgb/N.png`, `depth/N.png`, `*.gt.freiburg`, mostly with `associations.txt`.
 
 Its camera has a negative fy: the picture's y axis points up. The images are read as they are, with fy positive, which
 mirrors the world; so the truth is mirrored, too, and errors are what they were. Source: A. Handa et al., "A benchmark
@@ -20,9 +20,10 @@ from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of
 from vggtgeo.datasets.tum import MOST_LETTERS, read_pairs
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 
-_CAMERA = (481.20, 480.00, 319.50, 239.50)
-_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_CAMERA, _SIZE = (481.20, 480.00, 319.50, 239.50), (640, 480)
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _LIST = "associations.txt"
 
 
@@ -33,37 +34,60 @@ class IclNuim(FolderSequence):
     @classmethod
     def matches(cls, folder: Path) -> bool:
         """Whether `folder` has `associations.txt` and no `rgb.txt`, and this is ICL-NUIM's: beside its truth, or a list
-        that counts frames, depth first. Lists of times are anybody's, as ORB-SLAM2 takes them.
+        that counts frames, depth first; or pairs of numbered images beside its truth. Lists of times are anybody's, as
+        ORB-SLAM2 takes them.
         """
-        file = folder / _LIST
-        if not file.is_file() or (folder / "rgb.txt").is_file():
+        file, truth = folder / _LIST, bool(files_like(folder, "*.gt.freiburg"))
+        if (folder / "rgb.txt").is_file():
             return False
+        if not file.is_file():
+            return truth and bool(_numbered(folder))
         with file.open(encoding="utf-8", errors="replace") as lines:
             head = (line[:MOST_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
             words = next(filter(None, head), [])
         counted = len(words) == 4 and words[0].isdecimal() and "depth" in words[1]
-        return counted or bool(files_like(folder, "*.gt.freiburg"))
+        return counted or truth
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Reads the list of pairs."""
+        """Reads the list of pairs, or pairs the images by their numbers where there is none."""
+        pairs = read_pairs(folder / _LIST, "N") if (folder / _LIST).is_file() else _numbered(folder)
+        if not pairs:
+            raise InputError(f"`{folder}` has neither `{_LIST}` nor images `rgb/N.png` with `depth/N.png`")
         files = tuple(
             FrameFile(index, number / FRAMES_PER_SECOND, folder / image, folder / depth)
-            for index, (number, image, depth) in enumerate(sorted(read_pairs(folder / _LIST, "N")))
+            for index, (number, image, depth) in enumerate(sorted(pairs))
         )
         width, height = common_size(str(folder), files)
-        camera = Camera(_CAMERA, width, height)
-        if (width, height) != (640, 480):
-            camera = guess_with_warning(str(folder), width, height)
+        camera = icl_camera(folder, width, height)
         has_depth = depth_is_usable(str(folder), files, FIVE_THOUSANDTHS, width, height)
         return cls(folder, folder.resolve().name, camera, files, FIVE_THOUSANDTHS, has_depth)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses of the mirrored world."""
-        there = [*files_like(self.folder, "*.gt.freiburg"), self.folder / "groundtruth.txt"]
-        file = next((file for file in there if file.is_file()), None)
-        if file is None:
-            return None
-        rows = read_matrices(file, 8)
-        poses = poses_of(rows[:, 1:4], rows[:, 4:])
-        return trajectory_of(rows[:, 0] / FRAMES_PER_SECOND, _MIRROR @ poses @ _MIRROR, file)
+        return icl_truth(self.folder)
+
+
+def icl_camera(folder: Path, width: int, height: int) -> Camera:
+    """The published camera, fy positive; a guess, with an InputWarning, for images of another size."""
+    if (width, height) != _SIZE:
+        return guess_with_warning(str(folder), width, height)
+    return Camera(_CAMERA, width, height)
+
+
+def icl_truth(folder: Path) -> Trajectory | None:
+    """The poses of `*.gt.freiburg` or `groundtruth.txt`, of the mirrored world; None where neither is there."""
+    there = [*files_like(folder, "*.gt.freiburg"), folder / "groundtruth.txt"]
+    file = next((file for file in there if file.is_file()), None)
+    if file is None:
+        return None
+    rows = read_matrices(file, 8)
+    poses = poses_of(rows[:, 1:4], rows[:, 4:])
+    return trajectory_of(rows[:, 0] / FRAMES_PER_SECOND, MIRROR @ poses @ MIRROR, file)
+
+
+def _numbered(folder: Path) -> list[tuple[float, str, str]]:
+    """Number, image and depth of each pair `rgb/N.png`, `depth/N.png`, as `read_pairs` has them."""
+    images = [path for path in files_like(folder / "rgb", "*.png") if path.stem.isdecimal()]
+    both = [path for path in images if (folder / "depth" / path.name).is_file()]
+    return [(float(path.stem), f"rgb/{path.name}", f"depth/{path.name}") for path in both]

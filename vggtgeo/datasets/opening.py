@@ -11,6 +11,7 @@ from vggtgeo.datasets.bags import RosBag, is_bag
 from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim
+from vggtgeo.datasets.icl_raw import IclNuimRaw
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
@@ -53,6 +54,7 @@ FOLDER_KINDS: dict[str, FolderReader] = {
     "kitti": Kitti,
     "tanks": TanksAndTemples,
     "icl": IclNuim,
+    "icl-raw": IclNuimRaw,
     "7scenes": SevenScenes,
     "tum": TumRgbd,
     "nerfstudio": Nerfstudio,
