@@ -255,6 +255,41 @@ def test_what_macos_leaves_beside_files_is_none(tmp_path: Path, write: Callable[
         np.testing.assert_array_equal(after.ground_truth().poses, truth.poses)
 
 
+WINDOWS: dict[str, Callable[[str], bytes]] = {
+    "a byte order mark and CR LF": lambda text: text.replace("\n", "\r\n").encode("utf-8-sig"),
+    "blanks": lambda text: ("\n" + text.replace("\n", " \t\n") + "\n  \n").encode(),
+}
+"""What editors of Windows make of a text, and blanks that nobody sees."""
+TEXTS = frozenset({".txt", ".csv", ".yaml", ".json", ".log", ".freiburg", ".traj", ".pincam"})
+
+
+@pytest.mark.filterwarnings("ignore::vggtgeo.io.errors.NoteWarning")
+@pytest.mark.parametrize("change", WINDOWS)
+@pytest.mark.parametrize(
+    "write",
+    [
+        *(tiny.replica, tiny.rgbd, tiny.nerfstudio, tiny.scannet, tiny.euroc, tiny.icl, tiny.icl_raw, tiny.tanks),
+        *(tiny.eth3d, tiny.kitti, tiny.arkit, tiny.stray, tiny_sequences.tum, tiny_sequences.seven_scenes),
+    ],
+)
+def test_texts_that_went_through_windows_are_read(tmp_path: Path, write: Callable[[Path], Path], change: str) -> None:
+    # Proves that no layout loses frames, camera or truth, or ends, by how its lists and poses were saved. Oracle: the
+    # same recording as it is downloaded.
+    recording = write(tmp_path / "room")
+    before = tiny.quietly_opened(recording)
+    for file in [path for path in tmp_path.rglob("*") if path.suffix in TEXTS]:
+        file.write_bytes(WINDOWS[change](file.read_text()))
+    after = tiny.quietly_opened(recording)
+    frames = [[(frame.timestamp, frame.name) for frame in one.frames()] for one in (before, after)]
+    assert (after.camera, after.has_depth, frames[1]) == (before.camera, before.has_depth, frames[0])
+    truths = [one.ground_truth() for one in (before, after)]
+    if truths[0] is None:
+        assert truths[1] is None
+    else:
+        np.testing.assert_array_equal(truths[1].timestamps, truths[0].timestamps)
+        np.testing.assert_array_equal(truths[1].poses, truths[0].poses)
+
+
 def test_tanks_and_temples(tmp_path: Path) -> None:
     # Proves the log, the similarity to the scanner's frame, and the crop. Oracle: what was written; points by hand, one
     # of them in the notch of the polygon.

@@ -272,7 +272,7 @@ def load_suite(name: str | Path) -> Suite:
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         try:
-            text = whole_text(path, "utf-8-sig", "strict")
+            text = whole_text(path, errors="strict")
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(
                 f"`{path}` cannot be read: {error}; give a TOML file or one of {_shipped_text()}"

@@ -108,5 +108,5 @@ def _images(file: Path) -> list[tuple[float, str]]:
 
 
 def _numbers(file: Path) -> np.ndarray:
-    lines = [line for line in whole_text(file).splitlines() if line[:1].isdigit()]
+    lines = [line for line in whole_text(file).splitlines() if line.lstrip()[:1].isdigit()]
     return read_matrices(file, lines[0].count(",") + 1) if lines else np.zeros((0, 17))

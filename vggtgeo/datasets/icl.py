@@ -42,7 +42,7 @@ class IclNuim(FolderSequence):
             return False
         if not file.is_file():
             return truth and bool(_numbered(folder))
-        with file.open(encoding="utf-8", errors="replace") as lines:
+        with file.open(encoding="utf-8-sig", errors="replace") as lines:
             head = (line[:MOST_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
             words = next(filter(None, head), [])
         counted = len(words) == 4 and words[0].isdecimal() and "depth" in words[1]

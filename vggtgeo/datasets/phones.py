@@ -157,7 +157,7 @@ class ArkitScenes(FolderSequence):
 def _odometry(folder: Path) -> np.ndarray:
     """Rows: time, frame, x, y, z, qx, qy, qz, qw."""
     file = folder / "odometry.csv"
-    text = whole_text(file).splitlines()
+    text = [line for line in whole_text(file).splitlines() if line.strip()]
     header = text[0].split(",") if text else []
     rows = read_matrices(file, len(header), skip="t") if header else np.zeros((0, 9))
     if rows.shape[1] < 9 or not len(rows):

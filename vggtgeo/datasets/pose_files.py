@@ -123,7 +123,7 @@ def read_text(file: Path) -> str:
     try:
         if file.exists() and not file.is_file():  # a pipe has no end
             raise InputError(f"`{file}` is no regular file")
-        return whole_text(file, "utf-8-sig")
+        return whole_text(file)
     except OSError as error:
         raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None
 

@@ -138,9 +138,7 @@ def _published_camera(folder: Path, width: int, height: int) -> Camera:
 
 def _read_pose(file: Path) -> np.ndarray | None:
     try:
-        pose = np.array(whole_text(file, "utf-8-sig", errors="strict").replace(",", " ").split(), np.float64).reshape(
-            4, 4
-        )
+        pose = np.array(whole_text(file, errors="strict").replace(",", " ").split(), np.float64).reshape(4, 4)
     except ValueError:
         raise InputError(f"`{file}`: expected a 4 x 4 matrix of numbers, camera to world") from None
     if np.isfinite(pose).all() and not np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), atol=1e-3):

@@ -86,7 +86,7 @@ def lists_no_times(file: Path) -> bool:
     order of the list. Scripts write what each frame took in place of when it came; sorted by that, frames are shuffled.
     """
     try:
-        lines = [line.split("#", 1)[0].split() for line in whole_text(file, "utf-8-sig").splitlines()]
+        lines = [line.split("#", 1)[0].split() for line in whole_text(file).splitlines()]
         times, names = zip(*((float(words[0]), words[1]) for words in lines if words), strict=True)
     except (InputError, ValueError, IndexError):  # told where it is read
         return False
@@ -164,7 +164,7 @@ def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
     if not file.is_file():
         raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
     entries = []
-    for number, line in enumerate(whole_text(file, "utf-8-sig").splitlines(), start=1):
+    for number, line in enumerate(whole_text(file).splitlines(), start=1):
         text = line.split("#", 1)[0].strip()
         if text:
             entries.append(_parse_entry(file, number, text))

@@ -137,7 +137,7 @@ def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:
     if not file.is_file():
         raise InputError(f"`{file}` is not there or is no file; give a trajectory in the TUM format")
     rows = []
-    for number, line in enumerate(whole_text(file, "utf-8-sig").splitlines(), start=1):
+    for number, line in enumerate(whole_text(file).splitlines(), start=1):
         text = line.split("#", 1)[0].replace(",", " ").strip()
         if text:
             rows.append(_parse_row(f"`{file}`, line {number}", text))

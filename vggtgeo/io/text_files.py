@@ -11,8 +11,8 @@ MOST_BYTES = 64 * 2**20
 larger is something else, a sparse file of any size, say."""
 
 
-def whole_text(file: Path, encoding: str = "utf-8", errors: str = "replace") -> str:
-    """The text of a file of at most `MOST_BYTES` bytes.
+def whole_text(file: Path, errors: str = "replace") -> str:
+    """The text of a file of at most `MOST_BYTES` bytes, UTF-8, without the mark that editors of Windows begin it with.
 
     Raises:
         InputError: the file has more, or may not be read.
@@ -23,6 +23,6 @@ def whole_text(file: Path, encoding: str = "utf-8", errors: str = "replace") -> 
     if size > MOST_BYTES:
         raise InputError(f"`{file}` has {size} bytes; expected a text of at most {MOST_BYTES}")
     try:
-        return file.read_text(encoding=encoding, errors=errors)
+        return file.read_text(encoding="utf-8-sig", errors=errors)
     except PermissionError as error:
         raise InputError(f"`{file}` cannot be read: {error.strerror}; allow it, or take the file away") from None
