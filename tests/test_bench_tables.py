@@ -196,6 +196,8 @@ def test_what_has_no_result_is_told() -> None:
     text = markdown.page(tiny.suite(), rows)
     assert "| walk | full | 2 | crash | ended by SIGSEGV |" in text
     assert "Not there: hall" in text
+    assert "## Provenance" not in text, "an empty table"
+    assert "## Provenance" in markdown.page(tiny.suite(), [row("walk", "full", 0, 2.0, version="0.1.0")])
     assert "| full system | 3.00 ± 1.41 (2 of 3) |" in text
     assert "| walk | full system | 2 of 3 | 27/30 |" in text
     assert "# a b\n" in markdown.page(replace(tiny.suite(), title="a\nb"), rows)

@@ -1,12 +1,14 @@
 """`vggtgeo data`: the list of recordings, and sentences about what is wrong with one."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import tiny_layouts as layouts
 import tiny_sequences as tiny
 from typer.testing import CliRunner
 
@@ -53,6 +55,39 @@ def test_nothing_is_wrong_with_a_good_recording(tmp_path: Path) -> None:
     for text in ("reader: TumRgbd", "6 frames of 40 x 30", "10.0 frames a second", "truth: 12 poses, path 0.11 m"):
         assert text in outcome.stdout
     assert outcome.stdout.rstrip().endswith("nothing wrong found")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("scene0000_00.sens", b"\4\0\0\0", "`.*scene0000_00.sens` is a scan of ScanNet as it is downloaded; export"),
+        ("MH_01_easy.zip", b"PK\3\4", "`.*MH_01_easy.zip` is a zip archive; unpack it"),
+        ("desk.tgz", b"\x1f\x8b\x08", "`.*desk.tgz` is a gzip archive; unpack it"),
+    ],
+)
+def test_what_is_not_unpacked_is_named(tmp_path: Path, name: str, content: bytes, said: str) -> None:
+    # Proves that a folder with a download in it says what to do with it, as the file itself does, and that one which
+    # holds it unpacked, too, says where. Oracle: the names.
+    (tmp_path / name).write_bytes(content)
+    (tmp_path / "readme.txt").write_text("hello")
+    for place in (tmp_path, tmp_path / name):
+        (problem,) = inspect(place).problems
+        assert re.match(said, problem), problem
+    _good(tmp_path / "unpacked")
+    (problem,) = inspect(tmp_path).problems
+    assert problem.endswith(f"in it can be read: `{tmp_path / 'unpacked'}`")
+
+
+def test_a_car_may_be_fast(tmp_path: Path) -> None:
+    # Proves that a sound drive of KITTI has nothing wrong, and that a jump in its truth is told. Oracle: 1 m a frame,
+    # 10 m/s; one of 100 m.
+    drive = layouts.kitti(tmp_path)
+    assert not [text for text in inspect(drive).problems if "m/s" in text]
+    file = tmp_path / "poses/07.txt"
+    rows = np.loadtxt(file)
+    rows[2:, 3] += 100
+    np.savetxt(file, rows)
+    assert any("the truth moves at 974 m/s" in text for text in inspect(drive).problems)
 
 
 def _millimetres(folder: Path) -> None:

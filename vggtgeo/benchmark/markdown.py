@@ -29,7 +29,7 @@ def page(suite: Suite, rows: Sequence[Row]) -> str:
         parts += ["## Without a result", failures(rows)]
     for name in suite.published:
         parts += [published_table(published(name))]
-    parts += ["## Provenance", provenance(rows)]
+    parts += ["## Provenance", provenance(rows)] if any(row.get("version") for row in rows) else []
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.images import rows_of
+from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.opening import open_sequence
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
@@ -27,8 +28,8 @@ _LEAST_STEPS, _USUAL = 10, 0.75
 """Of the steps between the numbers of images, and the share that is one: else they were chosen by hand."""
 _GAP = 5.0
 """Times the median step between two frames."""
-_FAST = 5.0
-"""Metres a second: more than a hand or a small drone does between two poses of the truth."""
+_FAST, _FAST_CAR = 5.0, 60.0
+"""Metres a second: more than a hand or a small drone, or a car, does between two poses of the truth."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
         *_of_times(frames, len(sequence)),
         *_of_depth(sequence, frames),
     ]
-    problems += _of_truth(truth, frames)
+    problems += _of_truth(truth, frames, _FAST_CAR if isinstance(sequence, Kitti) else _FAST)
     if not sequence.camera.known and not any("intrinsics" in text for text in problems):
         problems.append("the intrinsics are a guess; give --intrinsics, or put them into calibration.txt")
     return Inspection((*_facts(sequence, frames, truth), *dict.fromkeys(notes)), tuple(dict.fromkeys(problems)))
@@ -197,7 +198,7 @@ def _of_depth(sequence: Sequence, frames: list[Frame]) -> list[str]:
     return problems
 
 
-def _of_truth(truth: Trajectory | None, frames: list[Frame]) -> list[str]:
+def _of_truth(truth: Trajectory | None, frames: list[Frame], fast: float) -> list[str]:
     if truth is None or not frames or len(truth) < 2:
         return []
     times = np.array([frame.timestamp for frame in frames])
@@ -208,7 +209,7 @@ def _of_truth(truth: Trajectory | None, frames: list[Frame]) -> list[str]:
     if within.mean() < 0.9:
         problems.append(f"{100 * (1 - within.mean()):.0f} % of the frames looked at lie outside the times of the truth")
     speed = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1) / np.diff(truth.timestamps)
-    if speed.max() > _FAST:
+    if speed.max() > fast:
         row = int(speed.argmax())
         when = f"{truth.timestamps[row]:.2f} s"
         problems.append(f"the truth moves at {speed.max():.0f} m/s at {when}: a jump, or another unit")

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from vggtgeo.datasets.images import files_like
+
 _RAW_PARTS = ("image_00", "image_01", "image_02", "image_03", "oxts", "velodyne_points")
 
 
@@ -12,9 +14,25 @@ def reason_not_read(place: Path) -> str | None:
             f"`{place}` is a part of KITTI's raw recordings; give the folder of a drive, which holds `image_02/data` "
             "or `image_00/data`"
         )
-    if place.is_file() and (kind := _archive(place)):
-        return f"`{place}` is {kind}; unpack it, and give the folder of images or the video that is in it"
+    files = [place] if place.is_file() else _downloads(place)
+    if sensed := next((file for file in files if file.suffix == ".sens"), None):
+        return (
+            f"`{sensed}` is a scan of ScanNet as it is downloaded; export its images, depth, poses and intrinsics with "
+            "ScanNet's SensReader, and give the folder of those"
+        )
+    if packed := next((file for file in files if _archive(file)), None):
+        return f"`{packed}` is {_archive(packed)}; unpack it, and give the folder of images or the video that is in it"
     return None
+
+
+def _downloads(folder: Path) -> list[Path]:
+    """Files of a folder that are named as archives and scans are; none beside a folder, which may be what they held."""
+    if any(path.is_dir() and path.name[0] != "." for path in folder.iterdir()):
+        return []
+    return [file for file in files_like(folder, "*") if file.suffix.lower() in _DOWNLOADED]
+
+
+_DOWNLOADED = frozenset({".sens", ".zip", ".tgz", ".gz", ".tar", ".7z", ".rar", ".bz2", ".tbz", ".xz", ".zst"})
 
 
 _ARCHIVES = {
