@@ -117,7 +117,8 @@ def test_tables_mark_the_best_and_the_second() -> None:
 EVERYTHING = {
     "coverage": 0.975, "nees_place": 0.4321, "focal_error": -0.0123, "depth_rmse_m": 0.0345, "depth_abs_rel": 0.0567,
     "depth_below_1_25": 0.987, "f_score": 0.876, "precision": 0.765, "recall": 0.654, "accuracy_m": 0.0543,
-    "completeness_m": 0.0432, "mesh_completeness_m": 0.0321, "rte_1m_m": 0.0191, "peak_memory_gb": 1.23,
+    "completeness_m": 0.0432, "mesh_completeness_m": 0.0321, "threshold_m": 0.05, "rte_1m_m": 0.0191,
+    "peak_memory_gb": 1.23,
 }  # fmt: skip
 
 
@@ -129,7 +130,7 @@ def test_what_was_measured_is_in_the_tables(tmp_path: Path) -> None:
     for suite_rows, there in ((rows, True), (rows[1:], False)):
         write_page(tmp_path / "report.html", tiny.suite(), suite_rows, tmp_path)
         text, page = markdown.page(tiny.suite(), suite_rows), (tmp_path / "report.html").read_text()
-        for group in ("Depth", "Map", "Cost"):
+        for group in ("Depth", "Map, scores within 5 cm", "Cost"):
             assert (f"### {group}" in text) == (f"<h3>{group}</h3>" in page) == there, group
         for number in shown:
             assert (f" {number} |" in text) == (f">{number}</span>" in page) == there, number

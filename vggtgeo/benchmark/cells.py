@@ -11,6 +11,7 @@ from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.statistics import Summary, paired, select, values
 from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.suite import Suite
+from vggtgeo.benchmark.table import number
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,6 @@ GROUPS: dict[str, tuple[Column, ...]] = {
         Column("mesh F-score %", "mesh_f_score", 100.0, 1, 1),
         Column("mesh accuracy cm", "mesh_accuracy_m", 100.0),
         Column("mesh completeness cm", "mesh_completeness_m", 100.0),
-        Column("threshold cm", "threshold_m", 100.0, 1, 0),
     ),
     "Cost": (
         Column("frames/s", "frames_per_second", 1.0, 1, 0),
@@ -144,6 +144,13 @@ def text_of(rows: Sequence[Row], column: Column) -> str:
 def measured(groups: Sequence[Sequence[Row]], columns: Iterable[Column]) -> list[Column]:
     """The columns that some run has a number for."""
     return [column for column in columns if any(summary_of(own, column).count for own in groups)]
+
+
+def heading(title: str, groups: Iterable[Sequence[Row]]) -> str:
+    """The title of a group of numbers; that of the map with the distance that its scores are within."""
+    known = [number(row, "threshold_m") for own in groups for row in own]
+    within = ", ".join(f"{100 * one:g}" for one in sorted({one for one in known if np.isfinite(one)}))
+    return f"{title}, scores within {within} cm" if within and title == "Map" else title
 
 
 def cell_of(rows: Sequence[Row], column: Column) -> Cell:

@@ -89,16 +89,18 @@ def details(suite: Suite, rows: Sequence[Row]) -> list[str]:
         for setting in cells.settings_of(suite, rows)
         if cells.finished(own := select(rows, sequence, setting))
     ]
+    groups = [own for _, own in runs]
     parts = ["### Poses", _poses(runs, _references(rows))]
     for title, columns in cells.GROUPS.items():
-        shown = [] if title == "Poses" else cells.measured([own for _, own in runs], columns)
+        shown = [] if title == "Poses" else cells.measured(groups, columns)
         if shown:
             lines = [
                 [*names, *(_marked(cells.cell_of(own, column)) for column in shown)]
                 for names, own in runs
                 if cells.measured([own], shown)
             ]
-            parts += [f"### {title}", table([*_NAMES, *(column.head for column in shown)], lines)]
+            heads = [*_NAMES, *(column.head for column in shown)]
+            parts += [f"### {cells.heading(title, groups)}", table(heads, lines)]
     return parts
 
 

@@ -93,7 +93,9 @@ def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> list[dict[str,
             for row, (setting, own) in enumerate(zip(settings, groups, strict=True))
         ]
         if shown or title == "Poses":
-            tables.append({"title": title, "heads": [column.head for column in shown], "lines": lines})
+            tables.append(
+                {"title": cells.heading(title, groups), "heads": [column.head for column in shown], "lines": lines}
+            )
     return tables
 
 
