@@ -102,8 +102,9 @@ def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None
         assert (" cm" in found.output) == (words is None), f"{scale}: {found.output}"
         assert (words or f"{100 * value:.3f} cm") in " ".join(found.output.split())
         assert words is None or f"{value:.5g}" in found.output
-    of_run.rename(tmp_path / "run" / "groundtruth.txt")
-    assert " cm" in CliRunner().invoke(app, [str(estimate), str(tmp_path / "run" / "groundtruth.txt")]).output
+    for name in ("groundtruth.txt", "rgbd_dataset_freiburg1_xyz-groundtruth.txt", "livingRoom0.gt.freiburg"):
+        of_run = of_run.rename(tmp_path / "run" / name)
+        assert " cm" in CliRunner().invoke(app, [str(estimate), str(of_run)]).output, name
 
 
 def test_a_file_of_a_run_has_the_scale_of_its_summary(tmp_path: Path) -> None:

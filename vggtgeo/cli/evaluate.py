@@ -25,9 +25,8 @@ MAX_TIME_DIFFERENCE = 0.01
 """Seconds; that of `vggtgeo.evaluation`, repeated here so that `--help` need not load it (a test compares them)."""
 
 _WRITTEN_BY_RUNS = ("trajectory.txt", "keyframes.txt")
-_BENCHMARKS = ("groundtruth.txt", "data.csv")
-_ICL = ".gt.freiburg"
-"""Files of true poses as TUM RGB-D (and all of its layout), EuRoC and ICL-NUIM name them, in metres."""
+_BENCHMARKS = ("groundtruth.txt", "groundtruth.csv", "data.csv", ".gt.freiburg")
+"""How names of files of true poses end at TUM RGB-D (and all of its layout), EuRoC and ICL-NUIM, in metres."""
 
 
 def evaluate(
@@ -114,7 +113,7 @@ def _in_metres(file: Path) -> bool | None:
     scale = load_scale(file)
     if scale is not None:
         return scale.startswith("metric")
-    return True if file.name in _BENCHMARKS or file.name.endswith(_ICL) else None
+    return True if file.name.endswith(_BENCHMARKS) else None
 
 
 def print_report(report: TrajectoryReport, scale: str | None = None, metres: bool | None = True) -> None:
