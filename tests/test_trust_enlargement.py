@@ -128,7 +128,7 @@ def test_what_the_camera_carries_has_no_say() -> None:
 
 
 def test_an_older_checkpoint_notes_nothing(tmp_path: Path) -> None:
-    """Version 5 had no factor; what it noted is read, without one."""
+    """Version 5 had no factor, nor edges; what it noted is read, without them."""
     run = recorded_run()
     recorder = EvidenceRecorder(run.sequence.camera)
     for frame in run.frames[:3]:
@@ -140,12 +140,12 @@ def test_an_older_checkpoint_notes_nothing(tmp_path: Path) -> None:
     def older(header: dict[str, Any]) -> None:
         header["version"] = 5
         ((_, fields),) = header["classes"]
-        assert fields.pop() == "enlarged"
+        assert [fields.pop(), fields.pop()] == ["edges_elsewhere", "enlarged"]
         for part in header["tree"]:
-            part["v"].pop()
+            del part["v"][-2:]
 
     found, _ = CHECKPOINT.read(rewritten(tmp_path / "kept.npz", older))
-    plain = tuple(replace(one, enlarged=None) for one in noted)
+    plain = tuple(replace(one, enlarged=None, edges_elsewhere=None) for one in noted)
     assert list(differences(plain, found)) == []
 
 

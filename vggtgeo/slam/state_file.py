@@ -133,8 +133,9 @@ def _with_fisheyes(header: Header) -> Header:
 
 
 def _with_seen_points(header: Header) -> Header:
-    """Version 11 did not place frames against the points of the map as it is in the end."""
+    """Version 11 did not place frames against the points of the map as it is in the end, nor look at edges of depth."""
     tree, classes = with_field(header["tree"], header["classes"], "FramePose", "seen")
+    tree, classes = with_field(tree, classes, "FrameEvidence", "edges_elsewhere")
     return {**header, "tree": tree, "classes": classes}
 
 

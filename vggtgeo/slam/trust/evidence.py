@@ -20,6 +20,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.edges import EVERY, edges_elsewhere
 from vggtgeo.slam.trust.enlargement import followed_enlargement, matched_corners
 
 WIDTH = 320
@@ -65,7 +66,7 @@ class FrameEvidence:
     image. depth: float32 [m], the sensor's, metres, NaN = none. depth_changed: share of the pixels with depth whose
     depth is not exactly that of the frame before, NaN without depth. contrast: standard deviation of the grey levels.
     enlarged: logarithm of the factor by which the picture is larger than the one before, less what measured depth
-    explains by coming nearer; None where nothing says.
+    explains by coming nearer; None where nothing says. edges_elsewhere: see `edges.py`, of one frame in `EVERY`.
     """
 
     frame: int
@@ -77,6 +78,7 @@ class FrameEvidence:
     depth_changed: float
     contrast: float
     enlarged: float | None = None
+    edges_elsewhere: float | None = None
 
     def through(self, lens: Camera) -> FrameEvidence:
         """The same corners in images that the lens does not distort."""
@@ -183,9 +185,13 @@ class EvidenceRecorder(Callback):
         full = (self._pixels + 0.5) * scale - 0.5
         depth = np.full(len(full), np.nan, np.float32) if frame.depth is None else _read(frame.depth, full)
         ideal = self._camera.undistorted(full).astype(np.float32)
-        numbers = self._ids.copy()
+        numbers, edges = self._ids.copy(), None
+        if frame.depth is not None and len(self._frames) % EVERY == 0:
+            edges = edges_elsewhere(grey, frame.depth, self._left_out)
         self._frames.append(
-            FrameEvidence(frame.index, frame.timestamp, numbers, ideal, depth, median, changed, contrast, enlarged)
+            FrameEvidence(
+                *(frame.index, frame.timestamp, numbers, ideal, depth, median, changed, contrast, enlarged, edges)
+            )
         )
 
     def _of_the_world(self, pixels: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from vggtgeo.slam.trust.change_of_sides import check_sides
 from vggtgeo.slam.trust.contradicted import check_matches
 from vggtgeo.slam.trust.depth_agreement import agree, check_depth, depth_ratios
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
+from vggtgeo.slam.trust.edges import check_edges
 from vggtgeo.slam.trust.enlargement import check_enlargements
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence
@@ -97,6 +98,7 @@ def _images(slam: Slam, estimate: Estimate, evidence: Evidence, size: tuple[int,
     yield from check_depth(estimate, ratios)
     yield from check_frozen(estimate, evidence, harmless=agree(ratios))
     yield from check_range(estimate, evidence)
+    yield from check_edges(estimate, np.array([noted.edges_elsewhere for noted in evidence], np.float64))
     sound = np.ones(len(estimate), bool)
     for part in wrong:
         sound[part.first : part.last + 2] = False
