@@ -61,7 +61,9 @@ def print_table(
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--changes", nargs="*", choices=changes, default=list(changes), help="by default all")
     options = parser.parse_args()
+    changes = {name: changes[name] for name in options.changes}
     print(f"| {' | '.join(('clip', 'input', 'change', *columns))} |\n" + "|---" * (3 + len(columns)) + "|")
     for folder in options.clips:
         for name, sequence in degraded_clips(folder, options.frames, changes, depth_alone):

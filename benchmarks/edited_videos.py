@@ -5,10 +5,11 @@
 
 The first 40 frames of each clip, with depth and without: the picture wanders on the sensor, as behind a lens that is
 stabilised (8 and 20 px); an editor's stabiliser, which moves, turns and scales each picture so that the path of the
-followed corners is smooth (by at most 8 % of the width, 3.4 degrees and 5 %; depth stays where it was); a focus that
-breathes (2 and 5 % of the focal length); writing all over it that shines through; fifteen frames of a title before it;
-a beginning that comes out of the dark; sides filled with an enlarged, blurred copy; a second picture in its corner; a
-screen that was filmed (moire, bands of light). ATE after SE(3) with depth, after Sim(3) without.
+followed corners is smooth (by at most 8 % of the width, 3.4 degrees and 5 %; depth stays where it was); a mirrored
+picture over depth that is not (without depth it is a video of the mirrored room); a focus that breathes (2 and 5 % of
+the focal length); writing all over it that shines through; fifteen frames of a title before it; a beginning that comes
+out of the dark; sides filled with an enlarged, blurred copy; a second picture in its corner; a screen that was filmed
+(moire, bands of light). ATE after SE(3) with depth, after Sim(3) without.
 """
 
 from __future__ import annotations
@@ -55,6 +56,12 @@ def stabilised(recording: Recording, rng: np.random.Generator) -> Recording:
     most = np.array([0.08 * width, 0.08 * width, 0.06, 0.05])
     x, y, turn, scale = np.clip(smooth - path, -most, most).T
     return with_images(recording, lambda image, row: _turned(image, np.exp(scale[row]), turn[row], (x[row], y[row])))
+
+
+def mirrored(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Left is right, as a front camera shows it; depth stays."""
+    del rng
+    return with_images(recording, lambda image, row: np.ascontiguousarray(image[:, ::-1]))
 
 
 SMOOTH = 12
@@ -188,6 +195,7 @@ CHANGES: dict[str, Degradation] = {
     "wanders by 8 px": wandering(8.0),
     "wanders by 20 px": wandering(20.0),
     "stabilised": stabilised,
+    "mirrored": mirrored,
     "breathes by 2 %": breathing(0.02),
     "breathes by 5 %": breathing(0.05),
     **{
