@@ -91,8 +91,8 @@ def run_and_write(
         checkpoints = Checkpoints(folder.checkpoint, bool(output.resume), output.checkpoint_every)
         if output.resume and not folder.checkpoint.is_file():
             typer.echo(f"there is nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)
-        callbacks, url = _rerun_callbacks(output, folder, title, settings.window.size)
-        if callbacks:
+        viewed, url = _rerun_callbacks(output, folder, title, settings.window.size)
+        if viewed:
             settings = updated(settings, {"window": {"record_iterations": True}})
         with as_input_errors(), ProgressBar(console) as bar:
             result = reconstruct(
@@ -105,7 +105,7 @@ def run_and_write(
                 seed=seed,
                 dense=dense,
                 title=title,
-                callbacks=(bar, _EarlyFiles(folder.stage, {**output.flags, **changed(settings)}), *callbacks),
+                callbacks=(bar, _EarlyFiles(folder.stage, {**output.flags, **changed(settings)}), *viewed),
                 facts=facts,
                 warned=warned,
                 checkpoints=checkpoints,
@@ -120,6 +120,8 @@ def run_and_write(
     print_result(console, result, summary, output.folder)
     if output.as_json:
         typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
+    if any(callback.cut_short for callback in viewed):
+        unsaved = unsaved or f"the recording `{output.rerun}` is cut short, as the warning above says"
     if unsaved:
         raise InputError(f"{unsaved}; all other results are in `{output.folder}`")
     if output.rerun == "serve":
@@ -174,7 +176,7 @@ class _EarlyFiles(Callback):
 
 def _rerun_callbacks(
     output: Output, folder: RunFolder, name: str, window: int
-) -> tuple[tuple[Callback, ...], str | None]:
+) -> tuple[tuple[RerunCallback, ...], str | None]:
     """What logs the run, if anything, and where a served run is to be seen; a file in the run's folder grows in its
     stage.
     """
@@ -186,4 +188,4 @@ def _rerun_callbacks(
     opened = open_target(target, name, folder.stage / STAND_IN)
     if opened.url is not None:
         typer.echo(f"follow the run in a browser: {opened.url}", err=True)
-    return (RerunCallback(opened.stream, window),), opened.url
+    return (RerunCallback(opened.stream, window, opened.file),), opened.url

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,7 @@ def view(
     as_json: JsonOption = False,
 ) -> None:
     """Show the run in DIR: path, map, and depth where it was saved."""
-    from vggtgeo.io.errors import InputError
+    from vggtgeo.io.errors import InputError, InputWarning
     from vggtgeo.viewing.folder import check_folder, log_folder, recording_of
     from vggtgeo.viewing.target import check_target, flush, has_screen, open_target
 
@@ -40,7 +41,11 @@ def view(
         log_folder(opened.stream, folder)
     else:
         opened.stream.log_file_from_path(recording)
-    flush(opened.stream)
+    problem = flush(opened.stream, opened.file)
+    if problem and opened.file is not None:
+        raise InputError(problem)
+    if problem:
+        warnings.warn(problem, InputWarning, stacklevel=2)
     if as_json:
         typer.echo(json.dumps({"target": rerun, "shown": str(recording or folder), "url": opened.url}))
     if rerun == "serve":

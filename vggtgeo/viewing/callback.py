@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -24,13 +27,14 @@ from vggtgeo.viewing.target import flush
 class RerunCallback(Callback):
     """Logs to `stream`. Timelines: `frame`, `time` (seconds of the sequence) and `iteration` (tried
     steps of the window's solver, counted through the run). window: keyframes of a window; a pair that is farther apart
-    is a loop.
+    is a loop. file: where the stream goes, if that is a file. cut_short: whether it could not be written to its end,
+    which costs a warning, never the run.
     """
 
-    def __init__(self, stream: Any, window: int = WindowSettings().size):
+    def __init__(self, stream: Any, window: int = WindowSettings().size, file: Path | None = None):
         import rerun as rr
 
-        self.stream = stream
+        self.stream, self._file, self.cut_short = stream, file, False
         self._recorder = WindowRecorder()
         self._window, self._live = window, LiveMap(stream)
         self._keyframes = self._notes = self._iterations = 0
@@ -67,7 +71,9 @@ class RerunCallback(Callback):
         entities.log_map(self.stream, cloud)
         counts = f"{len(slam.frames)} frames, {len(slam.keyframes)} keyframes, {len(cloud)} points in the map"
         entities.log_note(self.stream, f"finished: {counts}", level="INFO")
-        flush(self.stream)
+        if problem := flush(self.stream, self._file):
+            self.cut_short = self._file is not None
+            warnings.warn(problem, InputWarning, stacklevel=2)
 
     @in_double_precision
     def _log_adjusted(self, slam: Slam) -> None:

@@ -16,7 +16,7 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.viewing import entities
-from vggtgeo.viewing.target import STAND_IN, flush
+from vggtgeo.viewing.target import STAND_IN
 
 
 def check_folder(folder: Path) -> None:
@@ -63,7 +63,6 @@ def log_folder(stream: Any, folder: Path) -> None:
         entities.log_mesh(stream, Mesh.load_ply(folder / "mesh.ply"))
     for file in sorted(folder.glob("depth/*.depth.png")):
         _log_depth(stream, file)
-    flush(stream)
 
 
 def _log_depth(stream: Any, file: Path) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import socket
 import sys
 import sysconfig
+import tempfile
 import time
 import warnings
 from dataclasses import dataclass
@@ -27,14 +29,21 @@ WEB_PORT = 9090
 _MAGIC = b"RRF"
 _PATIENCE = 10.0
 """Seconds: for a viewer to open, and for it to take what was logged last."""
+_STANDSTILL = 5.0
+"""Seconds in which a file that is being written grows, on a slow disk, too."""
+_SOME = 2**20
+"""Bytes that a disk with room takes; what Rerun writes first is 30 kB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """A target that is open: `stream` takes what is logged; `url` is where a browser shows a served one."""
+    """A target that is open: `stream` takes what is logged; `url` is where a browser shows a served one, `file` what is
+    written where no viewer listens.
+    """
 
     stream: Any
     url: str | None = None
+    file: Path | None = None
 
 
 def check_target(target: str) -> str:
@@ -70,24 +79,29 @@ def open_target(target: str, name: str, instead: Path) -> Opened:
     import rerun as rr
 
     stream = rr.RecordingStream(APPLICATION)
-    url = None
+    url = file = None
     if check_target(target) == "spawn":
-        _spawn(stream, instead)
+        file = _spawn(stream, instead)
     elif target == "serve":
         url = _serve(stream)
     else:
-        _save(stream, Path(target))
+        file = _save(stream, Path(target))
     stream.send_recording_name(name)
-    return Opened(stream, url)
+    return Opened(stream, url, file)
 
 
-def flush(stream: Any) -> None:
-    """Waits until everything that was logged has arrived; a viewer that is gone costs a warning, never the run."""
-    try:
-        stream.flush(timeout_sec=_PATIENCE)
-    except RuntimeError as error:
-        reason = str(error).splitlines()[0]
-        warnings.warn(f"the Rerun viewer did not take all of the recording ({reason})", InputWarning, stacklevel=2)
+def flush(stream: Any, file: Path | None = None) -> str:
+    """Waits until everything that was logged has arrived; says what went wrong, in a sentence, empty where nothing did.
+
+    Args:
+        stream: as `open_target` gives it.
+        file: where it goes, if that is a file.
+
+    """
+    reason = _unsent(stream, _PATIENCE) if file is None else _unwritten(stream, file)
+    if not reason or file is None:
+        return reason and f"the Rerun viewer did not take all of the recording ({reason})"
+    return f"the recording `{file}` is cut short: {reason}; make room there, or give another file"
 
 
 def has_screen() -> bool:
@@ -97,20 +111,67 @@ def has_screen() -> bool:
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))
 
 
-def _save(stream: Any, path: Path) -> None:
+def _save(stream: Any, path: Path) -> Path:
+    """The file, asked for first whether the disk takes it: else Rerun may wait for ever, see `_unwritten`."""
     make_parent(path)
     try:
-        stream.save(path, default_blueprint=blueprint())
+        reason = _refused(path.parent)
+        if not reason:
+            stream.save(path, default_blueprint=blueprint())
     except RuntimeError as error:
-        raise InputError(f"`--rerun` is `{path}`, which cannot be written: {str(error).splitlines()[0]}") from None
+        reason = str(error).splitlines()[0]
+    if reason:
+        raise InputError(f"`--rerun` is `{path}`, which cannot be written: {reason}")
+    return path
 
 
-def _spawn(stream: Any, instead: Path) -> None:
+def _unsent(stream: Any, seconds: float) -> str:
+    try:
+        stream.flush(timeout_sec=seconds)
+    except RuntimeError as error:
+        return str(error).splitlines()[0]
+    return ""
+
+
+def _unwritten(stream: Any, file: Path) -> str:
+    """Why the file is not whole.
+
+    Rerun's thread that writes it ends at the first error. A flush that was sent before is then never answered
+    (rerun-sdk 0.41), and whatever ends the stream waits for that one. So once the file no longer grows, it is given up.
+    """
+    size = -1
+    while reason := _unsent(stream, _STANDSTILL):
+        before, size = size, file.stat().st_size if file.is_file() else 0
+        if size <= before:
+            _leave_open(stream)
+            return _refused(file.parent) or reason
+    return ""
+
+
+def _leave_open(stream: Any) -> None:
+    """Rerun waits neither at the end of the program nor where the stream is deleted: one reference more keeps it."""
+    import rerun as rr
+
+    rr.unregister_shutdown()
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
+
+
+def _refused(folder: Path) -> str:
+    """What the system says of one more file there; empty where it takes it."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(bytes(_SOME))
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def _spawn(stream: Any, instead: Path) -> Path | None:
     """A window, or the file `instead` where none opens."""
     reason = "there is no screen" if not has_screen() else _start_viewer(stream)
     if reason is None:
         stream.connect_grpc(default_blueprint=blueprint())
-        return
+        return None
     _save(stream, instead)
     warnings.warn(
         f"{reason}, so the recording goes to `{instead}`; look at it with `rerun {instead}` where there is one, or "
@@ -118,6 +179,7 @@ def _spawn(stream: Any, instead: Path) -> None:
         InputWarning,
         stacklevel=2,
     )
+    return instead
 
 
 def _start_viewer(stream: Any) -> str | None:
