@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 from vggtgeo.solvers.arrow import ArrowSystem, carry_to_nodes, dense_gradient, inverse_landmark_hessian
 from vggtgeo.solvers.block_band import (
@@ -15,7 +14,7 @@ from vggtgeo.solvers.block_band import (
     assemble_bands,
     factorise,
 )
-from vggtgeo.solvers.flat_directions import MIN_DIAGONAL, flat_stiffness, pins
+from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, pins
 
 
 class Bands(eqx.Module):
@@ -35,8 +34,7 @@ def prepare_bands(system: ArrowSystem, layout: BandLayout) -> Bands:
     hessian, schur = assemble_bands(system, layout)
     gradient, diagonal = dense_gradient(system)
     schur_gradient = carry_to_nodes(system, inverse_landmark_hessian(system) * system.landmark_gradient)
-    diagonal = jnp.maximum(diagonal, MIN_DIAGONAL)
-    return Bands(layout, hessian, schur, gradient, schur_gradient, diagonal, flat_stiffness(system))
+    return Bands(layout, hessian, schur, gradient, schur_gradient, at_least(diagonal), flat_stiffness(system))
 
 
 def damped_band(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandMatrix:

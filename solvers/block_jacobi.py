@@ -18,7 +18,7 @@ from vggtgeo.solvers.arrow import (
     dense_gradient,
     host_products,
 )
-from vggtgeo.solvers.flat_directions import MIN_DIAGONAL
+from vggtgeo.solvers.flat_directions import at_least
 
 
 class DiagonalLayout(AbstractLayout):
@@ -53,7 +53,7 @@ def prepare_blocks(system: ArrowSystem) -> JacobiBlocks:
     _, diagonal = dense_gradient(system)
     hessian = add_prior_blocks(assemble_edges(system, DiagonalLayout()), system, DiagonalLayout())
     schur = assemble_hosts(system, host_products(system), DiagonalLayout())
-    return JacobiBlocks(_diagonal(hessian), _diagonal(schur), jnp.maximum(diagonal, MIN_DIAGONAL))
+    return JacobiBlocks(_diagonal(hessian), _diagonal(schur), at_least(diagonal))
 
 
 def invert_blocks(system: ArrowSystem, blocks: JacobiBlocks, damping: Float[Array, ""]) -> DiagonalBlocks:

@@ -30,7 +30,7 @@ from vggtgeo.solvers.arrow import (
 from vggtgeo.solvers.bands import Bands, factorise_bands, prepare_bands
 from vggtgeo.solvers.block_band import band_layout, solve_band
 from vggtgeo.solvers.block_jacobi import JacobiBlocks, apply_blocks, invert_blocks, prepare_blocks
-from vggtgeo.solvers.flat_directions import MIN_DIAGONAL, flat_stiffness, free_gauge
+from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, free_gauge
 from vggtgeo.solvers.local_inverse import LocalInverse, local_coordinates
 from vggtgeo.solvers.minres import MinresSolved, minres
 from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, predicted_decrease
@@ -165,7 +165,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
             preconditioner=self.preconditioner.prepare(system),
             gradient=gradient,
             schur_gradient=eliminated,
-            diagonal=jnp.maximum(diagonal, MIN_DIAGONAL),
+            diagonal=at_least(diagonal),
             stiffness=flat_stiffness(system),
         )
 

@@ -15,7 +15,7 @@ from vggtgeo.solvers.arrow import (
     dense_gradient,
     inverse_landmark_hessian,
 )
-from vggtgeo.solvers.flat_directions import MIN_DIAGONAL
+from vggtgeo.solvers.flat_directions import at_least
 from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, DenseCholesky
 
 
@@ -64,4 +64,4 @@ def exact_model(
     """
     solver = DenseCholesky() if solver is None else solver
     factor = solver.factor(system, (lambda: system) if definite is None else definite)
-    return ExactModel(system, factor, jnp.maximum(dense_gradient(system)[1], MIN_DIAGONAL))
+    return ExactModel(system, factor, at_least(dense_gradient(system)[1]))

@@ -10,7 +10,15 @@ from jaxtyping import Array, Float
 from vggtgeo.solvers.arrow import ArrowSystem, Reduced, couple, hessian_times, inverse_landmark_hessian
 
 MIN_DIAGONAL = 1e-6
-"""Least curvature that damping and scaling assume of a coordinate."""
+"""Least curvature that damping and scaling assume of a coordinate, where the largest is 1 or more."""
+
+
+def at_least(diagonal: Float[Array, " c"]) -> Float[Array, " c"]:
+    """The diagonal of a Hessian, no smaller than the least curvature; that shrinks with the largest, so that a tiny
+    factor on all weights does not change what the damping is in proportion.
+    """
+    largest = jnp.max(diagonal, initial=0.0)
+    return jnp.maximum(diagonal, MIN_DIAGONAL * jnp.where(largest > 0, jnp.minimum(largest, 1.0), 1.0))
 
 
 def free_gauge(system: ArrowSystem) -> Float[Array, "c g"]:

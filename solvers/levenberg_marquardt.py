@@ -153,7 +153,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     rtol: float = 1e-9
     """Relative decrease of the energy that ends the iteration."""
     atol: float = 1e-12
-    """Gradient norm, in units of the scaled step, that ends the iteration."""
+    """Gradient norm, in units of the scaled step, that ends the iteration; where all curvatures are below 1 it counts
+    in the root of the largest, so that weights that are all tiny do not look like an optimum."""
     norm: Callable = optx.max_norm
     max_iterations: int = 50
     """Tries in all, accepted or not."""
@@ -251,7 +252,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             linearisations=state.linearisations + 1,
             gradient_norm=gradient_norm,
             history=last.history,
-            termination=self._terminate(state.energy, last, gradient_norm),
+            termination=self._terminate(state.energy, last, gradient_norm, _largest_curvature(system)),
             polished=state.polished,
             gradient_residual=gradient_norm,
             record=last.record,
@@ -338,14 +339,23 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         kept = jnp.where(at_once & (last.gain > 0.5), state.correction, less)
         return jnp.where(at_once & (last.gain > 0.9), more, kept)
 
-    def _terminate(self, energy: Float[Array, ""], last: _Try, gradient_norm: Float[Array, ""]) -> Termination:
+    def _terminate(
+        self,
+        energy: Float[Array, ""],
+        last: _Try,
+        gradient_norm: Float[Array, ""],
+        curvature: Float[Array, ""],
+    ) -> Termination:
+        # The gradient norm and this unit both go with the root of a factor on all weights. A problem in pixels or in
+        # standard deviations has curvatures far above 1, and there the unit is 1.
+        unit = jnp.sqrt(jnp.minimum(curvature, 1.0))
         small = last.accepted & (energy - last.energy <= self.rtol * energy)
         options = [
             (last.iterations >= self.max_iterations, _CODES.max_iterations),
             (small, _CODES.energy_converged),
             (last.stuck, _CODES.step_converged),
             (last.stuck & ~last.finite, _CODES.nonfinite_step),
-            (gradient_norm <= self.atol, _CODES.gradient_converged),
+            (gradient_norm <= self.atol * unit, _CODES.gradient_converged),
         ]
         termination: Termination = _CODES.running
         for happened, code in options:
@@ -371,3 +381,9 @@ def _gradient_norm(system: ArrowSystem) -> Float[Array, ""]:
     landmarks = landmarks if system.held is None else jnp.where(system.held, 0.0, landmarks)
     dense = jnp.where(system.free, scaled(*dense_gradient(system)), 0.0)
     return jnp.maximum(jnp.max(jnp.abs(landmarks), initial=0.0), jnp.max(jnp.abs(dense), initial=0.0))
+
+
+def _largest_curvature(system: ArrowSystem) -> Float[Array, ""]:
+    """Largest diagonal entry of the Hessian among the coordinates that may move."""
+    dense = jnp.where(system.free, dense_gradient(system)[1], 0.0)
+    return jnp.maximum(jnp.max(system.landmark_hessian, initial=0.0), jnp.max(dense, initial=0.0))

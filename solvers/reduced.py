@@ -12,7 +12,7 @@ import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, Reduced, back_substitute, reduce
 from vggtgeo.solvers.dense_inverse import dense_inverse
-from vggtgeo.solvers.flat_directions import MIN_DIAGONAL, gauge_stiffness
+from vggtgeo.solvers.flat_directions import at_least, gauge_stiffness
 from vggtgeo.solvers.local_inverse import LocalInverse
 
 Prepared = TypeVar("Prepared", bound=eqx.Module)
@@ -115,7 +115,7 @@ def damping_diagonal(diagonal: Float[Array, " c"], free: Bool[Array, " c"]) -> F
     gradient drive it away: cameras slid 1.6 m along parallel lines in float32.
     """
     largest = jnp.max(jnp.where(free, diagonal, 0.0), initial=0.0)
-    return jnp.maximum(diagonal, jnp.maximum(jnp.finfo(diagonal.dtype).eps * largest, MIN_DIAGONAL))
+    return jnp.maximum(at_least(diagonal), jnp.finfo(diagonal.dtype).eps * largest)
 
 
 def solve_free(matrix: Float[Array, "c c"], rhs: Float[Array, " c"], free: Bool[Array, " c"]) -> Float[Array, " c"]:
