@@ -19,6 +19,7 @@ from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
+from vggtgeo.io.given import check_kind
 
 
 class State(eqx.Module):
@@ -126,7 +127,13 @@ class Problem(eqx.Module):
         raise AttributeError(f"`Problem` has no attribute and no term `{name}`")
 
     def with_term(self, term: AbstractTerm) -> Problem:
-        """The problem with `term` in place of the one of the same name, or added as the last."""
+        """The problem with `term` in place of the one of the same name, or added as the last.
+
+        Raises:
+            InputError: it is no term.
+
+        """
+        check_kind("term", term, AbstractTerm, "a term, such as `vggtgeo.PointTerm`")
         names = [old.name for old in self.terms]
         terms = tuple(term if old.name == term.name else old for old in self.terms)
         return self.with_terms(terms if term.name in names else (*terms, term))
@@ -136,7 +143,15 @@ class Problem(eqx.Module):
         return self.with_terms(tuple(term for term in self.terms if term.name != name))
 
     def with_terms(self, terms: tuple[AbstractTerm, ...]) -> Problem:
-        """The problem with other terms."""
+        """The problem with other terms.
+
+        Raises:
+            InputError: they are no tuple of terms.
+
+        """
+        check_kind("terms", terms, tuple, "a tuple of terms")
+        for term in terms:
+            check_kind("terms", term, AbstractTerm, "terms in it, such as `vggtgeo.PointTerm`")
         return eqx.tree_at(lambda problem: problem.terms, self, terms)
 
     @property

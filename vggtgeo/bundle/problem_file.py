@@ -21,6 +21,7 @@ from vggtgeo.bundle.saved_modules import check_problem, describe, restore
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
+from vggtgeo.io.given import path_of
 from vggtgeo.solvers.kernels import Huber
 
 DESCRIPTION = "description"
@@ -72,9 +73,10 @@ def load_problem(
         vggtgeo.io.errors.InputError: `no.npz` is no file; give that of a bundle-adjustment problem
 
     """
-    arrays = _read(Path(path))
+    path = path_of("path", path)
+    arrays = _read(path)
     if DESCRIPTION in arrays:
-        return _restored(Path(path), arrays, terms, dtype)
+        return _restored(path, arrays, terms, dtype)
     observations = Observations(
         edges=arrays["edges"].astype(int),
         host=arrays["var_kf"].astype(int),

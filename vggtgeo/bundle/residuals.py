@@ -19,6 +19,7 @@ from vggtgeo.bundle.objective import (
     relative_poses,
     view_of,
 )
+from vggtgeo.bundle.pair_checks import check_kinds
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm, node_residuals
@@ -112,6 +113,7 @@ def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."
         ((240, 2), 0.5)
 
     """
+    check_kinds(problem, state)
     return _residuals_jit(problem, state)
 
 

@@ -137,6 +137,8 @@ def solve(
     """
     check_pair(problem, initial, "initial")
     check_kind("solver", solver, SchurLevenbergMarquardt | None, "a `vggtgeo.SchurLevenbergMarquardt`")
+    check_kind("adjoint", adjoint, optx.AbstractAdjoint | None, "a `vggtgeo.ArrowAdjoint`")
+    check_kind("graduation", graduation, Graduation | None, "a `vggtgeo.Graduation`")
     check_observed(problem)
     solver = default_solver(problem) if solver is None else solver
     return _solve_jit(problem, initial, solver, ArrowAdjoint() if adjoint is None else adjoint, graduation)

@@ -11,6 +11,7 @@ import numpy as np
 from vggtgeo.bundle.node_order import narrow_order
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.terms.node import PairTerm
+from vggtgeo.io.given import check_kind
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
@@ -45,6 +46,7 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
         DenseCholesky()
 
     """
+    check_kind("problem", problem, Problem, "a `Problem`, the first of what `vggtgeo.pack` gives")
     if problem.num_keyframes <= DENSE_LIMIT or problem.dense_terms:
         return DenseCholesky()
     ends, alone = coupled_pairs(problem)

@@ -3,6 +3,7 @@
 import os
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Protocol
@@ -30,6 +31,7 @@ from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.views import with_rate
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import path_of
 
 
 class FolderReader(Protocol):
@@ -87,12 +89,11 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
     """
     if kind is not None and kind not in KINDS:
         raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(KINDS)}")
+    place = path_of("path", path)
     if kind == "camera" or (kind is None and is_live(os.fspath(path))):
         return LiveCamera.open(os.fspath(path))
-    try:
-        place = Path(path).expanduser()
-    except RuntimeError:  # `~name` of a user whom this computer does not know, or no home folder at all
-        place = Path(path)
+    with suppress(RuntimeError):  # `~name` of a user whom this computer does not know, or no home folder at all
+        place = place.expanduser()
     sequence = _open_place(place, kind)
     if sequence.camera.known:
         check_plausible(f"the camera of `{os.fspath(path)}`", sequence.camera)

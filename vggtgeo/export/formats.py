@@ -15,6 +15,7 @@ from vggtgeo.export.nerfstudio import write_nerfstudio
 from vggtgeo.export.paths import write_kitti, write_tum
 from vggtgeo.export.surfaces import write_glb, write_las, write_ply
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.given import path_of
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.summary_file import read_summary
 
@@ -50,12 +51,12 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
             package is not installed.
 
     """
-    place = Path(source)
+    place = path_of("source", source)
     if to not in FORMATS:
         raise InputError(f"`to` is {to!r}; it must be one of {', '.join(FORMATS)}")
     if not (place / "summary.json").is_file():
         raise InputError(f"`{place}` holds no run (no `summary.json`); give a folder that `vggtgeo run` wrote")
-    output = Path(target) if target is not None else place / "export" / to
+    output = path_of("target", target) if target is not None else place / "export" / to
     _check_target(output, place)
     verdict = read_summary(place)[1]
     failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""

@@ -12,6 +12,7 @@ from plyfile import PlyData, PlyElement
 from vggtgeo.geometry.point_cloud import UNREADABLE, check_head
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
+from vggtgeo.io.given import path_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,7 @@ class Mesh:
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> Mesh:
         """Reads what `save_ply` wrote."""
+        path = path_of("path", path)
         try:
             _check_counts(path)
             data = PlyData.read(os.fspath(path), known_list_len={"face": {"vertex_indices": 3}})

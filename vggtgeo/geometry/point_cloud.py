@@ -9,6 +9,7 @@ from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
+from vggtgeo.io.given import path_of
 
 LONGEST_HEAD = 65_536
 UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyHeaderParseError, PlyParseError)
@@ -74,6 +75,7 @@ class PointCloud:
         """Reads the points, colours (black where there are none), confidence and normals of a PLY file; InputError for
         any file that holds no such points.
         """
+        path = path_of("path", path)
         try:
             check_head(path)
             vertices = PlyData.read(os.fspath(path))["vertex"].data

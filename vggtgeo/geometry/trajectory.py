@@ -6,7 +6,6 @@ A line of the file is `timestamp tx ty tz qx qy qz qw`: seconds, metres, unit qu
 import os
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
-from vggtgeo.io.given import real_numbers
+from vggtgeo.io.given import path_of, real_numbers
 from vggtgeo.io.text_files import whole_text
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
@@ -133,7 +132,7 @@ def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
 
 
 def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:
-    file = Path(path)
+    file = path_of("path", path)
     if not file.is_file():
         raise InputError(f"`{file}` is not there or is no file; give a trajectory in the TUM format")
     rows = []

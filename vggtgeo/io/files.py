@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from vggtgeo.io.given import path_of
+
 
 def make_parent(path: Path) -> None:
     """Makes the folder that `path` lies in, and those above it."""
@@ -26,7 +28,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     For writers that want a file name (OpenCV, numpy, matplotlib). Missing parent folders are made.
     """
-    target = Path(path)
+    target = path_of("path", path)
     target.parent.mkdir(parents=True, exist_ok=True)
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, "it is a folder; give the name of a file", str(target))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import numbers
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,24 @@ def check_kind(name: str, given: Any, kind: Any, expected: str) -> None:
     """InputError unless `given` is of this type, or one of these; `expected` says what is, and how to come by one."""
     if not isinstance(given, kind):
         raise InputError(f"`{name}` is of the type `{type(given).__name__}`; expected {expected}")
+
+
+def path_of(name: str, given: Any) -> Path:
+    """The path that was given, as a text or an `os.PathLike`; whether anything is there is for the caller to ask.
+
+    Raises:
+        InputError: it is of another kind, bytes among them; or empty, which would mean the working folder; or no file
+            system has such a name.
+
+    """
+    found = os.fspath(given) if isinstance(given, str | os.PathLike) else given
+    if not isinstance(found, str):
+        raise InputError(f"`{name}` is {given!r:.60}; expected a path: a text, or a `pathlib.Path`")
+    if not found:
+        raise InputError(f"`{name}` is empty, which would mean the working folder; give a path")
+    if "\0" in found:
+        raise InputError(f"`{name}` is {given!r:.60}, which has a zero byte in it; give a path")
+    return Path(found)
 
 
 def check_whole(name: str, given: Any, least: int = 0, most: int | None = None) -> None:

@@ -25,6 +25,7 @@ from vggtgeo.bundle.problem_file import load_arrays, save_problem
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open, write_json
+from vggtgeo.io.given import path_of
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
@@ -66,7 +67,7 @@ class WindowWriter:
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = Path(folder)
+        self.folder = path_of("folder", folder)
         self.count = 0
         self._shape: Any = None
 
@@ -148,7 +149,7 @@ class WindowDataset:
     @classmethod
     def open(cls, folder: str | os.PathLike[str], terms: Sequence[type] = ()) -> Self:
         """Reads the index that `WindowWriter` left; InputError where there is none, as a writer did not end."""
-        place = Path(folder)
+        place = path_of("folder", folder)
         try:
             index = json.loads(whole_text(place / _INDEX, errors="strict"))
             return cls(place, int(index["windows"]), tuple(terms))

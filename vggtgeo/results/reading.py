@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 from vggtgeo.datasets import Sequence, open_sequence
@@ -11,7 +10,7 @@ from vggtgeo.datasets.trajectory_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind
+from vggtgeo.io.given import check_kind, path_of
 from vggtgeo.results.result import Result
 
 
@@ -29,7 +28,7 @@ def read(path: str | os.PathLike[str]) -> Result | Sequence:
         vggtgeo.io.errors.InputError: `no/such/place` does not exist; give a folder of images or a video file
 
     """
-    if (Path(path) / "summary.json").is_file():
+    if (path_of("path", path) / "summary.json").is_file():
         return Result.load(path)
     return open_sequence(path)
 
@@ -67,7 +66,7 @@ def _estimate(given: Any, truth: Trajectory) -> Trajectory:
         return given
     if isinstance(given, Result):
         return given.trajectory
-    place = Path(given)
+    place = path_of("estimate", given)
     return load_trajectory(place / "trajectory.txt" if place.is_dir() else place, truth)
 
 
@@ -75,7 +74,7 @@ def _truth(given: Any) -> Trajectory:
     if isinstance(given, Trajectory):
         return given
     if isinstance(given, str | os.PathLike):
-        if Path(given).is_file():
+        if path_of("truth", given).is_file():
             return load_trajectory(given)
         given = open_sequence(given)
     check_kind("truth", given, Sequence, "a trajectory, a sequence with truth, or where one of them lies")

@@ -22,6 +22,7 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
+from vggtgeo.io.given import path_of
 from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
 from vggtgeo.results.every_depth import every_depth
@@ -152,7 +153,7 @@ class Result:
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Self:
         """Reads the folder that `Result.save` or `vggtgeo run` wrote; InputError where a file of it is missing."""
-        place = Path(folder)
+        place = path_of("folder", folder)
         unfinished = check_finished(place)
         if unfinished:
             warnings.warn(unfinished, InputWarning, stacklevel=2)
