@@ -17,6 +17,8 @@ import tiny_sequences as tiny
 from bad_row import Row, read_frames, rows
 from bad_rows_files import OPENED
 
+from vggtgeo.datasets import open_sequence
+
 SIZE = (bad.WIDTH, bad.HEIGHT)
 PICTURE = bad.picture(1)
 NUL = b"\0"
@@ -92,6 +94,29 @@ def two_in_one(folder: Path) -> Path:
     for name in ("left", "right"):
         bad.frames(folder / "download" / "stereo" / name)
     return folder / "download"
+
+
+def as_jpeg(folder: Path, count: int = 3) -> None:
+    """The first pictures once more, as JPEG."""
+    for row in range(count):
+        cv2.imwrite(str(folder / f"{row}.jpg"), cv2.imread(str(folder / f"{row}.png")))
+
+
+def masks(folder: Path) -> None:
+    """Of each picture a black square on white."""
+    for row in range(3):
+        mask = np.full((bad.HEIGHT, bad.WIDTH), 255, np.uint8)
+        mask[10:20, 10:20] = 0
+        cv2.imwrite(str(folder / f"{row}.bmp"), mask)
+
+
+def frame_names(folder: Path) -> None:
+    """All frames, each file once, as many as there are pictures: of two formats of the same ones only the PNG."""
+    names = [frame.name for frame in open_sequence(folder).frames()]
+    formats = {Path(name).suffix for name in names}
+    whole = [path for path in folder.iterdir() if path.suffix in formats]
+    assert len(names) == len(set(names)) == len(whole)
+    assert formats == {".png"} if len(names) == 3 else len(formats) == 2
 
 
 def without_half(folder: Path) -> None:
@@ -201,6 +226,15 @@ DEPTH = rows(
     ],
     call=read_frames,
 )
+DOUBLES = rows(
+    "Images",
+    [
+        ("each picture as PNG and as JPEG", beside(as_jpeg)),
+        ("some pictures as PNG and as JPEG", beside(lambda folder: as_jpeg(folder, 2))),
+        ("a mask of each picture under its name", beside(masks)),
+    ],
+    call=frame_names,
+)
 LISTS = rows(
     "Lists and poses",
     [
@@ -264,4 +298,4 @@ VIDEOS = rows(
     ],
     call=read_frames,
 )
-STRANGERS: list[Row] = [*IMAGES, *DEPTH, *LISTS, *CALIBRATION, *VIDEOS]
+STRANGERS: list[Row] = [*IMAGES, *DEPTH, *DOUBLES, *LISTS, *CALIBRATION, *VIDEOS]

@@ -1,5 +1,6 @@
 """Bad input to the readers: a clear error, or a clear warning and on with the rest."""
 
+import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,7 @@ import tiny_sequences as tiny
 
 from vggtgeo.datasets import Frame, Sequence, open_sequence
 from vggtgeo.datasets.image_files import read_image
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 
 def _read(sequence: Sequence) -> tuple[list[Frame], list[str]]:
@@ -263,3 +264,39 @@ def test_a_video_cut_off_gives_its_frames_and_a_warning(tmp_path: Path) -> None:
     frames, said = _read(open_sequence(tmp_path / "clip.avi"))
     assert 5 <= len(frames) < 15
     assert any("ends after" in text for text in said)
+
+
+def test_a_place_that_may_not_be_read_is_told_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a folder and of a file, before anything looks for a layout in them. Oracle: the error; the system's answer
+    stands in the place of permissions, which the super-user does not feel.
+    """
+    folder, video = tmp_path / "frames", tmp_path / "clip.mp4"
+    tiny.images(folder, ("0.png",))
+    video.write_bytes(b"")
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    for place in (folder, video):
+        with pytest.raises(InputError, match=f"{place.name}` may not be read by this user"):
+            open_sequence(place)
+
+
+@pytest.mark.parametrize("name", ["clip_0.db3", "clip_0.mcap"])
+def test_a_bag_without_its_metadata_is_told_as_such(name: str, tmp_path: Path) -> None:
+    """The file alone, and its folder; oracle: the error."""
+    (tmp_path / name).write_bytes(b"SQLite format 3")
+    for place in (tmp_path / name, tmp_path):
+        with pytest.raises(InputError, match=rf"{name}` is of a ROS 2 bag, and `metadata.yaml`, .*ros2 bag reindex"):
+            open_sequence(place)
+
+
+def test_a_folder_that_goes_away_is_told_once(tmp_path: Path) -> None:
+    """Deleted after the second of five frames: one sentence, with the count of what is left out, in place of one for
+    each. Oracle: the count by hand.
+    """
+    folder = tmp_path / "frames"
+    tiny.images(folder, tuple(f"{row}.png" for row in range(5)))
+    frames = open_sequence(folder).frames()
+    assert [next(frames).index, next(frames).index] == [0, 1]
+    shutil.rmtree(folder)
+    with pytest.warns(LeftOutWarning, match="frames` is no longer there: .* the last 3 of 5 frames are left") as caught:
+        assert list(frames) == []
+    assert [warning.message.frames for warning in caught] == [3]

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import onnx
 import pytest
 import tiny_networks as tiny
+from onnx import TensorProto, helper
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
 from vggtgeo.models.onnx.graph_bytes import external_files
@@ -52,6 +54,29 @@ def test_each_network_is_recognised_by_its_signature(files: dict[str, Path], nam
     inputs, outputs, metadata = read_signature(files[name])
     assert recognise(inputs, outputs) == [name]
     assert metadata == {"vggtgeo.network": name, "vggtgeo.weights": "random"}
+
+
+@pytest.mark.parametrize(
+    ("operator", "domain", "imported", "named"),
+    [
+        ("Evil", "evil.corp", False, "evil.corp:Evil"),
+        ("Evil", "evil.corp", True, "evil.corp:Evil"),
+        ("Evil", "", True, "Evil"),
+    ],
+)
+def test_an_operator_that_is_not_known_is_named(
+    operator: str, domain: str, imported: bool, named: str, tmp_path: Path
+) -> None:
+    """Not as a file that is cut off, which fetching it again would mend. Oracle: the operator's name."""
+    value = lambda name: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3])
+    node = helper.make_node(operator, ["image"], ["y"], domain=domain)
+    opsets = [helper.make_opsetid("", 17), *([helper.make_opsetid(domain, 1)] if domain and imported else [])]
+    graph = helper.make_graph([node], "tiny", [value("image")], [value("y")])
+    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=9), tmp_path / "net.onnx")
+    with pytest.raises(
+        NetworkFileError, match=rf"net.onnx` uses the operator `{named}`, which onnxruntime \S+ does not"
+    ):
+        read_signature(tmp_path / "net.onnx")
 
 
 def _truncated(path: Path) -> None:

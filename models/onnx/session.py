@@ -275,6 +275,11 @@ def _why_not_opened(path: Path, message: str) -> str:
             "copy them again, or export it again"
         )
     reason = " ".join(message.split())
+    if unknown := _unknown_operator(reason):
+        return (
+            f"`{path}` uses the operator `{unknown}`, which onnxruntime {onnxruntime.__version__} does not know; "
+            "export it again with standard operators, or update onnxruntime"
+        )
     reason = f"onnxruntime: {reason if len(reason) < 200 else '... ' + reason[-200:]}"
     if "xternal" in message and ("data" in message or "initializer" in message):
         return (
@@ -285,6 +290,17 @@ def _why_not_opened(path: Path, message: str) -> str:
         f"`{path}` is not an ONNX file that can be read: expected a whole one, found {path.stat().st_size} bytes that "
         f"are cut off or something else; export or fetch it again ({reason})"
     )
+
+
+def _unknown_operator(message: str) -> str | None:
+    """Of an error that says that a node's operator, its version or its domain is none that is known."""
+    node = re.search(r'In Node, \("[^"]*", ([\w.]+), "([\w.]*)"', message)
+    if node and re.search(r"No opset import for domain|No Op registered|is not a registered function", message):
+        return f"{node[2]}:{node[1]}" if node[2] else node[1]
+    named = re.search(r"Fatal error: ([\w.]*:?[\w.]+)\(-?\d+\) is not a registered", message) or re.search(
+        r"(?:No Op registered for|Could not find an implementation for) ([\w.]+)", message
+    )
+    return named and named[1]
 
 
 def _signatures(nodes: Iterable[Any]) -> Signatures:

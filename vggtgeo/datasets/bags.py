@@ -27,11 +27,29 @@ from vggtgeo.models.extras import install_hint
 _DELAY = 0.02
 """Seconds between an image and its depth."""
 _BEGINS = b"#ROSBAG V"
+METADATA = "metadata.yaml"
+ROS_2 = (".db3", ".mcap")
+"""Suffixes of the files that lie beside a `metadata.yaml`."""
 
 
 def is_bag(path: Path) -> bool:
     """Whether `path` is a ROS 1 bag (a file `.bag`) or a ROS 2 bag (a folder with `metadata.yaml`, `.db3`, `.mcap`)."""
-    return path.suffix in (".bag", ".db3", ".mcap") or (path / "metadata.yaml").is_file()
+    return path.suffix in (".bag", *ROS_2) or (path / METADATA).is_file()
+
+
+def lacks_metadata(folder: Path) -> str | None:
+    """A sentence about the files of a ROS 2 bag that were copied without the one that tells what they hold; None where
+    there are none such.
+    """
+    if not folder.is_dir() or (folder / METADATA).is_file():
+        return None
+    file = next((path for path in sorted(folder.iterdir()) if path.suffix in ROS_2), None)
+    if file is None:
+        return None
+    return (
+        f"`{file}` is of a ROS 2 bag, and `{METADATA}`, which belongs beside it, is not there; copy it, too, or make "
+        f"it again with `ros2 bag reindex {folder}`"
+    )
 
 
 @dataclass(frozen=True)
@@ -135,7 +153,9 @@ def _reader(path: Path) -> Iterator[Any]:
         with path.open("rb") as file:
             if not file.read(len(_BEGINS)) == _BEGINS:
                 raise InputError(f"`{path}` is no bag of ROS: it does not begin with `{_BEGINS.decode()}`")
-    place = path.parent if path.suffix in (".db3", ".mcap") else path
+    place = path.parent if path.suffix in ROS_2 else path
+    if reason := lacks_metadata(place):
+        raise InputError(reason)
     try:
         with AnyReader([place], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader

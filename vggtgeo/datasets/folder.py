@@ -100,7 +100,15 @@ class FolderSequence:
         empty = 0
         bits = 8
         turned = False
-        for file in files:
+        for number, file in enumerate(files):
+            if not file.image.exists() and not self.folder.exists():
+                left = len(files) - number
+                text = (
+                    f"`{self.folder}` is no longer there: it was moved or deleted while it was read; the last "
+                    f"{left} of {len(files)} frames are left out"
+                )
+                warnings.warn(LeftOutWarning(text, left), stacklevel=3)
+                break
             read = self._read_image(file, bits)
             if read is None:
                 continue

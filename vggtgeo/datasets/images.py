@@ -6,15 +6,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+import cv2
+import numpy as np
+
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, read_image
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 
 FRAMES_PER_SECOND = 30.0
 _SECONDS = re.compile(r"\d+\.\d+")
 _NANOSECONDS = re.compile(r"\d{18,19}")
+_PREFERRED = (".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp", ".jpg", ".jpeg")
+"""Of two formats of the same pictures: what loses nothing first."""
+_SMALL = (64, 64)
+_ALIKE = 0.95
+"""Correlation of two files of one picture; a colour image and its depth or mask have less."""
 _NUMBERED = re.compile(r"[^0-9]*([0-9]{1,15})")
 
 
@@ -37,6 +45,7 @@ class ImageFolder(FolderSequence):
         images = image_files(folder)
         if not images:
             raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
+        images = _without_doubles(folder, images)
         _tell_of_more(folder, len(images))
         times = times_by_name(images)
         files = tuple(
@@ -50,6 +59,38 @@ class ImageFolder(FolderSequence):
         """The true poses, if the folder has them."""
         file = self.folder / "groundtruth.txt"
         return Trajectory.load_tum(file) if file.exists() else None
+
+
+def _without_doubles(folder: Path, images: list[Path]) -> list[Path]:
+    """One file of each picture, where every picture lies there in the same two formats, as a converter or a camera
+    leaves it (`1.jpg`, `1.png`); told in a note. Pairs of different pictures, colour and a mask, say, stay.
+    """
+    formats = sorted({image.suffix.lower() for image in images}, key=_PREFERRED.index)
+    if len(formats) != 2:
+        return images
+    first, second = ([image for image in images if image.suffix.lower() == suffix] for suffix in formats)
+    if [image.stem for image in first] != [image.stem for image in second]:
+        return images
+    ends = sorted({0, len(first) // 2, len(first) - 1})
+    if not all(_show_the_same(first[row], second[row]) for row in ends):
+        return images
+    warnings.warn(
+        f"`{folder}`: each of {len(first)} pictures lies there twice, as `{formats[0]}` and as `{formats[1]}`: the "
+        f"`{formats[0]}` are read",
+        NoteWarning,
+        stacklevel=4,
+    )
+    return first
+
+
+def _show_the_same(one: Path, other: Path) -> bool:
+    """Whether two files are of one picture, whatever their size, tone and compression."""
+    try:
+        small = [cv2.resize(read_image(path), _SMALL, interpolation=cv2.INTER_AREA) for path in (one, other)]
+    except InputError:
+        return False
+    first, second = (picture.astype(float).ravel() - picture.mean() for picture in small)
+    return bool(first @ second >= _ALIKE * np.sqrt((first @ first) * (second @ second)))
 
 
 def _tell_of_more(folder: Path, count: int) -> None:

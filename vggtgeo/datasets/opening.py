@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
-from vggtgeo.datasets.bags import RosBag, is_bag
+from vggtgeo.datasets.bags import RosBag, is_bag, lacks_metadata
 from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim
@@ -111,6 +111,11 @@ def is_readable(place: Path) -> bool:
 def _open_place(place: Path, kind: str | None) -> Sequence:
     if not place.exists():
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
+    if not os.access(place, os.R_OK | os.X_OK if place.is_dir() else os.R_OK):
+        raise InputError(
+            f"`{place}` may not be read by this user (permission denied); change that (`chmod -R u+rX`, as its owner), "
+            "or give a copy of your own"
+        )
     if kind == "bag" or (kind is None and is_bag(place)):
         return RosBag.open(place)
     if place.is_file() and (kind == "record3d" or (kind is None and Record3d.matches(place))):
@@ -129,7 +134,8 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
         if reader.matches(place):
             return reader.open(place)
     raise InputError(
-        reason_not_read(place)
+        lacks_metadata(place)
+        or reason_not_read(place)
         or f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
         "a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of `vggtgeo data list`, or a folder "
         f"of images{_hint(place)}"

@@ -47,6 +47,7 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.text_files import MOST_BYTES as MOST_TEXT
 from vggtgeo.models.extras import install_hint
 
+SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"
 _IMAGE = re.compile(r"rgbd?/(\d{1,9})\.(jpe?g|png)")
 _LEAST_CONFIDENCE = 1
@@ -64,10 +65,14 @@ class Record3d(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether there is `metadata` beside `rgbd`, in a folder or a zip archive, or `metadata.json` beside EXR."""
+        """Whether there is `metadata` beside `rgbd`, in a folder or a zip archive, or `metadata.json` beside EXR; or it
+        is a file that ends with `.r3d`.
+        """
         if folder.is_dir():
             exported = (folder / EXPORTED).is_file() and next((folder / "depth").glob("*.exr"), None) is not None
             return exported or ((folder / METADATA).is_file() and (folder / "rgbd").is_dir())
+        if folder.suffix.lower() == SUFFIX:  # one that is cut short is no zip archive any more
+            return folder.is_file()
         try:
             if not (folder.is_file() and zipfile.is_zipfile(folder)):
                 return False
@@ -82,7 +87,10 @@ class Record3d(FolderSequence):
         try:
             names = _names(folder)
         except UNREADABLE as error:
-            raise InputError(f"`{folder}` is no archive of Record3D that can be read: {error}") from None
+            raise InputError(
+                f"`{folder}` is damaged or cut short, a recording of Record3D is a whole zip archive ({error}); share "
+                "it from the app again"
+            ) from None
         numbered = {int(match.group(1)): folder / name for name in sorted(names) if (match := _IMAGE.fullmatch(name))}
         if not names & {METADATA, EXPORTED} or not numbered:
             raise InputError(f"`{folder}` is no recording of Record3D: expected `{METADATA}` and `rgbd/0.jpg`, ...")
