@@ -43,7 +43,8 @@ def walked(rng: np.random.Generator, points: int = POINTS) -> tuple[Slam, np.nda
         FramePose(1, 0.1, 0, exponential(AWAY) @ motion, True, points, unsure, seen=seen),
         FramePose(2, 0.2, 0, motion @ motion, True, points),
     )
-    return Slam(INTRINSICS, INTRINSICS, np.full(4, 1.0), False, keyframes=(first,), frames=records), pose
+    known = {"keyframes": (first,), "frames": records, "pose_sigma": np.full((1, 2), 0.01)}
+    return Slam(INTRINSICS, INTRINSICS, np.full(4, 1.0), False, **known), pose
 
 
 def with_second(slam: Slam, **values: object) -> Slam:
@@ -89,7 +90,9 @@ def test_what_the_adjustment_did_to_points_and_keyframe_counts() -> None:
 
 
 def test_without_enough_points_a_pose_stays() -> None:
-    """One point too few, points whose depth is gone, a frame without a pose: as it was carried, to the bit."""
+    """One point too few, points whose depth is gone, or that came to lie behind the camera, a frame without a pose, a
+    map that is not finished: as it was carried, to the bit.
+    """
     slam, _ = walked(np.random.default_rng(2), LEAST_POINTS)
     few = slam.frames[1].seen
     assert few is not None
@@ -98,7 +101,9 @@ def test_without_enough_points_a_pose_stays() -> None:
     for wrong in (
         with_second(slam, seen=SeenPoints(few.slots[1:], few.pixels[1:])),
         replace(slam, keyframes=(gone,)),
+        with_second(slam, relative=exponential(np.array([0, 0, -9.0, 0, 0, 0])), evidence=Evidence()),
         with_second(slam, tracked=False),
+        replace(slam, pose_sigma=None),
     ):
         np.testing.assert_array_equal(frame_poses(wrong)[1], carried_poses(wrong)[1])
     assert not np.array_equal(frame_poses(slam)[1], carried_poses(slam)[1])

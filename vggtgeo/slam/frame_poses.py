@@ -27,12 +27,18 @@ WIDTH, WIDEST = 1.0, 8.0
 tracked pose to some pixels, a few are off by as much. On icl-office and a simulated office 0.5 to 2 do alike; with
 Huber's kernel, which lets those pull, steps from frame to frame are 0.43 cm off in place of 0.25."""
 STEPS, SETTLED = 15, 1e-5
-NEAREST = 0.1
+NEAREST, FARTHEST = 0.1, 1e6
+"""Depths that take part, in the unit of the map."""
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
-    """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known."""
+    """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known.
+
+    While the run goes on, before the last adjustment, all are carried along: it moves the map once more.
+    """
     times, poses = carried_poses(slam)
+    if slam.pose_sigma is None or len(slam.pose_sigma) != len(slam.keyframes):
+        return times, poses
     rows = [row for row, record in enumerate(slam.frames) if record.seen is not None and record.tracked]
     if not rows:
         return times, poses
@@ -62,7 +68,7 @@ def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tupl
     assert record.seen is not None
     keyframe, slots = slam.keyframes[record.reference], record.seen.slots
     inverse = keyframe.points.inverse_depth[slots]
-    known = np.isfinite(inverse) & (inverse > 0)
+    known = np.isfinite(inverse) & (inverse > 1 / FARTHEST)
     inverse, pixels = inverse[known], keyframe.points.pixels[slots[known]]
     if motion is not None and slam.readout is not None:
         pixels = at_once(pixels, inverse, motion, slam.intrinsics, keyframe.size, slam.readout)
@@ -83,6 +89,8 @@ def _resected(
         width = max(WIDEST / 2**number, WIDTH)
         local = points @ current[:3, :3].T + current[:3, 3]
         front = local[:, 2] > NEAREST
+        if np.count_nonzero(front) < LEAST_POINTS:
+            return pose
         off = pinhole.project(local[front], intrinsics) - pixels[front]
         weight = 1.0 / (1.0 + (off**2).sum(1) / width**2) ** 2
         rows = np.concatenate(pinhole.projection_rows(local[front], intrinsics), 1)
