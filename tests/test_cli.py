@@ -301,3 +301,22 @@ def test_a_switch_of_jax_that_is_none_is_named(tmp_path: Path) -> None:
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
     assert result.returncode == 2
     assert result.stderr == "error: the environment variable `JAX_ENABLE_X64` is `maybe`; JAX expects true or false\n"
+
+
+@pytest.mark.parametrize(
+    ("flags", "unknown"),
+    [
+        ("--xla_cpu_multi_thread_eigen=false  --xla_nonsense=1", "--xla_nonsense"),
+        ("--xla_force_host_platform_device_count=2 --xla_cpu_enable_fast_math=false --xla_dump_to=/tmp/--x", None),
+        ("", None),
+    ],
+)
+def test_a_flag_that_xla_does_not_know_is_told(
+    flags: str, unknown: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """XLA itself ends the process in C++; flags that it knows pass. Oracle: the line."""
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    result = CliRunner().invoke(make_app(), ["solve", "no.npz", "-o", "x.npz"])
+    assert result.exit_code == 2
+    told = f"the environment variable `XLA_FLAGS` has `{unknown}`, which jaxlib"
+    assert result.stderr.startswith(f"error: {told}" if unknown else "error: `no.npz` is no file"), result.stderr

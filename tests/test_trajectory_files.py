@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import vggtgeo as vg
 from vggtgeo.datasets.trajectory_files import load_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 
 
 def _path(count: int = 12) -> Trajectory:
@@ -89,3 +89,12 @@ def test_what_is_no_trajectory_is_told(tmp_path: Path, text: str, message: str) 
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         load_trajectory(tmp_path / "a.txt")
+
+
+def test_poses_of_an_estimate_are_not_left_out_of_the_truth(tmp_path: Path) -> None:
+    """A file of KITTI's poses, one of them NaN: it may be an estimate as well as a truth. Oracle: the sentence."""
+    rows = np.tile(np.eye(4)[:3].ravel(), (3, 1))
+    rows[1] = np.nan
+    np.savetxt(tmp_path / "estimate.txt", rows)
+    with pytest.warns(NoteWarning, match=r"1 of 3 poses have a NaN or an infinity; left out of the trajectory"):
+        assert len(load_trajectory(tmp_path / "estimate.txt")) == 2

@@ -45,9 +45,11 @@ def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
         raise InputError(f"`{file}`: expected a matrix of {shape[0]} x {shape[1]} numbers") from None
 
 
-def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path) -> Trajectory | None:
+def trajectory_of(
+    times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path, of: str = "truth"
+) -> Trajectory | None:
     """Camera -> world at `times`; poses with NaN or infinity, or without a rotation, as files have them where tracking
-    was lost, are left out with an InputWarning.
+    was lost, are left out with an InputWarning. of: what they are, for that.
 
     None where no pose is left.
     """
@@ -56,7 +58,7 @@ def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where:
     known = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     if not known.all():
         warnings.warn(
-            f"`{where}`: {int((~known).sum())} of {len(poses)} poses have a NaN or an infinity; left out of the truth",
+            f"`{where}`: {int((~known).sum())} of {len(poses)} poses have a NaN or an infinity; left out of the {of}",
             NoteWarning,
             stacklevel=3,
         )
@@ -64,7 +66,7 @@ def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where:
     if not turned[known].all():
         warnings.warn(
             f"`{where}`: {int((known & ~turned).sum())} of {len(poses)} poses have no rotation (all zeros, say); left "
-            "out of the truth",
+            f"out of the {of}",
             InputWarning,
             stacklevel=3,
         )

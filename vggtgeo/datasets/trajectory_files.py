@@ -36,7 +36,7 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
         return _kitti(file, clock)
     if columns == _EUROC:
         rows = read_matrices(file, _EUROC)
-        found = trajectory_of(1e-9 * rows[:, 0], poses_of(rows[:, 1:4], rows[:, [5, 6, 7, 4]]), file)
+        found = trajectory_of(1e-9 * rows[:, 0], poses_of(rows[:, 1:4], rows[:, [5, 6, 7, 4]]), file, "trajectory")
         if found is None:
             raise InputError(f"`{file}` holds no pose")
         return found
@@ -62,7 +62,8 @@ def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:
         )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    found = trajectory_of(np.arange(float(len(rows))) if clock is None else clock.timestamps, poses, file)
+    times = np.arange(float(len(rows))) if clock is None else clock.timestamps
+    found = trajectory_of(times, poses, file, "trajectory")
     if found is None:
         raise InputError(f"`{file}` holds no pose")
     rounded = len(found) == len(poses) and np.abs(found.poses - poses).max() < _ROUNDING
