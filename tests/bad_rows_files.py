@@ -125,10 +125,10 @@ def spoilt(layout: Callable[[Path], Path], name: str, content: str) -> Callable[
     return make
 
 
-def flat(folder: Path) -> Path:
-    """Images that are 3 pixels high."""
+def flat(folder: Path, width: int = 2000, height: int = 3) -> Path:
+    """Images that are wide and low."""
     for row in range(3):
-        tiny.write_image(folder / f"frames/{row}.png", bad.picture(row, 2000, 3))
+        tiny.write_image(folder / f"frames/{row}.png", bad.picture(row, width, height))
     return folder / "frames"
 
 
@@ -184,7 +184,7 @@ IMAGES = rows(
 )
 SMALL = rows(
     "Images",
-    [("2000 x 3 pixels", flat)],
+    [("2000 x 3 pixels", flat), ("20000 x 33 pixels", lambda folder: flat(folder, 20000, 33))],
     argv=lambda made: ["run", made, "-o", made.parent / "out", "--intrinsics", "1500,1500,1000,1"],
 )
 DEPTH = rows(

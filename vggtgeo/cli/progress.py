@@ -1,4 +1,4 @@
-"""A run on the terminal: a bar while it goes on, and a report at its end."""
+"""A run on the terminal: a bar while it goes on, or lines now and then where nobody sees a bar; a report at its end."""
 
 from __future__ import annotations
 
@@ -17,15 +17,26 @@ from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 
+LEAST_PAUSE, LONGEST_PAUSE = 5.0, 60.0
+"""Seconds between two lines: short runs shall not fill a log, and long ones show that they are alive."""
+PARTS = 10
+"""Of a run: a line for each, no sooner than the least pause."""
+
 
 class ProgressBar(Callback):
-    """Frames done, their rate, and the state's notes as they come; a context, which takes the bar away."""
+    """Frames done, their rate, and the state's notes as they come; a context, which takes the bar away. A pipe or a
+    file gets lines in place of a bar, which would be written there when all is over.
+    """
 
     def __init__(self, console: Console) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._progress = Progress(*columns, TextColumn("{task.fields[state]}"), console=console)
+        self._lines = not console.is_terminal
+        state = TextColumn("{task.fields[state]}")
+        self._progress = Progress(*columns, state, console=console, disable=self._lines)
         self._notes = self._resumed = 0
-        self._began = 0.0
+        self._began = self._last_line = 0.0
+        self._total: int | None = None
+        self._part = 0
         self._stage: TaskID | None = None
 
     def __enter__(self) -> Self:
@@ -37,13 +48,16 @@ class ProgressBar(Callback):
 
     def on_begin(self, name: str, total: int | None) -> None:
         self._task = self._progress.add_task(name, total=total, state="")
-        self._began = time.perf_counter()
+        self._began = self._last_line = time.perf_counter()
+        self._total = total
         self._progress.start()
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         rate = (len(slam.frames) - self._resumed) / (time.perf_counter() - self._began)
         state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {_state(slam)}"
         self._progress.update(self._task, advance=1, state=state)
+        if self._lines and self._is_due(len(slam.frames)):
+            self._print(f"{len(slam.frames)}{f' of {self._total}' if self._total else ''} frames: {state}")
         for note in slam.notes[self._notes :]:
             self._print(f"warning: {note}")
         self._notes = len(slam.notes)
@@ -58,6 +72,17 @@ class ProgressBar(Callback):
         self._end_stage()
         self._stage = self._progress.add_task(name, total=None, state="")
         self._progress.start()
+        if self._lines:
+            self._print(name)
+
+    def _is_due(self, done: int) -> bool:
+        """Whether it is time for a line."""
+        now, part = time.perf_counter(), PARTS * done // self._total if self._total else self._part
+        pause = now - self._last_line
+        due = pause >= LONGEST_PAUSE or (pause >= LEAST_PAUSE and part > self._part)
+        if due:
+            self._last_line, self._part = now, part
+        return due
 
     def _end_stage(self) -> None:
         if self._stage is not None:

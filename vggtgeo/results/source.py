@@ -53,9 +53,10 @@ class Source:
     def check(self, start: int, end: int | None, stride: int) -> None:
         """InputError for a selection that is none, or images too small for features, before anything is compiled."""
         if min(self.camera.width, self.camera.height) < LEAST_SIDE:
+            size, read = (f"{camera.width} x {camera.height}" for camera in (self.camera, self.read))
+            smaller = "" if size == read else f", {size} after they were reduced"
             raise InputError(
-                f"the images of `{self.name}` are {self.camera.width} x {self.camera.height} pixels; both sides must "
-                f"be at least {LEAST_SIDE}"
+                f"the images of `{self.name}` are {read} pixels{smaller}; both sides must be at least {LEAST_SIDE}"
             )
         length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames) or sys.maxsize
         check_selection(self.name, length, start, end, stride)
