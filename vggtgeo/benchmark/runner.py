@@ -26,6 +26,7 @@ from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
+from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import locked_folder
 
 OUTPUTS = ("report.html", "tables.md", "runs.csv", "runs.parquet")
@@ -132,7 +133,7 @@ def bench(
         vggtgeo.io.errors.InputError: `sequences` holds ['ofice']; choose among office, corridor, redkitchen, icl-office
 
     """
-    chosen = suite if isinstance(suite, Suite) else load_suite(Path(suite))
+    chosen = suite if isinstance(suite, Suite) else load_suite(path_of("suite", suite))
     chosen = limited(chosen, _names(sequences), _names(settings), seeds, first_seed, frames)
     chosen = replace(
         chosen,
@@ -140,7 +141,7 @@ def bench(
         timeout_minutes=chosen.timeout_minutes if timeout_minutes is None else timeout_minutes,
         memory_gb=chosen.memory_gb if memory_gb is None else memory_gb,
     )
-    folder = Path(output)
+    folder = path_of("output", output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
     if workers < 1:

@@ -16,6 +16,7 @@ import numpy as np
 
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import path_of
 from vggtgeo.io.record_file import Layout
 from vggtgeo.io.records import by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
@@ -71,7 +72,7 @@ def save_map(path: str | os.PathLike[str], slam: Slam) -> None:
     """
     if not slam.keyframes:
         raise InputError(f"there is no keyframe to save as a map in `{path}`; track at least one frame")
-    MAP.write(Path(path), as_map(slam))
+    MAP.write(path_of("path", path), as_map(slam))
 
 
 @in_double_precision
@@ -90,7 +91,7 @@ def load_map(path: str | os.PathLike[str]) -> Slam:
         vggtgeo.io.errors.InputError: `office.map` is no file; give that of a map
 
     """
-    found, _ = MAP.read(Path(path))
+    found, _ = MAP.read(path_of("path", path))
     known = checked_state(Path(path), found)
     if not known.keyframes or known.frames or known.window:
         raise InputError(f"`{path}` holds no map; expected keyframes alone: save one with `vggtgeo run --save-map`")

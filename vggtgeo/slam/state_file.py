@@ -26,6 +26,7 @@ from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import path_of
 from vggtgeo.io.record_file import Header, Layout
 from vggtgeo.io.records import by_name, with_field
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
@@ -164,7 +165,7 @@ def save_state(path: str | os.PathLike[str], slam: Slam) -> None:
             your own, say).
 
     """
-    STATE.write(Path(path), slam)
+    STATE.write(path_of("path", path), slam)
 
 
 @in_double_precision
@@ -175,7 +176,7 @@ def load_state(path: str | os.PathLike[str]) -> Slam:
         InputError: the file is missing, damaged, of a version that is not known, or holds no state.
 
     """
-    found, _ = STATE.read(Path(path))
+    found, _ = STATE.read(path_of("path", path))
     return checked_state(Path(path), found)
 
 
