@@ -3,11 +3,12 @@
     D=../shared/data
     .venv/bin/vggtgeo models export mlsd --source mlsd_pytorch --checkpoint FILE -o runs/networks/mlsd.onnx  # and alike
     .venv/bin/python benchmarks/small_networks.py $D/corridor-office $D/building-walk $D/icl-office $D/redkitchen
-        --models runs/networks [--frames 100] [--rgb-only]
+        --models runs/networks [--frames 100] [--rgb-only] [--seed 1]
 
 Each row is a run with other points or lines; all else is the default. ATE RMSE and the 95th percentile of the frames'
 errors, cm, after SE(3) alignment with depth and after Sim(3) without; milliseconds a frame of tracking, mapping and
-window adjustment, and of that in networks. Mixtures whose files are not in the folder are left out, with a line.
+window adjustment, and of that in networks. Mixtures whose files are not in the folder are left out, with a line. Other
+seeds tell by how much two rows must differ to mean anything.
 """
 
 from __future__ import annotations
@@ -46,12 +47,13 @@ def main() -> None:
     parser.add_argument("--models", type=Path, required=True, help="folder of the networks' files")
     parser.add_argument("--frames", type=int, help="of each clip, from its first; by default all")
     parser.add_argument("--rgb-only", action="store_true", help="leave the depth of the clips out")
+    parser.add_argument("--seed", type=int, default=0, help="of the samples of robust estimators")
     arguments = parser.parse_args()
     mixtures = {name: mixed for name, mixed in MIXTURES.items() if _there(name, mixed, arguments.models)}
     print(f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
     for clip in arguments.clips:
         for name, mixed in mixtures.items():
-            cells = run(clip, mixed, arguments.models, arguments.frames, arguments.rgb_only)
+            cells = run(clip, mixed, arguments.models, arguments.frames, arguments.rgb_only, arguments.seed)
             print(f"| {' | '.join((clip.name, cells[0], name, *cells[1:]))} |", flush=True)
 
 
@@ -63,13 +65,13 @@ def _there(name: str, mixed: Mapping[str, str], folder: Path) -> bool:
     return not missing
 
 
-def run(clip: Path, mixed: Mapping[str, str], models: Path, frames: int | None, rgb_only: bool) -> list[str]:
+def run(clip: Path, mixed: Mapping[str, str], models: Path, frames: int | None, rgb_only: bool, seed: int) -> list[str]:
     """The cells of one run behind the name of its clip: input first."""
     sequence = without_depth(vg.read(clip)) if rgb_only else vg.read(clip)
     perceived = perception("classical", default_roles(sequence.has_depth), models, mixed=mixed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        result = vg.reconstruct(sequence, perceived, end=frames, dense="none")
+        result = vg.reconstruct(sequence, perceived, end=frames, seed=seed, dense="none")
     summary, truth = result.summary, sequence.ground_truth()
     report = None if truth is None or len(result.trajectory) < 3 else evaluate_trajectory(result.trajectory, truth)
     errors = np.array([np.nan]) if report is None else (report.se3 if sequence.has_depth else report.sim3).errors
