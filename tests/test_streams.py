@@ -58,10 +58,11 @@ def test_a_run_that_cannot_print_is_written_as_a_whole(
 @pytest.mark.parametrize("columns", ["0", "1", "-5", "many"])
 def test_a_terminal_without_columns_still_shows_what_was_found(tmp_path: Path, columns: str) -> None:
     """`COLUMNS=0` printed blank lines, and ended as if all were well. Oracle: words and numbers of the table."""
-    bad.walk(tmp_path / "mine.txt", 0)
+    truth = tmp_path / "groundtruth.txt"
+    bad.walk(truth, 0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", columns)
-        done = called("evaluate", tmp_path / "mine.txt", tmp_path / "mine.txt")
+        done = called("evaluate", truth, truth)
     assert done.returncode == 0, done.stderr
     assert "60 poses" in " ".join(done.stdout.split())
     assert done.stdout.count("0.000") > 4, done.stdout

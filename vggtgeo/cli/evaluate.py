@@ -123,7 +123,7 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
     """
     import numpy as np
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from vggtgeo.evaluation import ErrorStatistics
 
@@ -134,7 +134,8 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
         f"{report.sim3.alignment.scale:.4f}; RPE over {report.relative.interval}",
         soft_wrap=True,
     )
-    table = Table("", "RMSE", "mean", "median", "max")
+    # A narrow terminal gets a number in two lines, not cut: 4.4413e-17 is not "4.44…".
+    table = Table(*(Column(name, overflow="fold") for name in ("", "RMSE", "mean", "median", "max")))
     angles = ErrorStatistics.of(np.degrees(report.relative.rotation))
     free = scale is not None and scale.startswith("free")
     if scale is not None:
