@@ -58,7 +58,9 @@ def test_nanoseconds_are_told_and_taken_as_such(tmp_path: Path) -> None:
 def test_the_truth_of_euroc_is_read(tmp_path: Path) -> None:
     # Proves the order of its quaternion, w first, and its times. Oracle: the poses that were written.
     _euroc(tmp_path / "data.csv", _path())
-    _same(load_trajectory(tmp_path / "data.csv"), _path())
+    found = load_trajectory(tmp_path / "data.csv")
+    assert len(found) == len(_path())
+    _same(found, _path())
 
 
 def test_poses_of_kitti_have_the_times_of_the_truth(tmp_path: Path) -> None:

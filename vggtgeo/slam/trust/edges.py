@@ -9,11 +9,12 @@ For one picture: the mean strength of its edges under those of the depth, for al
 of other places (windows of `WINDOW` around a shift) where that is as large somewhere as around no shift. It is a half
 on average where picture and depth have nothing in common.
 
-Mean of that share over 40 frames, every third of them, in 31 pieces of the four clips, of two phones with LiDAR and of
-TartanAir: at most 0.23, mostly 0.00 to 0.04; pictures that are blurred, noisy, dark, compressed or half covered, and
-depth that is noisy or coarse, change it by less than 0.05. With the picture mirrored 0.24 to 0.65, with depth of three
-frames before 0.01 (a camera that stands nearly still) to 0.60, stabilised 0.28 to 0.72 on the HoloLens clips, whose
-camera is on a head, and 0.01 to 0.42 in redkitchen and icl-office, where that costs little.
+Mean of that share over 40 frames, every third of them, in 23 pieces of the four clips (`benchmarks/depth_edges.py`):
+at most 0.19, mostly 0.00 to 0.03; in three recordings of phones and of a simulator at most 0.23. Pictures that are
+blurred, noisy, dark, compressed or half covered, and depth that is noisy or coarse, change it by less than 0.15, mostly
+downwards. With the picture mirrored 0.24 to 0.65, with depth of three frames before 0.01 (a camera that stands nearly
+still) to 0.60, stabilised 0.28 to 0.72 on the HoloLens clips, whose camera is on a head, and 0.01 to 0.42 in redkitchen
+and icl-office, where that costs little.
 """
 
 from __future__ import annotations
