@@ -35,3 +35,13 @@ def test_compressed_images_are_the_same_and_small() -> None:
     assert array_of(small.colour).shape == smooth.shape
     assert np.sqrt(np.mean(off**2)) < 2.0
     assert _bytes(small) < 0.25 * _bytes(images), _bytes(small) / _bytes(images)
+
+
+def test_depth_is_there_if_any_pixel_has_one() -> None:
+    """One pixel of many is enough, in arrays and compressed; oracle: what was put there."""
+    colour, nothing = np.zeros((24, 32, 3), np.uint8), np.full((24, 32), np.nan, np.float16)
+    one = nothing.copy()
+    one[7, 5] = 1.5
+    for depth, there in ((nothing, False), (one, True)):
+        images = KeyframeImages(colour, depth, nothing, np.zeros((24, 32), np.uint8))
+        assert (images.has_depth, images.compressed().has_depth) == (there, there)

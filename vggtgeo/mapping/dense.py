@@ -54,7 +54,7 @@ class DenseMap:
     def mesh(self) -> Mesh | None:
         """The surface, world frame, made when it is first asked for; None where there is none."""
         # A depth of the pictures was confirmed by two other views; one that was measured was not.
-        measured = any(np.isfinite(keyframe.depth).any() for keyframe in self.keyframes)
+        measured = any(keyframe.images.has_depth for keyframe in self.keyframes)
         found = fused_mesh(self.keyframes, self.own_maps, self.intrinsics, self.voxel, 2 if measured else 1)
         return found if len(found.faces) else None
 
@@ -87,7 +87,7 @@ def dense_map(slam: Slam, mode: str = "auto") -> DenseMap:
         InputError: see `check_dense`.
 
     """
-    check_dense(mode, any(np.isfinite(keyframe.depth).any() for keyframe in slam.keyframes))
+    check_dense(mode, any(keyframe.images.has_depth for keyframe in slam.keyframes))
     depth_maps: dict[int, DepthMap | None] = {}
     pieces = pieces_by_size(slam)
     for piece in pieces:
@@ -104,7 +104,7 @@ def dense_map(slam: Slam, mode: str = "auto") -> DenseMap:
 
 def _possible(mode: str, keyframes: Sequence[Keyframe]) -> str:
     """The mode for one piece of the map: one that has no measured depth at all cannot be asked for it."""
-    measured = any(np.isfinite(keyframe.depth).any() for keyframe in keyframes)
+    measured = any(keyframe.images.has_depth for keyframe in keyframes)
     return mode if measured or mode not in ("sensor", "network") else "none"
 
 
@@ -116,7 +116,7 @@ def _voxel(depth_maps: Sequence[DepthMap | None], intrinsics: np.ndarray) -> flo
 
 def dense_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: str = "auto") -> list[DepthMap | None]:
     """Dense depth of each keyframe, None where there is none; arguments and errors as of `dense_map`."""
-    measured = any(np.isfinite(keyframe.depth).any() for keyframe in keyframes)
+    measured = any(keyframe.images.has_depth for keyframe in keyframes)
     check_dense(mode, measured)
     if mode == "none":
         return [None] * len(keyframes)

@@ -122,7 +122,7 @@ def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[
     held = lambda depth: CompressedImage.of(depth.astype(np.float16)) if many else depth
 
     def measured(keyframe: Keyframe) -> np.ndarray | CompressedImage | None:
-        return keyframe.images.depth if np.isfinite(keyframe.depth).any() else None
+        return keyframe.images.depth if keyframe.images.has_depth else None
 
     def correct(i: int) -> np.ndarray | None:
         """Its points, once it is corrected."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -10,16 +9,19 @@ from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import residuals_at
+from vggtgeo.io.kept_program import KeptProgram
 
 CHANCE = 1e-3
 """Of taking a camera that is no better."""
 LEAST_HOSTS = 3
 
 
-@eqx.filter_jit
-def _energies_jit(problem: Problem, state: State) -> Float[Array, "e p"]:
+def _energies(problem: Problem, state: State) -> Float[Array, "e p"]:
     residual = residuals_at(problem, state)["points"]
     return problem.points.kernel.rho(problem.points.weight * jnp.sum(residual**2, -1)) / 2
+
+
+_energies_jit = KeptProgram(_energies, lambda problem, state: problem.points.weight)
 
 
 def gain(

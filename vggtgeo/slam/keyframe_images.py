@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import cv2
@@ -64,6 +65,11 @@ class KeyframeImages:
     def small(self) -> bool:
         """Whether they are compressed."""
         return isinstance(self.colour, CompressedImage)
+
+    @cached_property
+    def has_depth(self) -> bool:
+        """Whether any pixel has one; decoded for that once."""
+        return bool(np.isfinite(array_of(self.depth)).any())
 
     def compressed(self) -> KeyframeImages:
         """The same in little memory; each look at an image decodes it."""

@@ -177,7 +177,7 @@ def log_keyframe(stream: Any, keyframe: Keyframe, pair: Pair | None) -> None:
     matched = np.isin(np.arange(len(ends)), [] if pair is None else pair.lines.index_j)
     colours = np.where(matched[:, None], _ORANGE, _GREY).astype(np.uint8)
     stream.log("keyframe/image/lines", rr.LineStrips2D(list(ends), colors=colours, radii=-1.5))
-    if np.isfinite(keyframe.depth).any():
+    if keyframe.images.has_depth:
         millimetres = np.nan_to_num(1000.0 * keyframe.depth[::2, ::2].astype(np.float32)).astype(np.uint16)
         stream.log("keyframe/depth", rr.DepthImage(millimetres, meter=1000.0, colormap="viridis"))
     coloured = cv2.applyColorMap(keyframe.depth_confidence[::2, ::2], cv2.COLORMAP_VIRIDIS)
