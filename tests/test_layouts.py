@@ -321,8 +321,8 @@ def test_a_truth_in_a_unit_of_its_own_is_told(tmp_path: Path) -> None:
     for folder in (scene, phone):
         sequence = tiny.quietly_opened(folder)
         assert not sequence.truth_in_metres
-        with pytest.warns(NoteWarning, match="are in a unit of their own: errors that are called cm are hundredths"):
-            opened(sequence, None, SlamSettings())
+        with pytest.warns(NoteWarning, match="are in a unit of their own, and errors against them in the same"):
+            assert not opened(sequence, None, SlamSettings()).truth_in_metres
 
 
 @pytest.mark.parametrize("lists", ["rgb.txt depth.txt associated.txt", "rgb.txt depth.txt", "associated.txt"])

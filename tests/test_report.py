@@ -15,6 +15,7 @@ from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
 
 from vggtgeo.bundle.residuals import residual_sizes
+from vggtgeo.cli.progress import errors_line
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
@@ -96,6 +97,25 @@ def test_every_adjustment_is_recorded_once(run: RecordedRun) -> None:
         assert set(record.rms) == set(record.counts) <= {"points", "lines", "depth", "relative_poses"}
         assert record.energy[1] <= record.energy[0]
         assert 1 <= record.iterations <= SETTINGS.window.window_iterations
+
+
+def test_errors_against_a_truth_without_metres_are_no_centimetres(run: RecordedRun, tmp_path: Path) -> None:
+    """The page of a run beside poses of COLMAP, and its line in the terminal. Oracle: the report's own number."""
+    sequence_truth = run.sequence.ground_truth()
+    report = evaluate_trajectory(frame_trajectory(run.slam), sequence_truth)
+    verdict = Verdict("good")
+    given = {"settings": {}, "seconds": {"all": 2.0}, "report": report, "simulated": True}
+    own, metric = (summarise(run.slam, verdict, truth_in_metres=metres, **given) for metres in (False, True))
+    error = report.sim3.statistics.rmse
+    text = _page(run, tmp_path, summary=own)
+    assert f"{error:.4g}" in text
+    assert " cm" not in text
+    assert "[cm]" not in text
+    assert "ATE, SE(3)" not in text
+    assert "ATE, Sim(3) [unit of the truth]" in text
+    assert "ATE, SE(3) [cm]" in _page(run, tmp_path, summary=metric)
+    assert errors_line(own["truth"], free=False).startswith(f"ATE {error:.4g} after Sim(3) alignment, in the unit")
+    assert errors_line(metric["truth"], free=False).endswith(f"SE(3), {100 * error:.2f} cm after Sim(3) alignment")
 
 
 class _Checker(HTMLParser):

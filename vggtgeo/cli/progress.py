@@ -102,6 +102,16 @@ def _state(slam: Slam) -> str:
     return "waiting for parallax" if slam.waiting else "tracking"
 
 
+def errors_line(truth: Mapping[str, Any], free: bool) -> str:
+    """The line that compares with the truth. free: whether the estimate's scale is."""
+    se3, sim3 = (truth[name]["rmse"] for name in ("ate_se3_m", "ate_sim3_m"))
+    if not truth["in_metres"]:
+        return f"ATE {sim3:.4g} after Sim(3) alignment, in the unit of the true poses, which is not the metre"
+    if free:
+        return f"ATE {100 * sim3:.2f} cm after Sim(3) alignment (the scale is free)"
+    return f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment"
+
+
 def print_result(console: Console, result: Result, summary: Mapping[str, Any], folder: Path) -> None:
     """The report of a run; its last line is the verdict. summary: as it was written."""
     verdict, (fx, fy, cx, cy) = result.verdict, result.intrinsics_as_read
@@ -131,12 +141,7 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
             "deg at most (uncertainty.txt)"
         )
     if "truth" in summary:
-        se3, sim3 = (summary["truth"][name]["rmse"] for name in ("ate_se3_m", "ate_sim3_m"))
-        free = summary["scale"].startswith("free")
-        exact = "" if free else f"{100 * se3:.2f} cm after SE(3), "
-        lines.append(
-            f"ATE {exact}{100 * sim3:.2f} cm after Sim(3) alignment" + (" (the scale is free)" if free else "")
-        )
+        lines.append(errors_line(summary["truth"], free=summary["scale"].startswith("free")))
     points = f"({len(result.cloud)} points)"
     lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply {points} report.html")
     lines += [f"- {reason}" for reason in verdict.reasons]

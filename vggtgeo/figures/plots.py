@@ -61,14 +61,16 @@ def plot_trajectory(
     keyframes: Trajectory | None = None,
     with_scale: bool = False,
     title: str = "",
+    metres: bool = True,
 ) -> None:
     """Writes a PNG with the top and side view of `estimate`, metres, equal axes; atomically.
 
-    With `truth`, the estimate is first aligned to it, SE(3), or Sim(3) `with_scale`, and the title tells the ATE
-    over the poses that match in time; where too few match, the truth is left out. `keyframes` are marked. The
-    result of a reconstruction without scale and without truth has no unit. InputError for an empty estimate.
+    With `truth`, the estimate is first aligned to it, SE(3), or Sim(3) `with_scale` or where the truth has another unit
+    than `metres`, and the title tells the ATE over the poses that match in time; where too few match, the truth is left
+    out. `keyframes` are marked. The result of a reconstruction without scale and without truth has no unit. InputError
+    for an empty estimate.
     """
-    figure = trajectory_figure(estimate, truth, keyframes, with_scale, title)
+    figure = trajectory_figure(estimate, truth, keyframes, with_scale, title, metres=metres)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=130, format="png", facecolor="white")
 
@@ -80,21 +82,23 @@ def trajectory_figure(
     with_scale: bool = False,
     title: str | None = "",
     width: float = _WIDTH,
+    metres: bool = True,
 ) -> NotebookFigure:
     """The same as a figure, `width` inches wide; without a title where `title` is None."""
     if len(estimate) == 0:
         raise InputError("`estimate` has no pose; there is nothing to draw")
-    drawn = _align(estimate, truth, keyframes, with_scale)
+    drawn = _align(estimate, truth, keyframes, with_scale or not metres)
     seen = drawn.truth or drawn.estimate
+    in_metres = metres if drawn.error else not with_scale
     figure = _draw(
         drawn,
         view_axes(seen, level_world=drawn.truth is not None),
-        "m" if drawn.error or not with_scale else "no unit",
+        "m" if in_metres else "unit of the truth" if drawn.error else "no unit",
         width,
         "seen from the side" + ("" if drawn.truth or _turns(seen) else "; up is that of the images"),
     )
     if title is not None:
-        figure.suptitle(_title(drawn, title, with_scale), x=0.01, ha="left", fontsize=12, color=_INK)
+        figure.suptitle(_title(drawn, title, with_scale, metres), x=0.01, ha="left", fontsize=12, color=_INK)
     return figure
 
 
@@ -190,15 +194,16 @@ def _draw_view(axes: Any, drawn: _Drawn, origin: np.ndarray, rows: np.ndarray) -
         spine.set_color("#bbbbbb")
 
 
-def _title(drawn: _Drawn, title: str, with_scale: bool) -> str:
+def _title(drawn: _Drawn, title: str, with_scale: bool, metres: bool) -> str:
     if drawn.error is None:
         facts = f"{len(drawn.estimate)} pose{'s' if len(drawn.estimate) > 1 else ''}, no truth"
         if not with_scale:
             facts += f", path {drawn.estimate.length:.2f} m"
     else:
-        alignment = "Sim(3)" if with_scale else "SE(3)"
+        alignment = "SE(3)" if metres and not with_scale else "Sim(3)"
         statistics = drawn.error.statistics
-        facts = f"ATE {100 * statistics.rmse:.2f} cm after {alignment} ({statistics.count} poses)"
+        error = f"{100 * statistics.rmse:.2f} cm" if metres else f"{statistics.rmse:.4g}"
+        facts = f"ATE {error} after {alignment} ({statistics.count} poses)"
     return f"{title}:  {facts}" if title else facts
 
 

@@ -35,9 +35,12 @@ _WIDTH = 4.6
 """Inches: read at about its own size, on a desk as on a phone."""
 
 
-def trajectory_svg(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory, with_scale: bool) -> str:
-    """Top and side view of the path."""
-    return svg(trajectory_figure(estimate, truth, keyframes, with_scale, title=None, width=_WIDTH + 0.4))
+def trajectory_svg(
+    estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory, with_scale: bool, metres: bool = True
+) -> str:
+    """Top and side view of the path; metres: the unit of the truth."""
+    figure = trajectory_figure(estimate, truth, keyframes, with_scale, None, _WIDTH + 0.4, metres)
+    return svg(figure)
 
 
 def residuals_svg(records: Sequence[WindowRecord]) -> str:

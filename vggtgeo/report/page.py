@@ -104,7 +104,7 @@ def write_page(
         verdict_line=VERDICT_LINES[verdict.level],
         timeline=_timeline(verdict),
         warnings=[*warnings, *slam.notes],
-        trajectory=_path_drawn(slam, trajectory, truth),
+        trajectory=_path_drawn(slam, trajectory, truth, summary.get("truth", {}).get("in_metres", True)),
         has_truth=truth is not None,
         residuals=figures.residuals_svg(records) if records else None,
         map_above=_map_picture(map_view.from_above, cloud, trajectory),
@@ -124,11 +124,13 @@ def write_page(
     write_text(path, text)
 
 
-def _path_drawn(slam: Slam, trajectory: Trajectory, truth: Trajectory | None) -> str:
-    """Empty where no frame has a pose: one that is sought in a map that is known may be in another place."""
+def _path_drawn(slam: Slam, trajectory: Trajectory, truth: Trajectory | None, metres: bool) -> str:
+    """Empty where no frame has a pose: one that is sought in a map that is known may be in another place. metres: the
+    unit of the truth.
+    """
     if not len(trajectory):
         return ""
-    return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric)
+    return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric, metres)
 
 
 def template(package: str, name: str) -> jinja2.Template:
@@ -152,9 +154,11 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
         facts.append(Fact(f"{summary['frames_per_second']:.1f}", "frames a second"))
     if summary["scale"] == "metric":
         facts.append(Fact(f"{trajectory.length:.2f} m", "length of the path"))
-    if "truth" in summary:
-        aligned, name = ("ate_se3_m", "SE(3)") if slam.metric else ("ate_sim3_m", "Sim(3)")
-        facts.append(Fact(f"{100 * summary['truth'][aligned]['rmse']:.2f} cm", f"ATE after {name}"))
+    if (truth := summary.get("truth")) is not None:
+        aligned, name = ("ate_se3_m", "SE(3)") if slam.metric and truth["in_metres"] else ("ate_sim3_m", "Sim(3)")
+        error = truth[aligned]["rmse"]
+        shown = f"{100 * error:.2f} cm" if truth["in_metres"] else f"{error:.4g}"
+        facts.append(Fact(shown, f"ATE after {name}" + ("" if truth["in_metres"] else ", in the truth's unit")))
     facts.append(Fact(f"{len(cloud):,}".replace(",", "\u202f"), "points in the map"))
     facts.append(Fact(f"{summary['peak_memory_gb']:.2f} GB", "peak memory"))
     return facts
@@ -177,19 +181,24 @@ def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
 
 
 def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[str, list[str]]]:
-    """Rows of errors: RMSE, mean, median, largest; of a free scale those after a Sim(3) alignment only."""
+    """Rows of errors: RMSE, mean, median, largest; of a free scale, or a truth without metres, those after a Sim(3)
+    alignment only.
+    """
     if truth is None:
         return []
+    metric = metric and truth["in_metres"]
+    unit, factor = ("cm", 100.0) if truth["in_metres"] else ("unit of the truth", 1.0)
     translation = "rpe_translation_m" if metric else "rpe_translation_sim3_m"
     rows = (
-        *([("ATE, SE(3) [cm]", truth["ate_se3_m"], 100.0)] if metric else []),
-        ("ATE, Sim(3) [cm]", truth["ate_sim3_m"], 100.0),
-        (f"RPE translation{'' if metric else ', Sim(3)'} [cm]", truth[translation], 100.0),
+        *([(f"ATE, SE(3) [{unit}]", truth["ate_se3_m"], factor)] if metric else []),
+        (f"ATE, Sim(3) [{unit}]", truth["ate_sim3_m"], factor),
+        (f"RPE translation{'' if metric else ', Sim(3)'} [{unit}]", truth[translation], factor),
         ("RPE rotation [deg]", truth["rpe_rotation_deg"], 1.0),
     )
     names = ("rmse", "mean", "median", "maximum")
-    show = lambda value, factor: "\u2013" if value is None else f"{factor * value:.2f}"
-    return [(title, [show(errors[name], factor) for name in names]) for title, errors, factor in rows]
+    digits = "{:.2f}" if truth["in_metres"] else "{:.4g}"
+    show = lambda value, by: "\u2013" if value is None else digits.format(by * value)
+    return [(title, [show(errors[name], by) for name in names]) for title, errors, by in rows]
 
 
 def _stages(seconds: Mapping[str, float]) -> list[Stage]:

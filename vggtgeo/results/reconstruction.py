@@ -15,7 +15,6 @@ import numpy as np
 from vggtgeo.datasets import Sequence
 from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_kind, check_plain, check_whole
 from vggtgeo.io.interruption import Interruption, interruption
@@ -155,7 +154,7 @@ def reconstruct(
         notices = (*warned, *(collected if before is None else before.unsaid(collected)))
         ending = _Ending(
             slam,
-            source.truth,
+            source,
             report,
             notices,
             perception.refusals,
@@ -194,7 +193,7 @@ class _Ending:
     """A run after its last adjustment: what it is judged and described by."""
 
     slam: Slam
-    truth: Trajectory | None
+    source: Source
     report: TrajectoryReport | None
     warned: tuple[Warning | str, ...]
     refusals: Mapping[str, Refusals]
@@ -236,13 +235,18 @@ def _concluded(
         settings=changed(settings),
         seconds={**clock.seconds, "all": time.perf_counter() - run.began},
         report=run.report,
+        truth_in_metres=run.source.truth_in_metres,
         map_points=len(built.cloud),
         dense=run.dense,
         **run.facts,
     )
     notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
     return Result.assemble(
-        RunRecord(slam, built, tuple(windows), run.truth, notices, run.title, run.seen), verdict, summary
+        RunRecord(
+            *(slam, built, tuple(windows), run.source.truth, notices, run.title, run.seen, run.source.truth_in_metres)
+        ),
+        verdict,
+        summary,
     )
 
 

@@ -33,7 +33,11 @@ LEAST_SIDE = 32
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What an estimator may see, and the truth, set apart for the comparison."""
+    """What an estimator may see, and the truth, set apart for the comparison.
+
+    simulated: whether frames are rendered. truth_in_metres: whether lengths of the truth are metres; those of COLMAP
+    have a unit of their own.
+    """
 
     name: str
     frames: Sequence | FrameStream
@@ -41,6 +45,7 @@ class Source:
     read: Camera
     """Of the images before they were reduced."""
     simulated: bool = False
+    truth_in_metres: bool = True
 
     @property
     def camera(self) -> Camera:
@@ -119,7 +124,8 @@ def opened(
     name = frames.name.encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
     view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
     simulated = isinstance(frames, SyntheticSequence)
-    return Source(name, reduced(view, most), _truth(frames), view.camera, simulated)
+    truth, metres = _truth(frames), getattr(frames, "truth_in_metres", True)
+    return Source(name, reduced(view, most), truth, view.camera, simulated, metres)
 
 
 def _truth(sequence: Sequence) -> Trajectory | None:
@@ -127,7 +133,7 @@ def _truth(sequence: Sequence) -> Trajectory | None:
     try:
         truth = sequence.ground_truth()
         if truth is not None and not getattr(sequence, "truth_in_metres", True):
-            text = "are in a unit of their own: errors that are called cm are hundredths of that"
+            text = "are in a unit of their own, and errors against them in the same, after Sim(3) alignment"
             warnings.warn(f"the true poses of `{sequence.name}` {text}", NoteWarning, stacklevel=4)
         return truth
     except InputError as error:

@@ -46,9 +46,13 @@ def summarise(
     settings: Mapping[str, Any],
     seconds: Mapping[str, float],
     report: TrajectoryReport | None = None,
+    truth_in_metres: bool = True,
     **counts: Any,
 ) -> dict[str, Any]:
-    """Verdict, settings, versions, counts, time by stage, final intrinsics, errors where the truth is known."""
+    """Verdict, settings, versions, counts, time by stage, final intrinsics, errors where the truth is known.
+
+    truth_in_metres: whether those errors are metres, as their names say; `in_metres` beside them.
+    """
     tracked = sum(record.tracked for record in slam.frames)
     values = {
         "verdict": verdict.to_dict(),
@@ -70,7 +74,7 @@ def summarise(
         "notes": list(slam.notes),
         **counts,
     }
-    return values if report is None else {**values, "truth": report.as_dict()}
+    return values if report is None else {**values, "truth": {**report.as_dict(), "in_metres": truth_in_metres}}
 
 
 def stated_uncertainty(slam: Slam) -> dict[str, Any]:
