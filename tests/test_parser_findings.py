@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny_layouts as layouts
+import tiny_sequences as tiny
 from parsers import KINDS
 
 from vggtgeo.datasets import open_sequence
@@ -200,6 +201,29 @@ def test_replica_without_its_camera_is_taken_for_none_other(tmp_path: Path) -> N
     (tmp_path / "cam_params.json").unlink()
     with pytest.raises(InputError, match=r"has no `cam_params.json`, and its images are .* pixels; those of the publi"):
         open_sequence(folder)
+
+
+LONG = 300 * "x" + ".png"
+
+
+def test_a_listed_name_that_no_file_system_takes_costs_its_frame(tmp_path: Path) -> None:
+    """A name of 300 letters in a list of TUM, of an image, and in `transforms.json`, of all depth; it ended in an
+    `OSError`. Oracle: what is left, and the warning.
+    """
+    folder = tiny.tum(tmp_path / "desk")
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    lines[2] = lines[2].split()[0] + " rgb/" + LONG
+    (folder / "rgb.txt").write_text("\n".join(lines))
+    sequence = open_sequence(folder)
+    with pytest.warns(InputWarning, match="File name too long"):
+        assert len(list(sequence.frames())) == 2
+    scene = layouts.nerfstudio(tmp_path / "phone")
+    content = json.loads((scene / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["depth_file_path"] = LONG
+    (scene / "transforms.json").write_text(json.dumps(content))
+    with pytest.warns(InputWarning, match="none of the 3 depth images is there"):
+        assert not open_sequence(scene).has_depth
 
 
 @pytest.mark.filterwarnings("ignore:.*the IMU is not used")

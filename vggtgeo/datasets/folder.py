@@ -16,6 +16,7 @@ from vggtgeo.datasets.image_files import (
     MILLIMETRES,
     DepthFormat,
     ImageFile,
+    is_there,
     read_depth,
     read_image,
     read_image_file,
@@ -84,7 +85,7 @@ class FolderSequence:
 
     def holds(self, path: Path) -> bool:
         """Whether a file of `files` is there."""
-        return path.exists()
+        return is_there(path)
 
     def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
         """The image in a file, see `read_image_file`; a layout whose images do not fit its depth changes them here."""
@@ -101,7 +102,7 @@ class FolderSequence:
         bits = 8
         turned = False
         for number, file in enumerate(files):
-            if not file.image.exists() and not self.folder.exists():
+            if not is_there(file.image) and not self.folder.exists():
                 left = len(files) - number
                 text = (
                     f"`{self.folder}` is no longer there: it was moved or deleted while it was read; the last "
@@ -215,7 +216,7 @@ def depth_is_usable(
                 )
             return True
     if with_depth:
-        gone = not any(file.depth is not None and file.depth.exists() for file in with_depth)
+        gone = not any(file.depth is not None and is_there(file.depth) for file in with_depth)
         what = f"is there: `{with_depth[0].depth}`, ..." if gone else f"has a valid pixel{reason}"
         _warn(f"`{name}`: none of the {len(with_depth)} depth images {what}; reading the images only")
     return False

@@ -140,6 +140,14 @@ MOST_BYTES = 700_000_000
 """Of an image's file: all that is decoded, a hundred million pixels, unpacked, of 16 bits in three channels."""
 
 
+def is_there(path: Path) -> bool:
+    """Whether there is such a path; a list may name what no file system takes, or what may not be looked at."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
 def file_content(path: Path, most: int = MOST_BYTES) -> bytes:
     """All bytes of a regular file that is no larger than an image can be, or than `most`."""
     try:

@@ -22,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, read_depth
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, is_there, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
 from vggtgeo.datasets.pose_files import read_json, trajectory_of
@@ -70,7 +70,7 @@ class Nerfstudio(FolderSequence):
         width, height = common_size(str(folder), files)
         camera = _camera(file, content, list(images.values()), width, height)
         listed = [one.depth for one in files if one.depth is not None]
-        has_depth = any(depth.is_file() for depth in listed)
+        has_depth = any(map(is_there, listed))
         if listed and not has_depth:
             text = f"none of the {len(listed)} depth images is there: `{listed[0]}`, ...; reading the images only"
             warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=3)
