@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -119,6 +121,62 @@ def frame_names(folder: Path) -> None:
     assert formats == {".png"} if len(names) == 3 else len(formats) == 2
 
 
+def recorded(make: Callable[[Path], Path], change: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """A recording in the layout of a benchmark or an app, in which `change` has changed something."""
+
+    def both(folder: Path) -> Path:
+        place = make(folder / "scan")
+        change(place)
+        return place
+
+    return both
+
+
+def other_numbers(name: str, **values: Any) -> Callable[[Path], None]:
+    """A file of JSON, beside the recording or in it, whose objects have other values under these names."""
+
+    def change(folder: Path) -> None:
+        file = next(place for place in (folder / name, folder.parent / name) if place.is_file())
+        content = json.loads(file.read_text())
+        content.get("camera", content).update(values)
+        file.write_text(json.dumps(content))
+
+    return change
+
+
+def backwards(name: str, head: int = 0) -> Callable[[Path], None]:
+    """A list from its last line to its first, the latter twice; head: lines that stay the first."""
+
+    def change(folder: Path) -> None:
+        lines = (folder / name).read_text().splitlines()
+        turned = lines[:head] + lines[: head - 1 if head else None : -1] + lines[head : head + 1]
+        (folder / name).write_text("\n".join(turned) + "\n")
+
+    return change
+
+
+def one_gone(pattern: str) -> Callable[[Path], None]:
+    """The second file of this kind is not there."""
+    return lambda folder: sorted(folder.glob(pattern))[1].unlink()
+
+
+def small_confidence(folder: Path) -> None:
+    """Confidence of another size than its depth."""
+    for file in (folder / "confidence").iterdir():
+        cv2.imwrite(str(file), np.full((10, 10), 2, np.uint8))
+
+
+def only(*files: tuple[str, bytes]) -> Callable[[Path], Path]:
+    """A folder of nothing but these."""
+
+    def make(folder: Path) -> Path:
+        for name, content in files:
+            bad.file(f"pictures/{name}", content)(folder)
+        return folder / "pictures"
+
+    return make
+
+
 def without_half(folder: Path) -> None:
     """Half of the depth images are empty."""
     for file in sorted((folder / "depth").iterdir())[:2]:
@@ -173,6 +231,9 @@ IMAGES = rows(
         ("a BigTIFF's header of 30000 x 30000 pixels", image(bytes_of.big_tiff_header(30000, 30000), ".tiff")),
         ("a JPEG 2000 that is called .png", image(bad.encoded(".jp2"))),
         ("a HEIC that is called .jpg", image(b"\0\0\0\x18ftypheic" + b"\0" * 500, ".jpg")),
+        ("a JPEG XL that is called .png", image(b"\xff\x0a" + b"\0" * 99)),
+        ("a Git LFS pointer", image(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")),
+        ("a folder of HEIC", only(*((f"{row}.HEIC", b"\0\0\0\x18ftypheic") for row in range(3)))),
         ("a GIF that is called .png", image(b"GIF89a" + b"\0" * 500)),
         ("a PNG whose check sum is wrong", image(bad.encoded(".png")[:29] + b"\0" + bad.encoded(".png")[30:])),
         ("a file behind the PNG's end", image(bad.encoded(".png") + b"x" * 9999)),
@@ -223,6 +284,11 @@ DEPTH = rows(
         ("floats of 1e10, which renderers write where there is nothing", depths(".tiff", 1e10 * METRES)),
         ("a folder `depth` of other files", other_depth),
         ("half of them all zero", bad.rgbd(without_half)),
+        ("of Replica, one that is not there", recorded(layouts.replica, one_gone("results/depth*"))),
+        ("of ScanNet, one that is not there", recorded(layouts.scannet, one_gone("depth/*"))),
+        ("of ARKitScenes, one that is not there", recorded(layouts.arkit, one_gone("lowres_depth/*"))),
+        ("of Stray Scanner, no confidence", recorded(layouts.stray, lambda made: shutil.rmtree(made / "confidence"))),
+        ("of Stray Scanner, confidence of another size", recorded(layouts.stray, small_confidence)),
     ],
     call=read_frames,
 )
@@ -235,6 +301,10 @@ DOUBLES = rows(
     ],
     call=frame_names,
 )
+HUGE_POSE = {
+    "file_path": "images/frame_8.png",
+    "transform_matrix": [[1, 0, 0, 10**400], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+}
 LISTS = rows(
     "Lists and poses",
     [
@@ -251,6 +321,17 @@ LISTS = rows(
         ("`rgb.txt` of 20 GB", bad.rgbd(lambda folder: bad.lengthened(folder / "rgb.txt"))),
         ("truth of 20 GB", bad.rgbd(lambda folder: bad.lengthened(folder / "groundtruth.txt")), OPENED),
         ("truth that is a pipe", bad.rgbd(pipe_for("groundtruth.txt")), OPENED),
+        ("poses of ARKitScenes out of order", recorded(layouts.arkit, backwards("lowres_wide.traj")), OPENED),
+        ("poses of Stray Scanner out of order", recorded(layouts.stray, backwards("odometry.csv", 1)), OPENED),
+        (
+            "an alignment of Tanks and Temples that shears",
+            recorded(layouts.tanks, bad.write("scan_trans.txt", "1 5 0 0 0 1 0 0 0 0 1 0 0 0 0 1")),
+            OPENED,
+        ),
+        (
+            "a pose of 400 digits in `transforms.json`",
+            recorded(layouts.nerfstudio, other_numbers("transforms.json", frames=[HUGE_POSE])),
+        ),
     ],
     call=read_frames,
 )
@@ -268,6 +349,16 @@ CALIBRATION = rows(
         ("names before the numbers", calibrated("fx: 55\nfy: 55\ncx: 31.5\ncy: 23.5")),
         ("five million numbers", calibrated("5 " * 5_000_000)),
         ("a pipe", beside(pipe_for("calibration.txt"))),
+        ("Replica's, of other images", recorded(layouts.replica, other_numbers("cam_params.json", w=1200, h=680))),
+        (
+            "Replica's, a scale of 400 digits",
+            recorded(layouts.replica, other_numbers("cam_params.json", scale=10**400)),
+        ),
+        (
+            "Record3D's, numbers of 400 digits",
+            recorded(layouts.record3d, other_numbers("metadata", perFrameIntrinsicCoeffs=[[10**400] * 4] * 3)),
+        ),
+        ("Record3D's, whose size is in texts", recorded(layouts.record3d, other_numbers("metadata", w="40", h="30.0"))),
     ],
     call=read_frames,
 )
@@ -294,6 +385,9 @@ VIDEOS = rows(
         ("a bag of ROS that is a pipe", named("c.bag", os.mkfifo)),
         ("a bag of ROS of 20 GB of zeros", lambda folder: bad.lengthened(folder / "c.bag")),
         ("a video that is called .png", named("c.png", bad.video)),
+        ("a GIF that is called .mp4", bad.file("clip.mp4", bad.encoded(".gif"))),
+        ("a PNG that is called .mp4", bad.file("clip.mp4", bad.encoded(".png"))),
+        ("a JPEG that is called .mov", bad.file("clip.mov", bad.encoded(".jpg"))),
         ("a zip archive", bad.file("clip.mp4", b"PK\x03\x04" + b"\0" * 999)),
     ],
     call=read_frames,

@@ -80,7 +80,7 @@ REFUSED: tuple[tuple[str, Change, str], ...] = (
     ("suite", lambda _: b"a = " + DEEP, r"s.toml` is no TOML"),
     ("suite", lambda _: b"a = 1" + b"0" * 5000, r"s.toml` is no TOML"),
     ("Replica camera", lambda _: DEEP, r"cam_params.json` is no JSON"),
-    ("Replica camera", lambda _: b"1" + b"0" * 5000, r"cam_params.json` is no JSON"),
+    ("Replica camera", lambda _: b"1" + b"0" * 5000, r"cam_params.json`: expected `camera` with fx, fy, cx, cy"),
     ("EuRoC camera", put(b"data: [", b"data: [1.0, "), r"sensor.yaml`: `data` has 17 numbers; expected 16"),
     ("EuRoC list", put(b"1403636579763555584,", "\u00b2,".encode()), r"data.csv`, line 2: found '\u00b2,"),
     ("EuRoC list", put(b"1403636579763555584,", b"1" * 5000 + b","), r"data.csv`, line 2: found '1111"),

@@ -128,6 +128,8 @@ class FolderSequence:
                 empty += 1
                 if empty <= _NAMED_EMPTY_DEPTHS:
                     _warn(f"`{file.depth}` gives no valid depth; the frame is used without")
+            if self.has_depth and depth is None:
+                depth = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
             yield Frame(file.index, file.timestamp, image, depth, file.image.name)
         if empty > _NAMED_EMPTY_DEPTHS:
             _warn(f"`{self.name}`: {empty} of {len(files)} depth images gave no valid depth")
@@ -148,18 +150,18 @@ class FolderSequence:
             return None
         return read
 
-    def _read_depth(self, file: FrameFile) -> np.ndarray:
-        nothing = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
+    def _read_depth(self, file: FrameFile) -> np.ndarray | None:
+        """None where there is no depth, or none that can be used, which is told."""
         if file.depth is None:
-            return nothing
+            return None
         try:
             depth = self.load_depth(file.depth)
         except InputError as error:
             _warn(f"{error}; the frame is used without depth")
-            return nothing
-        if depth.shape != nothing.shape:
+            return None
+        if depth.shape != (self.camera.height, self.camera.width):
             _warn(_other_size(file.depth, depth, self.camera.width, self.camera.height) + "; used without depth")
-            return nothing
+            return None
         return depth
 
 
@@ -220,6 +222,13 @@ def depth_is_usable(
         what = f"is there: `{with_depth[0].depth}`, ..." if gone else f"has a valid pixel{reason}"
         _warn(f"`{name}`: none of the {len(with_depth)} depth images {what}; reading the images only")
     return False
+
+
+def tell_of_no_depth(folder: Path, files: Sequence[FrameFile]) -> None:
+    """How many images have no depth where others have one, in an InputWarning: a copy that stopped half-way, say."""
+    alone = sum(file.depth is None for file in files)
+    if 0 < alone < len(files):
+        _warn(f"`{folder}`: {alone} of {len(files)} images have no depth")
 
 
 def enlarged(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -14,10 +14,11 @@ from vggtgeo.datasets import image_sizes
 
 MOST_PIXELS = 100_000_000
 """Pixels of an image that are decoded: 0.3 GB."""
-_OTHER_FORMATS = (b"GIF8", b"\xff\x4f\xff\x51")
-_OTHER_BOXES = (b"jP  ", b"ftyp")
+_OTHER_FORMATS = (b"GIF8", b"\xff\x4f\xff\x51", b"\xff\x0a")
+_OTHER_BOXES = (b"jP  ", b"ftyp", b"JXL ")
 """OpenCV takes them by their content. Some hundred bytes of them may declare gigabytes of pixels, at places of the file
 that nobody here reads, and their own kind of turning is applied without a word."""
+_LFS_POINTER = b"version https://git-lfs"
 _LEFT_OVER = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MOST_LEFT_OVER = 4
 
@@ -35,7 +36,9 @@ def defect(content: bytes) -> str:
     if _lacks_scans(content):
         return "is cut off: scans of the progressive JPEG are missing"
     if content.startswith(_OTHER_FORMATS) or content[4:8] in _OTHER_BOXES:
-        return "is a GIF, JPEG 2000, AVIF or HEIC, whatever its name: convert it to PNG or JPEG"
+        return "is a GIF, JPEG 2000, JPEG XL, AVIF or HEIC, whatever its name: convert it to PNG or JPEG"
+    if content.startswith(_LFS_POINTER):
+        return "is a Git LFS pointer, not the image itself: fetch it with `git lfs pull`"
     width, height = declared_size(content)
     if width * height > MOST_PIXELS:
         return f"declares {width} x {height} pixels, more than {MOST_PIXELS // 10**6} million: not decoded"

@@ -96,7 +96,7 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     """The depth, float32 metres, NaN for none, of an image or an array of NumPy (`.npy`); InputError where it has not
     one channel, of 16-bit numbers or of floats.
     """
-    codes = _codes(path)
+    codes = read_codes(path)
     codes = codes[..., 0] if codes.ndim == 3 and codes.shape[2] == 1 else codes
     if codes.ndim == 2 and np.issubdtype(codes.dtype, np.floating):
         with np.errstate(over="ignore", invalid="ignore"):
@@ -113,7 +113,8 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     return depth
 
 
-def _codes(path: Path) -> np.ndarray:
+def read_codes(path: Path) -> np.ndarray:
+    """The numbers in an image or an array of NumPy, as they are stored; InputError where it cannot be read."""
     if path.suffix.lower() == ".npy":
         return _array(path)
     if path.suffix.lower() == ".exr":

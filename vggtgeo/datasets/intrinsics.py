@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.pose_files import read_json
+from vggtgeo.datasets.pose_files import read_json, same_size
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 
@@ -92,7 +92,7 @@ def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
         content = read_json(file) if file.is_file() else None
     except InputError:
         return None
-    if not isinstance(content, dict) or (content.get("w"), content.get("h")) != (width, height):
+    if not isinstance(content, dict) or not same_size((content.get("w"), content.get("h")), (width, height)):
         return None
     values = record3d_intrinsics(content)
     if values is None:
@@ -242,7 +242,7 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
     if not isinstance(content, dict):
         raise InputError(f"`{file}`: found {type(content).__name__}; expected an object with the camera")
     size = content.get("width", width), content.get("height", height)
-    if tuple(map(str, size)) != (str(width), str(height)):
+    if not same_size(size, (width, height)):
         raise InputError(
             f"`{file}` is of images of {size[0]} x {size[1]} pixels; those here are {width} x {height}: write the "
             f"camera of these into `{CALIBRATION}`, or give --intrinsics fx,fy,cx,cy"
@@ -257,7 +257,7 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
         raise InputError(f"`{file}`: expected `intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`")
     try:
         return Camera(check_intrinsics(tuple(map(float, found))), width, height)
-    except (InputError, OverflowError) as error:
+    except InputError as error:
         raise InputError(f"`{file}`: {error}") from None
 
 

@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, is_there, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
@@ -67,6 +67,7 @@ class Nerfstudio(FolderSequence):
             FrameFile(index, index / FRAMES_PER_SECOND, image, _depth(folder, file, images[image]))
             for index, image in enumerate(order)
         )
+        tell_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         camera = _camera(file, content, list(images.values()), width, height)
         listed = [one.depth for one in files if one.depth is not None]
@@ -88,7 +89,8 @@ class Nerfstudio(FolderSequence):
         frames = {_image(self.folder, file, frame): frame for frame in read_json(file)["frames"]}
         poses = [_pose(file, frames[one.image]) for one in self.files if one.image in frames]
         times = [one.timestamp for one in self.files if one.image in frames]
-        return trajectory_of(times, np.array(poses) @ FROM_OPENGL, file) if poses else None
+        with np.errstate(invalid="ignore"):  # of poses with infinities, which are left out
+            return trajectory_of(times, np.array(poses) @ FROM_OPENGL, file) if poses else None
 
     @property
     def truth_in_metres(self) -> bool:

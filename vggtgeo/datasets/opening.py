@@ -147,13 +147,21 @@ def _open_video(file: Path) -> Sequence:
         raise InputError(f"`{file}` is a folder; the reader 'video' needs a file")
     if not file.is_file():
         raise InputError(f"`{file}` is no regular file; give a folder of images or a video file")
-    if file.suffix.lower() == ".gif":
+    with file.open("rb") as opened:
+        head = opened.read(len(_PNG))
+    # FFmpeg goes by the content, and takes a picture for a video of one frame; a stream of Motion JPEG begins as one.
+    if file.suffix.lower() == ".gif" or head.startswith(b"GIF8"):
         raise InputError(f"`{file}` is a GIF, whose colours and times are not those of a camera; give the video itself")
-    if file.suffix.lower() in IMAGE_SUFFIXES:
+    a_jpeg = head.startswith(b"\xff\xd8") and file.suffix.lower() not in _MOTION_JPEG
+    if file.suffix.lower() in IMAGE_SUFFIXES or a_jpeg or head == _PNG:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
     if reason := reason_not_read(file):
         raise InputError(reason)
     return VideoFile.open(file)
+
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_MOTION_JPEG = (".mjpg", ".mjpeg")
 
 
 def _hint(folder: Path) -> str:

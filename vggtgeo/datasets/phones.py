@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import MILLIMETRES, read_depth
+from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.images import files_like
 from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_matrix, trajectory_of
@@ -37,6 +37,7 @@ LARGEST = 960
 """Pixels of the longer side: the depth has 256, and 1920 pixels of image cost four times as much."""
 _LEAST_CONFIDENCE = 1
 """Of 0 (low), 1 and 2."""
+_CONFIDENCE = "confidence"
 _MOST_DELAY = 0.02
 
 
@@ -79,6 +80,12 @@ class StrayScanner:
                 stacklevel=3,
             )
         has_depth = bool(files_like(folder / "depth", "*.png"))
+        if has_depth and not (folder / _CONFIDENCE).is_dir():
+            warnings.warn(
+                f"`{folder}` has no folder `{_CONFIDENCE}`: its depth is used whatever the phone thought of it",
+                InputWarning,
+                stacklevel=3,
+            )
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
 
     def __len__(self) -> int:
@@ -109,10 +116,20 @@ class StrayScanner:
         except InputError as error:
             warnings.warn(f"{error}; the frame is used without depth", InputWarning, stacklevel=3)
             return np.full(shape, np.nan, np.float32)
-        trust = cv2.imread(str(self.folder / "confidence" / file.name), cv2.IMREAD_UNCHANGED)
-        if trust is not None and trust.shape == depth.shape:
-            depth[trust < _LEAST_CONFIDENCE] = np.nan
+        if (self.folder / _CONFIDENCE).is_dir():
+            self._leave_out_doubtful(depth, self.folder / _CONFIDENCE / file.name)
         return enlarged(depth, (self.camera.width, self.camera.height))
+
+    def _leave_out_doubtful(self, depth: np.ndarray, file: Path) -> None:
+        """Makes NaN of what the phone does not trust; where that is not known all stays, with an InputWarning."""
+        try:
+            trust = read_codes(file)
+            if trust.shape != depth.shape:
+                raise InputError(f"`{file}`: found the shape {trust.shape}; its depth has {depth.shape}")
+        except InputError as error:
+            warnings.warn(f"{error}; all depth of the frame is used", InputWarning, stacklevel=4)
+        else:
+            depth[trust < _LEAST_CONFIDENCE] = np.nan
 
 
 @dataclass(frozen=True)
@@ -134,6 +151,7 @@ class ArkitScenes(FolderSequence):
         files = tuple(
             FrameFile(index, time, image, _nearest(time, depths)) for index, (time, image) in enumerate(images)
         )
+        tell_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         has_depth = any(file.depth is not None for file in files)
         return cls(folder, folder.resolve().name, _pincam(folder, width, height), files, MILLIMETRES, has_depth)

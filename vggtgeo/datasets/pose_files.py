@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory, rising
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
@@ -49,7 +49,8 @@ def trajectory_of(
     times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path, of: str = "truth"
 ) -> Trajectory | None:
     """Camera -> world at `times`; poses with NaN or infinity, or without a rotation, as files have them where tracking
-    was lost, are left out with an InputWarning. of: what they are, for that.
+    was lost, are left out with an InputWarning; so are those of a time that was there, and lines out of order are
+    sorted, as those of a file of TUM. of: what they are, for that.
 
     None where no pose is left.
     """
@@ -70,7 +71,11 @@ def trajectory_of(
             InputWarning,
             stacklevel=3,
         )
-    return Trajectory(times[turned], _orthonormal(poses[turned])) if turned.any() else None
+    if not turned.any():
+        return None
+    rows = np.flatnonzero(turned)
+    rows = rows[rising(where, times[rows])]
+    return Trajectory(times[rows], _orthonormal(poses[rows]))
 
 
 def trajectory_of_rows(
@@ -132,10 +137,34 @@ def read_text(file: Path) -> str:
 
 def read_json(file: Path) -> Any:
     """The content of a JSON file; InputError where it is none."""
+    return json_in(read_text(file), file)
+
+
+def json_in(content: str | bytes, where: Path) -> Any:
+    """What a text of JSON says; InputError where it is none. where: it stands, for that."""
     try:
-        return json.loads(read_text(file))
-    except (ValueError, RecursionError) as error:  # numbers of too many digits and too many brackets are neither
-        raise InputError(f"`{file}` is no JSON: {error}") from None
+        return json.loads(content, parse_int=_whole)
+    except (ValueError, RecursionError) as error:  # too many brackets are no error of the syntax
+        raise InputError(f"`{where}` is no JSON: {error}") from None
+
+
+def same_size(stated: Sequence[object], size: tuple[int, int]) -> bool:
+    """Whether a width and a height of JSON are these: scripts write `640`, `640.0` and `"640"`."""
+    try:
+        return tuple(float(str(side)) for side in stated) == size
+    except ValueError:
+        return False
+
+
+_MOST_DIGITS = 300
+"""Of a whole number that float64 holds, whatever its digits are."""
+
+
+def _whole(digits: str) -> float:
+    """A whole number; as a float, infinite at last, where it has so many digits that none can be made of it later:
+    readers look for what is not finite, and not for an overflow.
+    """
+    return int(digits) if len(digits) <= _MOST_DIGITS else float(digits)
 
 
 def _have_rotations(poses: np.ndarray) -> np.ndarray:

@@ -12,7 +12,6 @@ LZFSE is decoded by the package imagecodecs, EXR by OpenEXR (extra `phones`). Po
 independent truth.
 """
 
-import json
 import math
 import re
 import warnings
@@ -26,7 +25,7 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
 from vggtgeo.datasets.image_files import (
     FARTHEST,
     MILLIMETRES,
@@ -39,7 +38,7 @@ from vggtgeo.datasets.image_files import (
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, intrinsics_of, record3d_intrinsics
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.datasets.pose_files import poses_of, trajectory_of
+from vggtgeo.datasets.pose_files import json_in, poses_of, same_size, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
@@ -101,6 +100,7 @@ class Record3d(FolderSequence):
         unread = cls(folder, folder.resolve().name, Camera.guess(1, 1), ())
         metadata = unread.metadata()
         files = tuple(map(FrameFile, range(len(numbers)), _times(metadata, numbers), images, there))
+        tell_of_no_depth(folder, files)
         width, height = common_size(str(folder), files, lambda path: unread.load_image(path).image)
         camera = _camera(unread.file, metadata, width, height) or guess_with_warning(str(folder), width, height)
         whole = cls(folder, unread.name, camera, files, MILLIMETRES, any(there), _depth_size(metadata))
@@ -114,10 +114,7 @@ class Record3d(FolderSequence):
     def metadata(self) -> Mapping[str, Any]:
         """What the file of the metadata holds; InputError where it is no JSON object."""
         where = self.file
-        try:
-            content = json.loads(self._content(where, MOST_TEXT))
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"`{where}` is no JSON: {error}") from None
+        content = json_in(self._content(where, MOST_TEXT), where)
         if not isinstance(content, dict):
             raise InputError(f"`{where}` holds no object of JSON; expected one with `K`, `fps` and `poses`")
         return content
@@ -272,7 +269,7 @@ def _is_number(value: Any) -> bool:
 def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -> Camera | None:
     """Of the metadata; None where they have none, or one of other images, which is told."""
     size = metadata.get("w"), metadata.get("h")
-    if None not in size and size != (width, height):
+    if None not in size and not same_size(size, (width, height)):
         warnings.warn(
             f"`{where}` has a camera for {size[0]} x {size[1]} pixels; the images are {width} x {height}: not used",
             InputWarning,

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, tell_of_no_depth
 from vggtgeo.datasets.image_files import DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
-from vggtgeo.datasets.pose_files import read_json, read_matrices, trajectory_of_rows
+from vggtgeo.datasets.pose_files import read_json, read_matrices, same_size, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -46,6 +46,7 @@ class Replica(FolderSequence):
             FrameFile(index, (row - rows[0]) / FRAMES_PER_SECOND, image, _depth(image))
             for index, (row, image) in enumerate(zip(rows, images, strict=True))
         )
+        tell_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         camera, units = _camera(folder, width, height)
         coding = DepthFormat(units)
@@ -84,6 +85,12 @@ def _camera(folder: Path, width: int, height: int) -> tuple[Camera, float]:
                 raise InputError(f"`{file}`: expected `camera` with fx, fy, cx, cy and scale ({error!r})") from None
             if not (math.isfinite(scale) and scale > 0):
                 raise InputError(f"`{file}`: `scale` is {scale}; it must be a positive number of units a metre")
+            stated = camera.get("w", width), camera.get("h", height)
+            if not same_size(stated, (width, height)):
+                raise InputError(
+                    f"`{file}` is of images of {stated[0]} x {stated[1]} pixels; those here are {width} x {height}: "
+                    "write the camera of these into it"
+                )
             return Camera(intrinsics_of(file, found), width, height), scale
     own = camera_from_folder(folder, width, height)
     if own is None and (width, height) != _PUBLISHED_SIZE:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, tell_of_no_depth
 from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MILLIMETRES
 from vggtgeo.datasets.images import image_files, times_by_name
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
@@ -70,11 +70,9 @@ class RgbdFolders(FolderSequence):
             _warn(f"`{folder}`: {len(loose)} images{beside} ({loose[0].name}, ...) are left out")
         times = times_by_name(images)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
-        alone = partners.count(None)
-        if depths and alone:
-            _warn(f"`{folder}`: {alone} of {len(images)} images have no depth")
         rows = sorted(zip(times, images, partners, strict=True), key=lambda row: row[0])
         files = tuple(FrameFile(index, time, image, partner) for index, (time, image, partner) in enumerate(rows))
+        tell_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         camera = (
             camera_from_folder(folder, width, height)

@@ -57,7 +57,7 @@ class TanksAndTemples(FolderSequence):
         numbers, poses = _read_log(file)
         alignment = self.folder / file.name.replace(_LOG, "_trans.txt")
         if alignment.is_file():
-            poses = moved(poses, read_matrix(alignment, (4, 4)))
+            poses = moved(poses, _similarity(alignment))
         return trajectory_of(np.array(numbers) / FRAMES_PER_SECOND, poses, file)
 
     @property
@@ -84,6 +84,21 @@ class TanksAndTemples(FolderSequence):
         """The name that the files begin with."""
         file = next(iter(files_like(self.folder, f"*{_LOG}")), None)
         return None if file is None else file.name.removesuffix(_LOG)
+
+
+def _similarity(file: Path) -> Float[np.ndarray, "4 4"]:
+    """The matrix of a file; InputError where it is no scale, rotation and translation: what it makes of the poses would
+    be no poses, and the log would get the blame.
+    """
+    matrix = read_matrix(file, (4, 4))
+    turn = matrix[:3, :3]
+    with np.errstate(all="ignore"):
+        squares = turn @ turn.T
+        even = np.isfinite(matrix).all() and np.allclose(squares, squares[0, 0] * np.eye(3), atol=0.01 * squares[0, 0])
+        scales = bool(even and squares[0, 0] > 0 and np.linalg.det(turn) > 0)
+    if not scales or not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-3):
+        raise InputError(f"`{file}` is no scale, rotation and translation of the world: found {matrix.tolist()}")
+    return matrix
 
 
 def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 4 4"]:

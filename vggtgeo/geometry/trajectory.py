@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.io.errors import InputError, InputWarning
@@ -100,7 +100,8 @@ class Trajectory:
         kept, both with an InputWarning. InputError names the file and line for a missing file, a wrong number
         of columns, what is not a finite number, or a quaternion of length zero.
         """
-        rows = _in_order(path, _read_rows(path))
+        rows = _read_rows(path)
+        rows = rows[rising(path, rows[:, 0])]
         quaternions = rows[:, 4:]
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
@@ -169,21 +170,24 @@ def _parse_row(where: str, text: str) -> list[float]:
     return row
 
 
-def _in_order(path: str | os.PathLike[str], rows: np.ndarray) -> np.ndarray:
-    if (np.diff(rows[:, 0]) < 0).any():
-        row = int(np.argmax(np.diff(rows[:, 0]) < 0)) + 1
+def rising(path: str | os.PathLike[str], times: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
+    """Which poses of a file make a trajectory, and in which order: sorted, and of each time the first; both with an
+    InputWarning that names the file.
+    """
+    order = np.argsort(times, kind="stable")
+    if (np.diff(times) < 0).any():
+        row = int(np.argmax(np.diff(times) < 0)) + 1
         warnings.warn(
-            f"`{path}`: timestamps are out of order (first {rows[row, 0]:.6f}); the poses were sorted",
+            f"`{path}`: timestamps are out of order (first {times[row]:.6f}); the poses were sorted",
             InputWarning,
             stacklevel=3,
         )
-        rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    first = np.concatenate([[True], np.diff(rows[:, 0]) > 0])
+    first = np.diff(times[order], prepend=-np.inf) > 0
     if not first.all():
         warnings.warn(
             f"`{path}`: {int((~first).sum())} poses repeat the time of another (first at "
-            f"{rows[int(np.argmin(first)), 0]:.6f}); the first of each was kept",
+            f"{times[order][int(np.argmin(first))]:.6f}); the first of each was kept",
             InputWarning,
             stacklevel=3,
         )
-    return rows[first]
+    return order[first]
