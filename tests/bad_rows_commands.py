@@ -123,6 +123,12 @@ def into_garbage(made: Path) -> Any:
     return run_with("--resume")(made)
 
 
+def euroc_backwards(path: Path) -> None:
+    """A trajectory of 17 columns, times in nanoseconds, its last line the first."""
+    lines = [f"{10**18 + number * 10**9 // 30},{number % 7},{number % 3},0,1" + ",0" * 12 for number in range(60)]
+    path.write_text("\n".join(reversed(lines)) + "\n")
+
+
 def verify(made: Path) -> Any:
     """`vggtgeo models verify`."""
     return ["models", "verify", made]
@@ -238,6 +244,27 @@ def exported_over(folder: Path) -> Path:
     return folder
 
 
+def linked_to_itself(name: str) -> Any:
+    """Good images, and beside them a link to itself."""
+
+    def make(folder: Path) -> Path:
+        (folder / name).symlink_to(name)
+        return good(folder)
+
+    return make
+
+
+def run_and_link(folder: Path) -> Path:
+    """A run's folder, in which a link to itself lies."""
+    (folder / "out").symlink_to("out")
+    return Path(folder_of_run(summary_of("good"))(folder))
+
+
+def beside_made(flag: str, name: str) -> Any:
+    """`vggtgeo run` on good images, a flag with the name of something beside them."""
+    return lambda made: ["run", made, "-o", made.parent / "out", flag, made.parent / name]
+
+
 def looped(folder: Path) -> Path:
     """Two links to each other."""
     (folder / "a").symlink_to(folder / "b")
@@ -315,6 +342,8 @@ RUN = rows(
         ("two paths", good, {"argv": lambda made: ["run", made, made]}),
         ("`-` for standard input", nothing, {"argv": line("run", "-")}),
         ("a link to itself", looped, {"argv": lambda made: ["run", made]}),
+        ("a webcam of a number that no computer has", nothing, {"argv": line("run", "webcam:99999999999")}),
+        ("`--rerun` onto a link to itself", linked_to_itself("run.rrd"), {"argv": beside_made("--rerun", "run.rrd")}),
         ("the reader of videos on a folder", good, flags("--kind", "video")),
         ("the reader of folders on a file", bad.file("clip.mp4", b"no"), flags("--kind", "tum")),
     ],
@@ -362,6 +391,12 @@ OUTPUT = rows(
         ("a folder with a file that is called `unfinished`", None, output(somebodys("unfinished"), "things")),
         ("a folder with somebody's files in `unfinished`", None, output(somebodys("unfinished/mine.txt"), "things")),
         ("the root of the file system", good, {"argv": lambda made: ["run", made, "-o", "/"]}),
+        ("a link to itself", linked_to_itself("out"), {"argv": lambda made: ["run", made, "-o", made.parent / "out"]}),
+        (
+            "a folder below a link to itself",
+            linked_to_itself("out"),
+            {"argv": lambda made: ["run", made, "-o", made.parent / "out/deeper"]},
+        ),
         ("of `solve`: a folder", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made.parent]}),
         ("of `solve`: a device", bad.problem(), {"argv": lambda made: ["solve", made, "-o", "/dev/full"]}),
         ("of `solve`: the problem", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made]}),
@@ -378,6 +413,11 @@ OTHERS = rows(
             "`export` over files that no export wrote",
             exported_over,
             {"call": lambda made: export(made / "run", "tum", made / "mine")},
+        ),
+        (
+            "`export` onto a link to itself",
+            run_and_link,
+            {"call": lambda made: export(made, "tum", made / "out")},
         ),
         (
             "`export` of a run without points",
@@ -449,6 +489,7 @@ TRAJECTORIES = rows(
         ("times that never meet", None, evaluated(walk(), walk(start=1e6))),
         ("few times that meet", None, evaluated(walk(), walk(start=1.5))),
         ("the truth of another sequence", None, evaluated(walk(0), walk(1))),
+        ("EuRoC's columns, out of order", None, evaluated(euroc_backwards, walk(start=1e9))),
         (
             "a dataset without truth",
             good,

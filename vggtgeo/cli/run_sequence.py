@@ -19,6 +19,7 @@ from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.datasets.reduced import reduced
 from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import whole_path
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.models.classical import SensorDepth
@@ -183,7 +184,7 @@ def _rerun_callbacks(
     if output.rerun is None:
         return (), None
     target = output.rerun
-    if target not in ("spawn", "serve") and Path(target).parent.resolve() == output.folder.resolve():
+    if target not in ("spawn", "serve") and whole_path(Path(target).parent) == whole_path(output.folder):
         target = str(folder.stage / Path(target).name)
     opened = open_target(target, name, folder.stage / STAND_IN)
     if opened.url is not None:

@@ -15,6 +15,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_problem, save_solution
 from vggtgeo.bundle.solution import Solution, solve
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import whole_path
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 
@@ -53,7 +54,7 @@ def check_output(problem: Path, output: Path) -> None:
         )
     if output.exists() and problem.exists() and output.samefile(problem):
         raise InputError(f"`{output}` is the problem itself; give another name for the solution with `-o`")
-    above = next(folder for folder in output.resolve().parents if folder.exists())
+    above = next(folder for folder in whole_path(output).parents if folder.exists())
     if not (above.is_dir() and os.access(above, os.W_OK)):
         raise InputError(f"`{output}` cannot be written: `{above}` is no folder, or may not be written")
 

@@ -14,7 +14,8 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
-_WEBCAM = re.compile(r"webcam(?::(\d+))?")
+_WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
+"""Of a number that OpenCV has a place for; another name is one of a file, which is not there."""
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://.+", re.IGNORECASE)
 
 

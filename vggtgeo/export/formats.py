@@ -15,6 +15,7 @@ from vggtgeo.export.nerfstudio import write_nerfstudio
 from vggtgeo.export.paths import write_kitti, write_tum
 from vggtgeo.export.surfaces import write_glb, write_las, write_ply
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.files import whole_path
 from vggtgeo.io.given import path_of
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.summary_file import read_summary
@@ -66,7 +67,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     try:  # what is there already stays until all is written
         written = FORMATS[to](place, stage)
         names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
-        _claim(output, names, ours=output.resolve() == (place / "export" / to).resolve())
+        _claim(output, names, ours=whole_path(output) == whole_path(place / "export" / to))
         for name in names:
             (output / name).parent.mkdir(parents=True, exist_ok=True)
             (stage / name).replace(output / name)
@@ -84,10 +85,10 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
 
 def _check_target(output: Path, run: Path) -> None:
     """InputError where the files of an export would lie among those of the run, or in no folder."""
-    if output.resolve() == run.resolve():
+    if whole_path(output) == whole_path(run):
         raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
     for name in ("images", "depth"):
-        if output.resolve().is_relative_to((run / name).resolve()):
+        if whole_path(output).is_relative_to(whole_path(run / name)):
             raise InputError(f"`{output}` is in `{run / name}`, which is the run's own; give another for the export")
     for folder in (output, *output.parents):
         if os.path.lexists(folder) and not folder.is_dir():

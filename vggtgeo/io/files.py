@@ -17,6 +17,13 @@ from typing import IO, Any
 from vggtgeo.io.given import path_of
 
 
+def whole_path(path: Path) -> Path:
+    """Where a path leads: absolute, without links. Of links that go round in a circle, which `Path.resolve` ends with a
+    RuntimeError for, the path itself: whoever opens that says what is wrong with it.
+    """
+    return Path(os.path.realpath(path))
+
+
 def make_parent(path: Path) -> None:
     """Makes the folder that `path` lies in, and those above it."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import write_text
+from vggtgeo.io.files import whole_path, write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.io.text_files import whole_text
@@ -253,7 +253,7 @@ def _refuse_strange(stage: Path) -> None:
     """InputError for an `unfinished` that no run left there: a run takes away what it finds in its place. The root of
     the file system is nobody's folder for results.
     """
-    if stage.parent.resolve() == Path(stage.resolve().anchor):
+    if whole_path(stage.parent) == Path(whole_path(stage).anchor):
         raise InputError(f"`{stage.parent}` is the root of the file system; give a folder for the results with `-o`")
     if stage.is_symlink() or not stage.exists():
         return
@@ -270,7 +270,7 @@ def _refuse_strange(stage: Path) -> None:
 def _inside(place: Path, source: Path) -> str | None:
     """The first part of the way from `place` to `source`; None where it does not lie in it."""
     try:
-        parts = source.resolve().relative_to(place.resolve()).parts
+        parts = whole_path(source).relative_to(whole_path(place)).parts
     except ValueError:
         return None
     return parts[0] if parts else None
@@ -284,7 +284,7 @@ def is_result(folder: Path, file: Path) -> bool:
 
 def is_in_results(folder: Path, file: Path) -> bool:
     """Whether `file` lies in a folder that a run into `folder` replaces: `images`, `depth`, `unfinished`."""
-    return is_result(folder, file) and file.resolve().parent != folder.resolve()
+    return is_result(folder, file) and whole_path(file).parent != whole_path(folder)
 
 
 def _is_known(name: str) -> bool:
@@ -298,7 +298,7 @@ def _old_recording(folder: Path) -> list[str]:
     except (OSError, ValueError, RecursionError):
         return []
     path = Path(str(target))
-    inside = path.suffix == ".rrd" and path.parent.resolve() == folder.resolve()
+    inside = path.suffix == ".rrd" and whole_path(path.parent) == whole_path(folder)
     return [path.name] if inside else []
 
 
