@@ -87,6 +87,12 @@ def trajectory(times: Any, poses: Any) -> Callable[[Path], Any]:
     return lambda _: vg.Trajectory(times, poses)
 
 
+def evaluated(**options: Any) -> Callable[[Path], Any]:
+    """`vg.evaluate` of a trajectory against itself."""
+    steps = [np.block([[np.eye(3), np.full((3, 1), row)], [0.0, 0.0, 0.0, 1.0]]) for row in range(5)]
+    return lambda _: vg.evaluate(vg.Trajectory(range(5), steps), vg.Trajectory(range(5), steps), **options)
+
+
 def simulated(*given: Any, **options: Any) -> Callable[[Path], Any]:
     """`vg.simulate`."""
     return lambda _: vg.simulate(*given, **options)
@@ -161,6 +167,15 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a folder as checkpoints", reconstruct(checkpoints="out")),
     ("a function as a callback", reconstruct(callbacks=[print])),
     ("facts that JSON does not have", reconstruct(facts={"when": object()})),
+    ("a fact whose name is a number", reconstruct(facts={1: 2})),
+    ("a fact that every summary has", reconstruct(facts={"verdict": "good"})),
+    ("warnings that are one text", reconstruct(warned="dark")),
+    ("warnings that are a number", reconstruct(warned=5)),
+    ("an image of 3.6 billion pixels", reconstruct(lambda: [np.broadcast_to(np.uint8(3), (60000, 60000, 3))])),
+    ("checkpoints every `often`", lambda _: vg.Checkpoints("night.npz", every="often")),
+    ("`evaluate`: `delta` that is a text", evaluated(delta="a")),
+    ("`evaluate`: a letter for `vertical`", evaluated(vertical="z")),
+    ("a camera resized to nothing", lambda _: vg.Camera((50, 50, 32, 24), 64, 48).resized(0, 0)),
     ("a seed that is none", reconstruct(seed=None)),
     ("a stride of one and a half", reconstruct(stride=1.5)),
     ("`run`: a stride of 0", lambda _: next(vg.run(IMAGES, stride=0))),

@@ -221,7 +221,8 @@ def test_a_picture_every_few_seconds_is_followed() -> None:
 
 
 def test_doubtful_numbers_are_named() -> None:
-    # Proves the warnings of few matches, another clock, a short estimate and an absurd scale, and none for a good one.
+    # Proves the warnings of few matches, another clock, a short estimate, an absurd scale and an RPE of no pair, and
+    # none for a good one.
     truth = _truth()
     good = Trajectory(truth.timestamps, _estimate(truth).poses)
     assert evaluate_trajectory(good, truth).warnings == ()
@@ -229,6 +230,9 @@ def test_doubtful_numbers_are_named() -> None:
     assert "follows 25 %" in evaluate_trajectory(good.select(slice(0, 31)), truth).warnings[0]
     scaled = Trajectory(truth.timestamps, _scaled(good.poses, 9.0))
     assert "the scale is 0.111" in evaluate_trajectory(scaled, truth).warnings[0]
+    assert evaluate_trajectory(good, truth, delta=119).warnings == ()
+    assert "no two of them are 120 poses apart" in evaluate_trajectory(good, truth, delta=120).warnings[0]
+    assert "no two of them are 1e+06 metres" in evaluate_trajectory(good, truth, delta=1e6, unit="metres").warnings[0]
     shifted = Trajectory(truth.timestamps + np.where(np.arange(120) % 3, 0.012, 0.0), good.poses)
     assert "only 40 of 120 poses match" in evaluate_trajectory(shifted, truth, max_dt=1e-4).warnings[0]
 

@@ -170,7 +170,10 @@ def test_a_record_of_another_file_is_refused(check: Callable, tmp_path: Path) ->
     path = tiny.letr(tmp_path / "letr.onnx")
     np.savez(tmp_path / "wrong.npz", **{"input.images": np.zeros(3), "output.depth": np.zeros(3)})
     (tmp_path / "none.npz").write_bytes(b"PK nothing")
-    for name, message in (("wrong", "expected those of"), ("none", "cannot be read as a parity record")):
+    (tmp_path / "text.npz").write_bytes(b"1.0 2.0")
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "wrong.npz").read_bytes()[:-30])
+    unread = "cannot be read as a parity record (.npz): File is not a zip file"
+    for name, message in (("wrong", "expected those of"), ("none", unread), ("text", unread), ("cut", unread)):
         result = check(path, "--against", tmp_path / f"{name}.npz")
         assert result.exit_code == 2
         assert message in result.output

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import LeftOutWarning
+from vggtgeo.results.summary import OWN
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.settings_table import changed
 
@@ -147,6 +148,7 @@ def test_any_iterable_of_frames_will_do() -> None:
     assert found.record.title == "a list"
     assert found.record.truth is None
     assert expected.record.truth is not None
+    assert expected.summary.keys() <= OWN  # what no fact of a caller may be called
     with pytest.raises(vg.InputError, match="`frames` is empty"):
         vg.reconstruct([])
 

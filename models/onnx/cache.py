@@ -5,9 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-import struct
-import zipfile
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -15,16 +12,12 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from vggtgeo.models.onnx.file_checks import UNREADABLE
 from vggtgeo.models.onnx.session import Session
 
 Outputs = dict[str, np.ndarray]
 _NAMES = "names of all arrays"
 """An array beside the answer: of a file whose list of members is damaged, some may be missing."""
-_UNREADABLE = (
-    *(OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, struct.error, NotImplementedError, MemoryError),
-    *(SyntaxError, TypeError, AttributeError, KeyError, OverflowError, RecursionError),
-)
-"""What numpy and zipfile raise of files that are damaged, whatever bit of them is."""
 
 
 @runtime_checkable
@@ -109,7 +102,7 @@ def _read(path: Path) -> Outputs | None:
             named = found.pop(_NAMES).tolist()
             arrays = all(isinstance(value, np.ndarray) for value in found.values())  # no such member: its raw bytes
             return found if arrays and sorted(found) == named else None
-    except _UNREADABLE:
+    except UNREADABLE:
         return None
 
 

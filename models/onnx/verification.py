@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from vggtgeo.models.onnx.contracts import Patches, Tensor
-from vggtgeo.models.onnx.file_checks import NetworkFileError, Signature
+from vggtgeo.models.onnx.file_checks import UNREADABLE, NetworkFileError, Signature
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 from vggtgeo.models.onnx.mlsd import prepare
 from vggtgeo.models.onnx.session import Session
@@ -105,9 +106,10 @@ def _summary(array: np.ndarray) -> Output:
 
 def _read_record(session: Session, recorded: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     try:
-        with recorded.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+        # NumPy takes what is no archive for a pickle, and would have the user trust it.
+        with recorded.open("rb") as handle, zipfile.ZipFile(handle), np.load(handle, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (ValueError, EOFError, OSError) as error:
+    except UNREADABLE as error:
         raise NetworkFileError(f"`{recorded}` cannot be read as a parity record (.npz): {error}") from None
     inputs, outputs = (
         {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}

@@ -46,6 +46,8 @@ def verify_file(
     record = against or (beside if beside.is_file() else None)
     with as_input_errors():
         session = open_session(file, CONTRACTS[_contract_name(file, network)], provider=provider)
+        # First: whether the record is one is known at once, and the room that is shown takes seconds to render.
+        parity = verification.parity(session, record) if record else {}
         inputs = verification.example_inputs(session, shown_image(image))
         return Report(
             file=str(file),
@@ -56,7 +58,7 @@ def verify_file(
             inputs={name: array.shape for name, array in inputs.items()},
             outputs=verification.check_outputs(session, inputs),
             latency=verification.latency(session, inputs, runs),
-            parity=verification.parity(session, record) if record else {},
+            parity=parity,
             limit=verification.tolerance(session),
         )
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_depth, check_selection, described
+from vggtgeo.datasets.image_defects import MOST_PIXELS
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -50,6 +51,10 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: floa
     if first is None:
         raise InputError("`frames` is empty; give at least one frame")
     height, width = first.image.shape[:2]
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"`{first.name}` is {width} x {height} pixels, more than {MOST_PIXELS // 10**6} million; reduce the images"
+        )
     source = _of_one_kind(first, counted)
     return FrameStream(camera or Camera.guess(width, height), first.depth is not None, source)
 

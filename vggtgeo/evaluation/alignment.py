@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import real_numbers
 
 Alignment = Literal["none", "se3", "sim3", "yaw"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
@@ -77,10 +78,11 @@ def heading(
     `umeyama`, or for a vertical without direction.
     """
     _check(source, target)
-    length = float(np.linalg.norm(vertical))
-    if not (np.isfinite(length) and length > 0):
-        raise InputError(f"`vertical` is {vertical}; it must be a direction")
-    axis = np.asarray(vertical, np.float64) / length
+    given = real_numbers("vertical", vertical)
+    length = float(np.linalg.norm(given))
+    if given.shape != (3,) or not (np.isfinite(length) and length > 0):
+        raise InputError(f"`vertical` is {vertical}; it must be a direction, three numbers")
+    axis = np.asarray(given, np.float64) / length
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     s, t = source - source_mean, target - target_mean
     level = float((s * t).sum() - (s @ axis) @ (t @ axis))

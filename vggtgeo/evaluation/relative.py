@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from vggtgeo.evaluation.statistics import ErrorStatistics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_real
 
 Unit = Literal["poses", "seconds", "metres"]
 UNITS: tuple[Unit, ...] = get_args(Unit)
@@ -92,6 +93,7 @@ def pairs(
     """Rows of the first and the second pose of each pair that lies `delta` apart; see `relative_error`."""
     if unit not in UNITS:
         raise InputError(f"`unit` is {unit!r}; it must be one of {', '.join(UNITS)}")
+    check_real("delta", delta)
     if unit == "poses":
         if not (1 <= delta <= _MOST_POSES) or delta != int(delta):
             raise InputError(f"`delta` is {delta}; it must be at least 1 pose, a whole number, at most {_MOST_POSES}")

@@ -60,6 +60,8 @@ class TrajectoryReport:
             found.append(
                 f"the scale is {scale:.3g}: the two are not in one unit, and Sim(3) errors say nothing of that"
             )
+        if not len(self.relative.translation):
+            found.append(f"no two of them are {self.relative.interval} apart: there is no RPE, give a smaller `delta`")
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:

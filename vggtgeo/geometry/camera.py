@@ -101,6 +101,7 @@ class Camera:
 
     def resized(self, width: int, height: int) -> Self:
         """The same camera of its images resized to `width` x `height` pixels; a pixel's middle is a whole number."""
+        check_sides(width, height)
         across, down = width / self.width, height / self.height
         fx, fy, cx, cy = self.intrinsics
         centre = across * (cx + 0.5) - 0.5, down * (cy + 0.5) - 0.5

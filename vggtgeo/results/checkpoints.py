@@ -24,7 +24,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.checkpoint_pace import EVERY, SHARE
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
-from vggtgeo.io.given import path_of
+from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.record_file import Layout
 from vggtgeo.io.records import by_name
 from vggtgeo.models.onnx.bounds import Refusals
@@ -59,6 +59,7 @@ class Checkpoints:
 
     def __post_init__(self) -> None:
         path_of("path", self.path)
+        check_real("checkpoint-every", self.every, "seconds, at least 0")
         if not (math.isfinite(self.every) and self.every >= 0):
             raise InputError(f"`checkpoint-every` is {self.every:g}; it must be seconds, at least 0")
 

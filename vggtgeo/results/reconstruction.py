@@ -27,7 +27,7 @@ from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source, as_read, opened
 from vggtgeo.results.still_search import StillSearch
-from vggtgeo.results.summary import compare, summarise
+from vggtgeo.results.summary import OWN, compare, summarise
 from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
@@ -111,7 +111,7 @@ def reconstruct(
 
     """
     clock, began = Clock(), time.perf_counter()
-    _check_arguments(roles, settings, camera, known_map, callbacks, facts, checkpoints, title, seed)
+    _check_arguments(roles, settings, camera, known_map, callbacks, facts, warned, checkpoints, title, seed)
     settings = settings or SlamSettings()
     with program_settings(), interruption() as stop, collected_warnings() as collected:
         source = opened(frames, camera, settings)
@@ -175,6 +175,7 @@ def _check_arguments(
     known_map: Any,
     callbacks: Any,
     facts: Any,
+    warned: Any,
     checkpoints: Any,
     title: Any,
     seed: Any,
@@ -185,6 +186,14 @@ def _check_arguments(
     check_kind("checkpoints", checkpoints, Checkpoints | None, "`vggtgeo.Checkpoints`, or None")
     check_kind("title", title, str | None, "a text")
     check_plain("facts", {} if facts is None else facts)
+    wrong = [key for key in facts or {} if not isinstance(key, str) or key in OWN]
+    if wrong:
+        raise InputError(
+            f"`facts` has {wrong[0]!r:.60}; its names must be texts, and none that every summary has: "
+            f"{', '.join(sorted(OWN))}"
+        )
+    if isinstance(warned, str) or not isinstance(warned, Iterable):
+        check_kind("warned", warned, (), "a list of warnings or texts")
     check_whole("seed", seed)
 
 
@@ -229,17 +238,19 @@ def _concluded(
             built = dense_map(slam, run.dense)
         hooks.each("on_finish", slam, built.cloud)
         verdict = judging.result()
-    summary = summarise(
-        slam,
-        verdict,
-        settings=changed(settings),
-        seconds={**clock.seconds, "all": time.perf_counter() - run.began},
-        report=run.report,
-        truth_in_metres=run.source.truth_in_metres,
-        map_points=len(built.cloud),
-        dense=run.dense,
+    summary = {
+        **summarise(
+            slam,
+            verdict,
+            settings=changed(settings),
+            seconds={**clock.seconds, "all": time.perf_counter() - run.began},
+            report=run.report,
+            truth_in_metres=run.source.truth_in_metres,
+            map_points=len(built.cloud),
+            dense=run.dense,
+        ),
         **run.facts,
-    )
+    }
     notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
     return Result.assemble(
         RunRecord(

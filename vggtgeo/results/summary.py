@@ -39,6 +39,17 @@ def compare(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:
         return None
 
 
+OWN = frozenset(
+    {
+        *("verdict", "settings", "versions", "frames", "frames_tracked", "keyframes", "pairs", "pieces"),
+        *("peak_memory_gb", "scale", "scale_basis", "pose_sigma", "intrinsics", "lens", "rolling_shutter"),
+        *("seconds_by_stage", "notes", "map_points", "dense", "frames_per_second", "interrupted", "images_reduced"),
+        *("still_parts", "truth", "frames_per_second_whole_run"),
+    }
+)
+"""What a summary says of every run by itself; no fact of a caller may have such a name."""
+
+
 def summarise(
     slam: Slam,
     verdict: Verdict,
