@@ -16,7 +16,7 @@ from typing import Any
 from urllib.parse import quote
 
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import make_parent
+from vggtgeo.io.files import make_parent, whole_path
 from vggtgeo.viewing.blueprint import blueprint
 
 APPLICATION = "vggtgeo"
@@ -54,6 +54,8 @@ def check_target(target: str) -> str:
         )
     if Path(target).is_dir():
         raise InputError(f"`--rerun` is `{target}`, which is a folder; give a new file ending with `.rrd`")
+    if whole_path(Path(target)).is_symlink():  # Rerun would tell it in words of its own, after a second
+        raise InputError(f"`--rerun` is `{target}`, a link that leads nowhere; give a new file ending with `.rrd`")
     if Path(target).is_file() and not _is_recording(Path(target)):
         raise InputError(f"`--rerun` is `{target}`, which is there and is no recording; give the name of a new file")
     return target
