@@ -10,11 +10,14 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_whole, real_numbers
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.problem import energy_of
 
@@ -32,6 +35,14 @@ class Graduation(eqx.Module):
     """Widths, in units of the kernel's own."""
     iterations: int = eqx.field(static=True, default=4)
     """Tries at each width."""
+
+    def __check_init__(self) -> None:
+        """InputError for widths or a number of tries that are none."""
+        check_whole("iterations", self.iterations, 0)
+        factors = real_numbers("factors", self.factors)
+        if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
+            must = "a tuple of positive widths, in units of the kernel's own"
+            raise InputError(f"`factors` is {self.factors}; it must be {must}")
 
     def start(self, problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> State:
         """The state after the widest to the narrowest of the factors, held coordinates as in `initial`."""
