@@ -8,7 +8,7 @@ References: Huber 1964; Black & Anandan 1996; Barron, "A General and Adaptive Ro
 from __future__ import annotations
 
 import abc
-from typing import Self
+from typing import Self, TypeGuard
 
 import equinox as eqx
 import jax
@@ -59,7 +59,7 @@ class AbstractKernel(eqx.Module):
         return eqx.tree_at(lambda kernel: kernel.delta, self, self.delta * factor)
 
 
-def _is_known(value: object) -> bool:
+def _is_known(value: object) -> TypeGuard[Array]:
     """Whether it is numbers, and not what a transformation puts into their place."""
     return isinstance(value, jax.Array | np.ndarray | float | int) and not isinstance(value, jax.core.Tracer)
 
