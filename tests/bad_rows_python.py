@@ -211,6 +211,8 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`simulate`: a sensor's name", simulated("room", 3, sensor="kinect")),
     ("`simulate_window`: noise that is NaN", lambda _: vg.simulate_window(noise=np.nan)),
     ("`simulate_window`: more outliers than matches", lambda _: vg.simulate_window(outliers=2)),
+    ("a term with a kernel of width 0", with_pair(lambda p, s: replace(p.points, kernel=vg.Huber(0.0)))),
+    ("a term with a kernel's name", with_pair(lambda p, s: replace(p.points, kernel="huber"))),
     ("`Graduation`: a width below zero", lambda _: vg.Graduation((4.0, -2.0))),
     ("`Graduation`: a number in place of widths", lambda _: vg.Graduation(-1)),
 )

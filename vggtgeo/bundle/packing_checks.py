@@ -11,10 +11,10 @@ import numpy as np
 
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.padding import PaddedSize
+from vggtgeo.bundle.terms.term import check_width
 from vggtgeo.geometry.cameras import AbstractCamera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_real, real_numbers
-from vggtgeo.solvers.kernels import AbstractKernel
 
 UNIT = 1e-3
 """How far a quaternion's length and a line's normal may be from 1: what single precision and text files leave."""
@@ -46,11 +46,7 @@ def check_kernel(name: str, kernel: Any) -> None:
     """A robust kernel with a width, not its name, that is the plain square near zero: else padding would count."""
     if kernel is None or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(kernel)):
         return
-    if not isinstance(kernel, AbstractKernel):
-        raise InputError(f"`{name}` is {kernel!r}; expected a kernel object, as `vggtgeo.Huber(1.5)`, or None")
-    width = getattr(kernel, "delta", None)
-    if width is not None and not np.all(np.asarray(width) > 0):
-        raise InputError(f"`{name}` has the width {width}; it must be positive")
+    check_width(name, kernel)
     zero = jnp.zeros(())
     value, slope = np.asarray(kernel.rho(zero)), np.asarray(kernel.weight(zero))
     if not (np.allclose(value, 0, atol=UNIT) and np.allclose(slope, 1, atol=UNIT)):

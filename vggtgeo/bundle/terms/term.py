@@ -15,12 +15,26 @@ from typing import Any, ClassVar, NamedTuple, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.kernels import AbstractKernel, Square
 
 Local = Callable[[Array], Array]
 """A residual as a function of local coordinates."""
+
+
+def check_width(name: str, kernel: Any) -> None:
+    """InputError for no kernel (its name, say), and for one whose width is not positive: at 0 any state is a solution.
+    A traced width is not looked at.
+    """
+    if not isinstance(kernel, AbstractKernel):
+        raise InputError(f"`{name}` is {kernel!r}; expected a kernel object, as `vggtgeo.Huber(1.5)`")
+    width = getattr(kernel, "delta", None)
+    known = isinstance(width, jax.Array | np.ndarray | float | int) and not isinstance(width, jax.core.Tracer)
+    if known and not np.all(np.asarray(width) > 0):
+        raise InputError(f"`{name}` has the width {width}; it must be positive")
 
 
 def shared_field(**options: Any) -> Any:
@@ -59,6 +73,10 @@ class AbstractTerm(eqx.Module):
     """Of the residual, for reports: `px`, say."""
     structure: ClassVar[frozenset[str]] = frozenset({"weight", "kernel"})
     """Fields that are no data of an observation: what it touches, and what this class holds itself."""
+
+    def __check_init__(self) -> None:
+        """InputError for a kernel that is none."""
+        check_width(f"{self.name}.kernel", self.kernel)
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
