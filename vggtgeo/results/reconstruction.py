@@ -253,11 +253,7 @@ def _concluded(
     }
     notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
     return Result.assemble(
-        RunRecord(
-            *(slam, built, tuple(windows), run.source.truth, notices, run.title, run.seen, run.source.truth_in_metres)
-        ),
-        verdict,
-        summary,
+        RunRecord(slam, built, tuple(windows), run.source.truth, notices, run.title, run.seen), verdict, summary
     )
 
 

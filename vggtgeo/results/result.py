@@ -60,7 +60,7 @@ class RunRecord:
     slam: the last state. dense: the dense map after adjustment.
     windows: one an adjustment of the window. truth: camera -> world, where it is known. warnings: about the input, and
     about the weights of networks. title: of the run. seen: bool [H, W], pixels of the undistorted images that come
-    from the image; None where all do. truth_in_metres: whether lengths of the truth are metres.
+    from the image; None where all do.
     """
 
     slam: Slam
@@ -70,7 +70,6 @@ class RunRecord:
     warnings: tuple[str, ...] = ()
     title: str = "run"
     seen: np.ndarray | None = None
-    truth_in_metres: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +278,7 @@ class Result:
                 self.keyframes,
                 with_scale=not (record.slam.metric if record else self.metric),
                 title=record.title if record else name,
-                metres=record.truth_in_metres if record else True,
+                metres=record is None or summary.get("truth", {}).get("in_metres", True),
             )
         if record is not None:
             write_page(
