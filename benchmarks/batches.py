@@ -6,9 +6,11 @@
 Every window of a batch is the problem of `problems.py` from a start of its own, and takes the same number of
 iterations. Ways: *alone* (one `solve` after the other, called from Python), *in turn* (`solve_batch`, the default on a
 CPU), *in one program* (`vmap`, the default on a GPU), *shared out* (in turn on each of several devices). Rounds
-interleave the ways, and the table has the median. For *in one program* the operations and bytes that XLA counts for one
-iteration of the window are given too, a second (its counts are those of the compiled program before any cache: an upper
-bound of the traffic); `--peak-gflops` and `--peak-gbytes` turn them into fractions of a roofline.
+interleave the ways, and the table has the median. *Alone* and *in turn* are timed on 16 windows where a batch has more:
+what they take for a window does not depend on how many there are, and one by one 4096 take minutes on a GPU. For *in
+one program* the operations and bytes that XLA counts for one iteration of the window are given too, a second (its
+counts are those of the compiled program before any cache: an upper bound of the traffic); `--peak-gflops` and
+`--peak-gbytes` turn them into fractions of a roofline.
 On a GPU: `--batches 1 16 256 4096`.
 """
 
@@ -29,6 +31,8 @@ import numpy as np
 
 import vggtgeo as vg
 
+LONE = 16
+"""Windows that are solved one by one, of a batch with more."""
 HEADER = (
     "| size | precision | batch | way | ms a window | windows a second | times one alone "
     "| Gflop/s | GB/s | of roofline |\n"
@@ -75,13 +79,13 @@ def _rows(size: str, precision: str, options: argparse.Namespace) -> list[dict[s
         problems, states = _batch(problem, state, batch)
         ways = _ways(problems, states, solver, batch)
         times: dict[str, list[float]] = {name: [] for name in ways}
-        for run in ways.values():
+        for run, _ in ways.values():
             jax.block_until_ready(run())
         for _ in range(options.rounds):
-            for name, run in ways.items():
+            for name, (run, windows) in ways.items():
                 start = time.perf_counter()
                 jax.block_until_ready(run())
-                times[name].append((time.perf_counter() - start) / batch)
+                times[name].append((time.perf_counter() - start) / windows)
         cost = _cost(problems, states, solver, batch)
         for name, seconds in times.items():
             ratio = float(np.median(np.divide(times["alone"], seconds)))
@@ -117,20 +121,23 @@ def _batch(problem: Any, state: Any, count: int) -> tuple[Any, Any]:
     return jax.tree.map(repeat, problem), states
 
 
-def _ways(problems: Any, states: Any, solver: Any, count: int) -> dict[str, Callable[[], Any]]:
+def _ways(problems: Any, states: Any, solver: Any, count: int) -> dict[str, tuple[Callable[[], Any], int]]:
+    """By name: what solves the windows, and how many it solves."""
+    few = min(count, LONE)
+    first = jax.tree.map(lambda leaf: leaf[:few], (problems, states))
     one = jax.jit(lambda problem, state: vg.solve(problem, state, solver=solver).energy)
-    singles = [jax.tree.map(lambda leaf, n=n: leaf[n], (problems, states)) for n in range(min(count, 8))]
+    singles = [jax.tree.map(lambda leaf, n=n: leaf[n], first) for n in range(few)]
     batched = lambda **how: jax.jit(lambda p, s: vg.solve_batch(p, s, solver=solver, **how).energy)
     in_turn, together = batched(at_once=1), batched(at_once=count)
-    ways: dict[str, Callable[[], Any]] = {
-        "alone": lambda: [one(*singles[n % len(singles)]).block_until_ready() for n in range(count)],
-        "in turn": lambda: in_turn(problems, states),
-        "in one program": lambda: together(problems, states),
+    ways: dict[str, tuple[Callable[[], Any], int]] = {
+        "alone": (lambda: [one(*single).block_until_ready() for single in singles], few),
+        "in turn": (lambda: in_turn(*first), few),
+        "in one program": (lambda: together(problems, states), count),
     }
     devices = tuple(jax.devices())
     if len(devices) > 1 and count % len(devices) == 0:
         shared = batched(devices=devices)
-        ways["shared out"] = lambda: shared(problems, states)
+        ways["shared out"] = lambda: shared(problems, states), count
     return ways
 
 
