@@ -30,7 +30,7 @@ from pathlib import Path
 
 from vggtgeo.models.exporters.recipes import RECIPES
 from vggtgeo.models.onnx.file_checks import NetworkFileError
-from vggtgeo.models.onnx.session import choose_provider
+from vggtgeo.models.onnx.providers import NAMES, choose_provider, load_cuda_libraries
 
 from vggtgeo.slam.presets import NEEDED
 
@@ -62,8 +62,8 @@ ROWS = (
     Row("vggt", "vggt", (), "392 x 518"),
 )
 PROVIDERS = {
-    "cpu": ["CPUExecutionProvider"],
-    "cuda": [("CUDAExecutionProvider", {"arena_extend_strategy": "kSameAsRequested"})],
+    "cpu": [NAMES["cpu"]],
+    "cuda": [(NAMES["cuda"], {"arena_extend_strategy": "kSameAsRequested"})],
 }
 HEADINGS = (
     "file",
@@ -168,7 +168,11 @@ def measure(file: Path, threads: int, provider: str) -> dict:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     with gpu_memory(provider) as memory:
+        if provider == "cuda":
+            load_cuda_libraries()
         session = onnxruntime.InferenceSession(str(file), options, providers=PROVIDERS[provider])
+        if NAMES[provider] not in session.get_providers():
+            raise SystemExit(f"onnxruntime could not start {NAMES[provider]}: {load_cuda_libraries()}")
         with np.load(f"{file}.parity.npz") as parity:
             inputs = {value.name: parity[f"input.{value.name}"] for value in session.get_inputs()}
         session.run(None, inputs)

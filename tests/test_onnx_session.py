@@ -1,5 +1,6 @@
 """The session of all networks: what it refuses, what it computes, where it leaves results."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,10 +10,11 @@ import onnx
 import pytest
 import tiny_networks as tiny
 from onnx import TensorProto, helper
-from vggtgeo.models.onnx import contracts
+from vggtgeo.models.onnx import contracts, providers
 from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
 from vggtgeo.models.onnx.graph_bytes import external_files
-from vggtgeo.models.onnx.session import NetworkRunError, choose_provider, digest_of, open_session, read_signature
+from vggtgeo.models.onnx.providers import choose_provider
+from vggtgeo.models.onnx.session import NetworkRunError, digest_of, open_session, read_signature
 
 MAKERS = {
     "vggt": tiny.vggt,
@@ -242,7 +244,7 @@ def test_the_digest_follows_the_names_in_the_graph(tmp_path: Path) -> None:
 
 def test_cuda_is_refused_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves the choice of the provider. Oracle: the list that onnxruntime would give.
-    available = "vggtgeo.models.onnx.session.onnxruntime.get_available_providers"
+    available = "vggtgeo.models.onnx.providers.onnxruntime.get_available_providers"
     monkeypatch.setattr(available, lambda: ["CPUExecutionProvider"])
     assert choose_provider("auto") == "cpu"
     with pytest.raises(NetworkFileError, match=r"pip install -e '\.\[gpu\]'"):
@@ -250,3 +252,42 @@ def test_cuda_is_refused_where_there_is_none(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(available, lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     assert choose_provider("auto") == "cuda"
     assert choose_provider("cpu") == "cpu"
+
+
+@pytest.fixture
+def covered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package for CUDA is installed, and the files of the other lie over its own."""
+    monkeypatch.setattr(providers.onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    monkeypatch.setattr(providers.metadata, "version", {"onnxruntime-gpu": "1.31.1"}.__getitem__)
+    providers.warn_once.cache_clear()
+
+
+@pytest.mark.usefixtures("covered")
+def test_a_package_for_cuda_below_the_other_is_told() -> None:
+    # Proves that nobody runs on the CPU unawares after `pip install onnxruntime onnxruntime-gpu`, which leaves the
+    # files of the first (tried in a new environment). Oracle: what onnxruntime offers then.
+    put_back = "pip install --force-reinstall --no-deps onnxruntime-gpu==1.31.1"
+    with pytest.raises(NetworkFileError, match=put_back):
+        choose_provider("cuda")
+    with pytest.warns(UserWarning, match=put_back):
+        assert choose_provider("auto") == "cpu"
+    assert choose_provider("cpu") == "cpu"  # without a word
+
+
+@pytest.mark.filterwarnings("ignore:Specified provider")
+def test_cuda_that_does_not_start_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that the library that is missing is named, and that `auto` says where it falls back. Oracle: a package
+    # for CUDA on a machine without: it prints what it does not find, and opens the network on the CPU.
+    monkeypatch.setattr(
+        providers.onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    )
+    said = "Failed to load libcublas.so.13: no such file"
+    monkeypatch.setattr(providers.onnxruntime, "preload_dlls", lambda: sys.stdout.write(said), raising=False)
+    for memory in (providers.warn_once, providers.load_cuda_libraries):
+        memory.cache_clear()
+    path = tiny.mlsd(tmp_path / "mlsd.onnx")
+    with pytest.raises(NetworkFileError, match=said):
+        open_session(path, contracts.CONTRACTS["mlsd"], provider="cuda")
+    with pytest.warns(UserWarning, match=f"networks run on the CPU.*{said}"):
+        assert open_session(path, contracts.CONTRACTS["mlsd"]).provider == "cpu"
+    providers.load_cuda_libraries.cache_clear()

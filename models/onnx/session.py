@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import re
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-
-# From 1.31 on, onnxruntime numbers the device in a file of the home folder and tells its makers what is run, on Linux,
-# too, unless this is set before it is imported (`disable_telemetry_events` comes too late for the number).
-os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime
 from onnxruntime.capi import onnxruntime_pybind11_state as raised
-from vggtgeo.models.extras import install_hint
 from vggtgeo.models.onnx.contracts import METADATA_WEIGHTS, RANDOM_WEIGHTS, Contract
 from vggtgeo.models.onnx.file_checks import (
     NetworkFileError,
@@ -30,10 +24,9 @@ from vggtgeo.models.onnx.file_checks import (
     check_signature,
 )
 from vggtgeo.models.onnx.graph_bytes import external_files
+from vggtgeo.models.onnx.providers import NAMES, Provider, check_started, choose_provider, load_cuda_libraries, quiet
 
-Provider = Literal["auto", "cuda", "cpu"]
 _log = logging.getLogger(__name__)
-_PROVIDERS = {"cuda": "CUDAExecutionProvider", "cpu": "CPUExecutionProvider"}
 _DTYPES = {
     "tensor(float)": "float32",
     "tensor(float16)": "float16",
@@ -188,12 +181,10 @@ def open_session(
     """
     path = Path(path)
     check_looks_like_onnx(path)
-    opened = _open(path, choose_provider(provider), memory_limit_gb, threads)
-    used = "cuda" if _PROVIDERS["cuda"] in opened.get_providers() else "cpu"
-    if provider == "cuda" and used != "cuda":  # onnxruntime falls back without a word
-        raise NetworkFileError(
-            "`provider` is cuda, but onnxruntime could not start CUDA: is there a GPU and its driver?"
-        )
+    device = choose_provider(provider)
+    opened = _open(path, device, memory_limit_gb, threads)
+    used = "cuda" if NAMES["cuda"] in opened.get_providers() else "cpu"
+    check_started(provider, device, used)
     _announce(used)
     inputs, outputs, metadata = _described(path, opened)
     check_signature(path, contract, inputs, outputs)
@@ -205,14 +196,6 @@ def read_signature(path: str | Path) -> tuple[Signatures, Signatures, Mapping[st
     path = Path(path)
     check_looks_like_onnx(path)
     return _described(path, _open(path, "cpu", None, None))
-
-
-def choose_provider(provider: Provider) -> str:
-    """The device, "cuda" or "cpu"; raises `NetworkFileError` if CUDA is asked for and this onnxruntime has none."""
-    has_cuda = _PROVIDERS["cuda"] in onnxruntime.get_available_providers()
-    if provider == "cuda" and not has_cuda:
-        raise NetworkFileError(f"`provider` is cuda, but this onnxruntime runs on the CPU only; {install_hint('gpu')}")
-    return provider if provider != "auto" else "cuda" if has_cuda else "cpu"
 
 
 def digest_of(path: Path) -> str:
@@ -238,13 +221,15 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
         options.add_session_config_entry("session.disable_prepacking", "1")
     if threads is not None:
         options.intra_op_num_threads = threads
-    providers: list[Any] = [_PROVIDERS["cpu"]]
+    providers: list[Any] = [NAMES["cpu"]]
     if device == "cuda":
+        load_cuda_libraries()
         limit = {} if memory_limit_gb is None else {"gpu_mem_limit": int(memory_limit_gb * 2**30)}
         # The arena otherwise doubles itself, and several networks share one device.
-        providers.insert(0, (_PROVIDERS["cuda"], {"arena_extend_strategy": "kSameAsRequested", **limit}))
+        providers.insert(0, (NAMES["cuda"], {"arena_extend_strategy": "kSameAsRequested", **limit}))
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers)
+        with quiet():
+            return onnxruntime.InferenceSession(str(path), options, providers)
     except (*_RUNTIME_ERRORS, UnicodeError) as error:  # of a name that is no UTF-8, in the file or of it
         raise NetworkFileError(_why_not_opened(path, str(error))) from None
 

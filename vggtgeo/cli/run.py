@@ -199,7 +199,7 @@ def check_provider(provider: options.Provider) -> None:
     if provider != "cuda":
         return
     from vggtgeo.io.network_errors import as_input_errors
-    from vggtgeo.models.onnx.session import choose_provider
+    from vggtgeo.models.onnx.providers import choose_provider
 
     with as_input_errors():
         choose_provider(provider)

@@ -14,8 +14,9 @@ from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.models.onnx import verification
 from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, PARITY_SUFFIX
 from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
+from vggtgeo.models.onnx.providers import Provider
 from vggtgeo.models.onnx.registry import NETWORKS
-from vggtgeo.models.onnx.session import Provider, open_session, read_signature
+from vggtgeo.models.onnx.session import open_session, read_signature
 
 
 @dataclass(frozen=True)

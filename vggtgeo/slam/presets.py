@@ -39,8 +39,9 @@ from vggtgeo.models.onnx.line_matcher import DenseLineMatcher
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
 from vggtgeo.models.onnx.mlsd import MlsdDetector
 from vggtgeo.models.onnx.moge2 import MogeDepth
+from vggtgeo.models.onnx.providers import Provider
 from vggtgeo.models.onnx.registry import NETWORKS, files_of, players
-from vggtgeo.models.onnx.session import Provider, Session, open_session
+from vggtgeo.models.onnx.session import Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.slam.settings import Roles

@@ -1,0 +1,97 @@
+"""Where networks run: on CUDA where this onnxruntime has it and can start it, else on the CPU."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator
+from functools import cache
+from importlib import metadata
+from typing import Literal
+
+import onnxruntime
+from vggtgeo.models.extras import install_hint, put_back_hint
+from vggtgeo.models.onnx.file_checks import NetworkFileError
+
+GPU_PACKAGE = "onnxruntime-gpu"
+Provider = Literal["auto", "cuda", "cpu"]
+NAMES = {"cuda": "CUDAExecutionProvider", "cpu": "CPUExecutionProvider"}
+"""What onnxruntime calls them."""
+_FATAL, _WARNING = 4, 2
+"""Levels of onnxruntime's log; the second is its own default."""
+
+
+def choose_provider(provider: Provider) -> str:
+    """The device, "cuda" or "cpu"; raises `NetworkFileError` if CUDA is asked for and this onnxruntime has none.
+
+    Warns where the package for CUDA is installed and out of use.
+    """
+    has_cuda = NAMES["cuda"] in onnxruntime.get_available_providers()
+    if provider == "cuda" and not has_cuda:
+        why = _covered() or f"this onnxruntime runs on the CPU only; {install_hint('gpu')}"
+        raise NetworkFileError(f"`provider` is cuda, but {why}")
+    if provider == "auto" and not has_cuda and _covered():
+        warn_once(_covered())
+    return provider if provider != "auto" else "cuda" if has_cuda else "cpu"
+
+
+def _covered() -> str:
+    """A sentence where `onnxruntime` was installed after `onnxruntime-gpu`; nothing elsewhere.
+
+    Both hold the module of that name, and pip puts one over the other in an order of its own.
+    """
+    try:
+        found = metadata.version(GPU_PACKAGE)
+    except metadata.PackageNotFoundError:
+        return ""
+    return (
+        f"{GPU_PACKAGE} {found} is installed, and the files of the package onnxruntime lie over its own; "
+        f"{put_back_hint(GPU_PACKAGE, found)}"
+    )
+
+
+@cache
+def load_cuda_libraries() -> str:
+    """Load CUDA's libraries from where pip puts them, which the system's loader does not search; what was missing."""
+    said = io.StringIO()
+    if hasattr(onnxruntime, "preload_dlls"):  # from 1.21 on
+        with contextlib.redirect_stdout(said):
+            onnxruntime.preload_dlls()
+    return " ".join(said.getvalue().split())
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without what onnxruntime writes to the terminal for every network that does not come onto the GPU."""
+    onnxruntime.set_default_logger_severity(_FATAL)
+    try:
+        yield
+    finally:
+        onnxruntime.set_default_logger_severity(_WARNING)
+
+
+def check_started(provider: Provider, device: str, used: str) -> None:
+    """Say that CUDA did not start: onnxruntime falls back without a word.
+
+    Raises `NetworkFileError` if CUDA is what was asked for, else warns.
+
+    Args:
+        provider: what was asked for.
+        device: what `choose_provider` made of it.
+        used: where the network runs.
+
+    """
+    if device != "cuda" or used == "cuda":
+        return
+    missing = load_cuda_libraries()
+    why = f"onnxruntime could not start CUDA: {missing or 'is there a GPU and its driver?'}"
+    if provider == "cuda":
+        raise NetworkFileError(f"`provider` is cuda, but {why}")
+    warn_once(f"networks run on the CPU: {why}")
+
+
+@cache
+def warn_once(text: str) -> None:
+    """A UserWarning, the first time."""
+    warnings.warn(text, stacklevel=3)
