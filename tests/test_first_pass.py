@@ -169,6 +169,7 @@ def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **
     return vg.reconstruct(SequenceView(SEQUENCE, GUESS, has_depth=True) if frames is None else frames, **given)
 
 
+@pytest.mark.long
 def test_a_guessed_camera_is_sought_first(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that the run begins with what its first pass found, over as many frames as the setting says of those that
     # were selected, and with the guess where that finds none.

@@ -42,7 +42,7 @@ def test_parts_of_two_shapes_are_no_depth_map() -> None:
         DepthMap(np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 3)))
 
 
-@pytest.mark.parametrize("mode", ["sensor", "mvs"])
+@pytest.mark.parametrize("mode", ["sensor", pytest.param("mvs", marks=pytest.mark.long)])
 def test_the_map_of_many_keyframes_is_that_of_few(monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
     # Proves that cloud, mesh and depth images are the same, to the rounding, where depth maps are compressed and points
     # of groups of keyframes are averaged apart. Oracle: the map made at once.

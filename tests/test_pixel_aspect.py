@@ -140,6 +140,7 @@ def test_what_ends_in_no_camera_is_none() -> None:
         assert find_aspect(problem, state, ends_at) is None
 
 
+@pytest.mark.long
 def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that what is found is taken, told, and kept by the rounds after it; and that a run begun with it needs no
     # trial. Oracle: the focal lengths that the trial gives.
