@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 from vggtgeo.models.exporters import export as exporting
@@ -89,6 +90,16 @@ def test_a_file_gives_what_the_published_code_gives(network: str, checkouts: Pat
         assert path.encode() not in graph
     left = {file.name for file in tmp_path.iterdir()}
     assert {"file.onnx", "file.onnx.parity.npz"} <= left <= {"file.onnx", "file.onnx.parity.npz", "file.onnx.data"}
+
+
+def test_vggt_never_holds_the_weights_of_all_pairs_of_tokens(checkouts: Path, tmp_path: Path) -> None:
+    # Proves that global attention goes through the queries of one view at a time, which the memory of ten views hangs
+    # on. Oracle: the shapes that onnx infers for every softmax of the file: 3 views of 10 x 37 patches and 5 tokens.
+    report = export(recipe_of("vggt"), request_of("vggt", checkouts), tmp_path / "file.onnx")
+    graph = onnx.shape_inference.infer_shapes(onnx.load(report.path, load_external_data=False)).graph
+    shapes = {value.name: [size.dim_value for size in value.type.tensor_type.shape.dim] for value in graph.value_info}
+    weights = [shapes[node.output[0]] for node in graph.node if node.op_type == "Softmax"]
+    assert {shape[-2] for shape in weights if shape[-1] == 3 * 375} == {375}
 
 
 @pytest.mark.parametrize("network", HALF)

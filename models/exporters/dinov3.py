@@ -10,10 +10,11 @@ Changes to the loaded module:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from vggtgeo.models.exporters.attention import attention_replaced
 from vggtgeo.models.exporters.checkout import Checkout, import_from
 from vggtgeo.models.exporters.half import halve_blocks
 from vggtgeo.models.exporters.module import as_module
@@ -76,16 +77,14 @@ def _attention(query: Any, key: Any) -> Any:
 @contextmanager
 def _recorded_attention() -> Iterator[list[tuple[Any, Any]]]:
     """Collects the queries and keys of every attention that the published code computes in the block."""
-    functional = load("torch").nn.functional
-    original = functional.scaled_dot_product_attention
     recorded: list[tuple[Any, Any]] = []
 
-    def recording(query: Any, key: Any, *others: Any, **named: Any) -> Any:
-        recorded[:] = [(query, key)]
-        return original(query, key, *others, **named)
+    def recording(original: Callable[..., Any]) -> Callable[..., Any]:
+        def attention(query: Any, key: Any, *others: Any, **named: Any) -> Any:
+            recorded[:] = [(query, key)]
+            return original(query, key, *others, **named)
 
-    functional.scaled_dot_product_attention = recording
-    try:
+        return attention
+
+    with attention_replaced(recording):
         yield recorded
-    finally:
-        functional.scaled_dot_product_attention = original

@@ -10,6 +10,7 @@ Changes to the loaded module, each needed because the published code cannot be e
   row alone, so one row and one column are kept.
 - Aggregator and heads are called one by one: the published `forward` switches CUDA autocast off in between, for which
   there is no operator.
+- Global attention, of all views' tokens, is computed for the queries of one view at a time: see `attention`.
 
 The number of views and the size are fixed in the file.
 """
@@ -19,6 +20,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from vggtgeo.models.exporters.attention import attention_replaced, in_parts
 from vggtgeo.models.exporters.checkout import Checkout, import_from
 from vggtgeo.models.exporters.half import halve_blocks
 from vggtgeo.models.exporters.module import as_module
@@ -82,7 +84,9 @@ def _small(request: Request) -> Any:
 
 def _forward(network: Any, images: Any) -> tuple[Any, Any, Any]:
     batch = images[None]
-    tokens, patch_start = network.aggregator(batch)
+    patches = (images.shape[-2] // PATCH) * (images.shape[-1] // PATCH)
+    with attention_replaced(in_parts(network.aggregator.patch_start_idx + patches)):
+        tokens, patch_start = network.aggregator(batch)
     poses = network.camera_head(tokens)[-1]
     depth, confidence = network.depth_head(tokens, images=batch, patch_start_idx=patch_start)
     return poses[0], depth[0, ..., 0], confidence[0]
