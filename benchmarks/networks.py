@@ -30,7 +30,7 @@ from pathlib import Path
 
 from vggtgeo.models.exporters.recipes import RECIPES
 from vggtgeo.models.onnx.file_checks import NetworkFileError
-from vggtgeo.models.onnx.providers import NAMES, choose_provider, load_cuda_libraries
+from vggtgeo.models.onnx.providers import CUDA_OPTIONS, NAMES, choose_provider, load_cuda_libraries
 
 from vggtgeo.slam.presets import NEEDED
 
@@ -63,7 +63,7 @@ ROWS = (
 )
 PROVIDERS = {
     "cpu": [NAMES["cpu"]],
-    "cuda": [(NAMES["cuda"], {"arena_extend_strategy": "kSameAsRequested"})],
+    "cuda": [(NAMES["cuda"], CUDA_OPTIONS)],
 }
 HEADINGS = (
     "file",

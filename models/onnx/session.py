@@ -24,7 +24,15 @@ from vggtgeo.models.onnx.file_checks import (
     check_signature,
 )
 from vggtgeo.models.onnx.graph_bytes import external_files
-from vggtgeo.models.onnx.providers import NAMES, Provider, check_started, choose_provider, load_cuda_libraries, quiet
+from vggtgeo.models.onnx.providers import (
+    CUDA_OPTIONS,
+    NAMES,
+    Provider,
+    check_started,
+    choose_provider,
+    load_cuda_libraries,
+    quiet,
+)
 
 _log = logging.getLogger(__name__)
 _DTYPES = {
@@ -225,8 +233,7 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
     if device == "cuda":
         load_cuda_libraries()
         limit = {} if memory_limit_gb is None else {"gpu_mem_limit": int(memory_limit_gb * 2**30)}
-        # The arena otherwise doubles itself, and several networks share one device.
-        providers.insert(0, (NAMES["cuda"], {"arena_extend_strategy": "kSameAsRequested", **limit}))
+        providers.insert(0, (NAMES["cuda"], {**CUDA_OPTIONS, **limit}))
     try:
         with quiet():
             return onnxruntime.InferenceSession(str(path), options, providers)
