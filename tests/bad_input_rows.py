@@ -1,9 +1,10 @@
 """All rows of the table of bad inputs."""
 
 from bad_row import Row
+from bad_rows_bags import BAGS
 from bad_rows_commands import COMMANDS
 from bad_rows_files import FILES
 from bad_rows_strangers import STRANGERS
 
-ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS]
+ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS, *BAGS]
 __all__ = ["ROWS", "Row"]

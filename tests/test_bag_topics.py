@@ -14,6 +14,8 @@ from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, image_of, metres_
 from vggtgeo.datasets.check import inspect
 from vggtgeo.io.errors import InputError
 
+PLACE = Path("a.bag, /c, 0")
+
 COMPRESSED = "16UC1; compressedDepth png"
 
 
@@ -90,7 +92,7 @@ def test_images_behind_a_mosaic(encoding: str) -> None:
     # Proves which pixel has which colour. Oracle: a wall of one colour, seen through the filter that the name says.
     colour = {"r": 200, "g": 120, "b": 40}
     pattern = np.array([colour[letter] for letter in encoding.removeprefix("bayer_")[:4]], np.uint8).reshape(2, 2)
-    image = image_of(raw(encoding, np.tile(pattern, (8, 10))))
+    image = image_of(raw(encoding, np.tile(pattern, (8, 10))), PLACE).image
     np.testing.assert_array_equal(image[4:-4, 4:-4].reshape(-1, 3), np.tile([200, 120, 40], (96, 1)))
 
 
@@ -99,7 +101,15 @@ def test_images_in_brightness_and_colour(encoding: str, places: str) -> None:
     # Proves the order of the bytes. Oracle: grey of brightness 126 (16 to 235), which has no colour, is 128.
     values = {"y": 126, "u": 128, "v": 128}
     pixels = np.tile(np.array([values[letter] for letter in places], np.uint8).reshape(2, 2), (4, 3, 1))
-    np.testing.assert_allclose(image_of(raw(encoding, pixels)), 128, atol=1)
+    np.testing.assert_allclose(image_of(raw(encoding, pixels), PLACE).image, 128, atol=1)
+
+
+def test_a_mosaic_that_was_compressed() -> None:
+    # Proves that drivers which compress the mosaic itself are read as its name says. Oracle: a wall of one colour.
+    pattern = np.tile(np.array([[200, 120], [120, 40]], np.uint8), (8, 10))
+    content = cv2.imencode(".png", pattern)[1].tobytes()
+    image = image_of(packed("bayer_rggb8; png compressed ", content), PLACE).image
+    np.testing.assert_array_equal(image[4:-4, 4:-4].reshape(-1, 3), np.tile([200, 120, 40], (96, 1)))
 
 
 def test_compressed_depth() -> None:
@@ -107,19 +117,19 @@ def test_compressed_depth() -> None:
     codes = tiny_sequences.depth_codes(1)
     png = cv2.imencode(".png", codes)[1].tobytes()
     for kind, content in ((COMPRESSED, bytes(12) + png), ("16UC1; png compressed ", png)):
-        depth = metres_of(packed(kind, content))
+        depth = metres_of(packed(kind, content), PLACE)
         assert np.isnan(depth[0, 0])
         np.testing.assert_allclose(depth[1:], codes[1:] / 1000, rtol=1e-6)
     a, b = np.float32(1000.0), np.float32(-3.5)
     inverse = np.array([[0, 200, 1000]], np.uint16)
     head = bytes(4) + np.array([a, b], "<f4").tobytes()
     floats = packed("32FC1; compressedDepth png", head + cv2.imencode(".png", inverse)[1].tobytes())
-    np.testing.assert_allclose(metres_of(floats), [[np.nan, 1000 / 203.5, 1000 / 1003.5]], rtol=1e-6)
+    np.testing.assert_allclose(metres_of(floats, PLACE), [[np.nan, 1000 / 203.5, 1000 / 1003.5]], rtol=1e-6)
     for rest in (bytes(60), bytes(12), b""):
         with pytest.raises(InputError, match=r"its depth \(16UC1; compressedDepth rvl\) cannot be decoded"):
-            metres_of(packed("16UC1; compressedDepth rvl", rest))
-    with pytest.raises(InputError, match="it cannot be decoded"):
-        image_of(packed("bgr8; jpeg compressed bgr8"))
+            metres_of(packed("16UC1; compressedDepth rvl", rest), PLACE)
+    with pytest.raises(InputError, match=r"is empty .its format: bgr8; jpeg compressed bgr8; expected JPEG or PNG"):
+        image_of(packed("bgr8; jpeg compressed bgr8"), PLACE)
 
 
 def test_a_choice_is_a_note_and_no_problem(tmp_path: Path) -> None:

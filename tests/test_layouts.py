@@ -537,9 +537,12 @@ def test_bags_of_ros(tmp_path: Path, ros2: bool) -> None:
 
 
 def test_a_bag_of_a_camera_that_nobody_calibrated(tmp_path: Path) -> None:
-    # Proves that a `CameraInfo` of zeros is no camera. Oracle: the guess.
+    # Proves that a `CameraInfo` of zeros is no camera, and told as such. Oracle: the guess.
     pytest.importorskip("rosbags", reason="rosbags is not installed")
-    with pytest.warns(InputWarning, match="no intrinsics found"):
+    with (
+        pytest.warns(InputWarning, match="not calibrated"),
+        pytest.warns(InputWarning, match="no intrinsics found"),
+    ):
         sequence = open_sequence(tiny.bag(tmp_path / "a.bag", ros2=False, calibrated=False))
     assert not sequence.camera.known
 

@@ -3,11 +3,13 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from vggtgeo.datasets.image_files import ImageFile, decoded, image_in, metres_of_floats
 from vggtgeo.io.errors import InputError
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -35,9 +37,18 @@ _COLOUR: dict[str, tuple[int, int | None]] = {
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
+_OF_PAIRS = 2
+"""Bytes a pixel of encodings that give each pair of pixels one colour."""
 _HEAD = 12
 """Bytes before the PNG of a `compressedDepth`: a format, and two numbers that floats were coded by."""
 _PNG = b"\x89PNG"
+
+
+@dataclass(frozen=True)
+class Unread:
+    """A message that is damaged. reason: why it cannot be read."""
+
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -60,7 +71,10 @@ def chosen_topics(first: Mapping[str, Any]) -> Chosen:
     images = {name: rank for name, rank in images.items() if name not in depths}
     if not images:
         found = ", ".join(f"`{name}` ({_kind(message)})" for name, message in first.items()) or "none"
-        raise InputError(f"has no topic with images in colour or grey that can be read; its topics of images: {found}")
+        raise InputError(
+            f"has no topic with images in colour or grey that can be read; its topics of images: {found}; convert "
+            f"to what is read: JPEG, PNG, {', '.join(_COLOUR)}"
+        )
     colour, depth = _best(images), _best(depths)
     return Chosen(colour, depth, tuple(name for name in first if name not in (colour, depth)))
 
@@ -76,10 +90,16 @@ def _best(ranks: Mapping[str, tuple[int, ...]]) -> str:
 
 
 def _kind(message: Any) -> str:
+    if message is None:
+        return "no message"
+    if isinstance(message, Unread):
+        return "damaged"
     return str(getattr(message, "encoding", "") or getattr(message, "format", ""))[:60] or "of no stated kind"
 
 
 def _is_depth(name: str, message: Any) -> bool:
+    if message is None or isinstance(message, Unread):
+        return False
     if hasattr(message, "encoding"):
         return message.encoding in _DEPTH and not _INFRARED.search(name)
     return "compresseddepth" in f"{name} {message.format}".lower() or message.format.split(";")[0].strip() in _DEPTH
@@ -91,6 +111,8 @@ def _rank_of_depth(name: str) -> tuple[int]:
 
 def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:
     """None for a message that is no image in colour or grey. Last: infrared, then depth in false colours, then grey."""
+    if message is None or isinstance(message, Unread):
+        return None
     if hasattr(message, "encoding"):
         if message.encoding not in _COLOUR:
             return None
@@ -100,54 +122,87 @@ def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:
     return int(bool(_INFRARED.search(name))), int("depth" in name.lower()), int(grey)
 
 
-def image_of(message: Any) -> np.ndarray:
-    """uint8 [H, W, 3], RGB; InputError where it cannot be decoded."""
-    if not hasattr(message, "encoding"):  # compressed
-        image = _decoded(np.asarray(message.data, np.uint8).tobytes(), cv2.IMREAD_COLOR)
-        if image is None:
-            raise InputError("it cannot be decoded")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+def image_of(message: Any, place: Path, least_bits: int = 8) -> ImageFile:
+    """The image in a message, see `read_image_file`; InputError where there is none. place: for that."""
+    if isinstance(message, Unread):
+        raise InputError(f"`{place}` is damaged: {message.reason}")
+    if not hasattr(message, "encoding"):
+        return _compressed_image(message, place, least_bits)
     if message.encoding not in _COLOUR:
-        raise InputError(f"its encoding is {message.encoding}; known are {', '.join(_COLOUR)}")
+        raise InputError(f"`{place}`: its encoding is {message.encoding}; known are {', '.join(_COLOUR)}")
     channels, change = _COLOUR[message.encoding]
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
-    image = np.ascontiguousarray(rows[:, : message.width * channels]).reshape(message.height, message.width, channels)
-    return image if change is None else np.asarray(cv2.cvtColor(image, change))
+    if channels == _OF_PAIRS and message.width % 2:
+        raise InputError(f"`{place}` is {message.width} pixels wide; expected an even number of {message.encoding}")
+    image = _pixels(message, place, np.dtype(np.uint8), channels)
+    return ImageFile(image if change is None else np.asarray(cv2.cvtColor(image, change)), 8, 1)
 
 
-def metres_of(message: Any) -> np.ndarray:
-    """Depth, float32 [H, W], NaN for none; InputError where it cannot be decoded."""
-    depth = _raw_metres(message) if hasattr(message, "encoding") else _compressed_metres(message)
-    depth[~(depth > 0) | ~np.isfinite(depth)] = np.nan
-    return depth
+def _compressed_image(message: Any, place: Path, least_bits: int) -> ImageFile:
+    kind = message.format.split(";")[0].strip()
+    try:
+        read = image_in(np.asarray(message.data, np.uint8).tobytes(), place, least_bits)
+    except InputError as error:
+        raise InputError(f"{error} (its format: {_kind(message)}; expected JPEG or PNG)") from None
+    if kind.startswith("bayer_") and kind in _COLOUR and not np.ptp(read.image, axis=2).any():  # the mosaic itself
+        mosaic = np.ascontiguousarray(read.image[..., 0])
+        return ImageFile(np.asarray(cv2.cvtColor(mosaic, _COLOUR[kind][1] or 0)), read.bits, read.orientation)
+    return read
 
 
-def _raw_metres(message: Any) -> np.ndarray:
+def metres_of(message: Any, place: Path) -> np.ndarray:
+    """Depth, float32 [H, W], NaN for none; InputError where it cannot be decoded. place: of the message, for that."""
+    if isinstance(message, Unread):
+        raise InputError(f"`{place}` is damaged: {message.reason}")
+    return _raw_metres(message, place) if hasattr(message, "encoding") else _compressed_metres(message, place)
+
+
+def _pixels(message: Any, place: Path, kind: np.dtype[Any], channels: int = 1) -> np.ndarray:
+    """What a message holds, [H, W, channels], if it holds what it says: cameras' drivers pad rows, and no more."""
+    data, size = np.asarray(message.data, np.uint8), f"{message.width} x {message.height} pixels"
+    row = message.width * channels * kind.itemsize
+    if not row or not message.height or message.step < row or message.step * message.height != len(data):
+        raise InputError(
+            f"`{place}` has {len(data)} bytes, and declares {size} of {message.encoding}, {message.step} bytes a row: "
+            "they do not belong together"
+        )
+    rows = data.reshape(message.height, message.step)[:, :row]
+    return np.ascontiguousarray(rows).view(kind).reshape(message.height, message.width, channels)
+
+
+def _raw_metres(message: Any, place: Path) -> np.ndarray:
+    if message.encoding not in _DEPTH:
+        raise InputError(f"`{place}`: its encoding is {message.encoding}; depth has {', '.join(_DEPTH)}")
     kind, unit = _DEPTH[message.encoding]
     order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    rows = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), order).reshape(message.height, -1)
-    return rows[:, : message.width].astype(np.float32) * np.float32(unit)
+    codes = _pixels(message, place, order)[..., 0]
+    return metres_of_floats(codes) if order.kind == "f" else _of_codes(codes, unit)
 
 
-def _compressed_metres(message: Any) -> np.ndarray:
+def _of_codes(codes: np.ndarray, unit: float) -> np.ndarray:
+    return np.where(codes > 0, codes * np.float32(unit), np.float32(np.nan)).astype(np.float32)
+
+
+def _compressed_metres(message: Any, place: Path) -> np.ndarray:
     """A PNG of 16 bits, millimetres, with or without the head of `compressedDepth`; or, of floats, inverse depth:
     depth = a / (code - b), with the two numbers of the head (package compressed_depth_image_transport).
     """
     content = np.asarray(message.data, np.uint8).tobytes()
     headed = not content.startswith(_PNG)
-    codes = _decoded(content[_HEAD if headed else 0 :], cv2.IMREAD_UNCHANGED)
-    if codes is None or codes.dtype != np.uint16 or codes.ndim != 2:
-        raise InputError(f"its depth ({_kind(message)}) cannot be decoded; expected a PNG of 16 bits, not RVL")
-    if headed and message.format.split(";")[0].strip() == "32FC1":
+    floats = message.format.split(";")[0].strip() == "32FC1"
+    wrong = f"`{place}`: its depth ({_kind(message)}) cannot be decoded; expected a PNG of 16 bits, not RVL"
+    if floats and not headed:
+        raise InputError(f"{wrong}, behind the two numbers that floats were coded by")
+    try:
+        codes = decoded(content[_HEAD if headed else 0 :], place, cv2.IMREAD_UNCHANGED)
+    except InputError as error:
+        raise InputError(f"{wrong} ({error})") from None
+    if codes.dtype != np.uint16 or codes.ndim != 2:
+        raise InputError(f"{wrong} (found {codes.dtype} of shape {codes.shape})")
+    if floats:
         a, b = np.frombuffer(content[4:_HEAD], "<f4").astype(np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(codes > 0, a / (codes - b), np.float32(np.nan)).astype(np.float32)
-    return np.asarray(codes * np.float32(1e-3), np.float32)
-
-
-def _decoded(content: bytes, flags: int) -> np.ndarray | None:
-    """None for what is no picture; OpenCV raises where there are no bytes at all."""
-    return cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+            return metres_of_floats(np.where(codes > 0, a / (codes - b), np.float32(np.nan)))
+    return _of_codes(codes, 1e-3)
 
 
 def told(chosen: Chosen, poses: str) -> str:

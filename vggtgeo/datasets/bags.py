@@ -7,7 +7,7 @@ name contains `truth`, `gt`, `vicon` or `mocap`. What is chosen of several is to
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +15,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from vggtgeo.datasets.bag_topics import IMAGES, chosen_topics, image_of, metres_of, told, truth_topic
+from vggtgeo.datasets.bag_cameras import CAMERA_INFO, camera_of
+from vggtgeo.datasets.bag_topics import IMAGES, Unread, chosen_topics, image_of, metres_of, told, truth_topic
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.intrinsics import guess_with_warning, is_fisheye
+from vggtgeo.datasets.image_orientation import not_turned
+from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
-from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
 from vggtgeo.models.extras import install_hint
@@ -70,20 +72,19 @@ class RosBag:
         """Looks through the topics; InputError where there are no colour images, or rosbags is not installed."""
         with _reader(path) as reader:
             topics = {name: str(info.msgtype) for name, info in reader.topics.items()}
-            first = {name: next(_messages(reader, name), (0.0, None))[1] for name in topics if topics[name] in IMAGES}
-            first = {name: message for name, message in first.items() if message is not None}
+            first = {name: _first(reader, name) for name in topics if topics[name] in IMAGES}
             try:
                 chosen = chosen_topics(first)
-                height, width = image_of(first[chosen.colour]).shape[:2]
             except InputError as error:
-                raise InputError(f"`{path}` {error}") from None
+                raise InputError(f"`{path}` {error}{_others(topics)}") from None
             poses = truth_topic(topics)
             if text := told(chosen, poses):
                 _warn(f"`{path}`: {text}", NoteWarning)
-            camera = _camera(reader, topics, chosen.colour, width, height)
+            times, (width, height) = _times_and_size(reader, path, chosen.colour)
+            camera = _camera(reader, path, topics, chosen.colour, (width, height))
             camera = camera or guess_with_warning(str(path), width, height)
-            times = tuple(time for time, _ in _messages(reader, chosen.colour))
-        return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, times, bool(chosen.depth))
+            has_depth = bool(chosen.depth) and _depth_is_usable(reader, path, chosen.depth, times, (width, height))
+        return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, times, has_depth)
 
     def __len__(self) -> int:
         return len(self.times)
@@ -98,46 +99,130 @@ class RosBag:
         if not self.poses:
             return None
         with _reader(self.path) as reader:
-            rows = np.array([(time, *_pose(message)) for time, message in _messages(reader, self.poses)]).reshape(-1, 8)
-        if not len(rows):
+            messages = list(_messages(reader, self.poses))
+        whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, Unread)]
+        if len(whole) < len(messages):
+            lost = len(messages) - len(whole)
+            _warn(
+                f"`{self.path}`: {lost} of {len(messages)} poses of `{self.poses}` are damaged; left out of the truth"
+            )
+        if not whole:
             raise InputError(f"`{self.path}` has no pose in its topic `{self.poses}`")
-        rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+        rows = np.array(whole).reshape(-1, 8)
         return trajectory_of(rows[:, 0], poses_of(rows[:, 1:4], rows[:, 4:]), self.path)
 
     def _read(self, chosen: range) -> Iterator[Frame]:
         with _reader(self.path) as reader:
             depths = _messages(reader, self.depth) if self.has_depth else iter(())
             waiting: list[tuple[float, Any]] = []
+            bits, turned = 8, False
             for index, (time, message) in enumerate(_messages(reader, self.colour)):
                 if index not in chosen:
                     if index >= chosen.stop:
                         return
                     continue
+                place = _place(self.path, self.colour, index)
                 try:
-                    image = image_of(message)
+                    read = image_of(message, place, bits)
                 except InputError as error:
-                    _warn(f"`{self.name}`, image {index}: {error}; the frame is skipped", LeftOutWarning)
+                    _warn(f"{error}; the frame is skipped", LeftOutWarning)
                     continue
+                height, width = read.image.shape[:2]
+                if (width, height) != (self.camera.width, self.camera.height):
+                    size = f"{self.camera.width} x {self.camera.height}"
+                    text = f"`{place}` is {width} x {height} pixels; the bag's images are {size}: the frame is skipped"
+                    _warn(text, LeftOutWarning)
+                    continue
+                if read.orientation != 1 and not turned:
+                    _warn(not_turned(place, read.orientation))
+                bits, turned = max(bits, read.bits), turned or read.orientation != 1
                 depth = None
                 if self.has_depth:
                     waiting = _around(time, waiting, depths)
-                    depth = self._depth(time, waiting, index)
-                yield Frame(index, time, image, depth, f"{self.name}, {index}")
+                    depth = self._depth(time, waiting, place)
+                yield Frame(index, time, read.image, depth, f"{self.name}, {index}")
 
-    def _depth(self, time: float, waiting: list[tuple[float, Any]], index: int) -> np.ndarray:
+    def _depth(self, time: float, waiting: list[tuple[float, Any]], place: Path) -> np.ndarray:
         nothing = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
         near = [entry for entry in waiting if abs(entry[0] - time) <= _DELAY]
         if not near:
             return nothing
         try:
-            depth = metres_of(min(near, key=lambda entry: abs(entry[0] - time))[1])
+            depth = metres_of(min(near, key=lambda entry: abs(entry[0] - time))[1], Path(f"{place}, its depth"))
         except InputError as error:
-            _warn(f"`{self.name}`, image {index}: {error}; used without depth")
+            _warn(f"{error}; used without depth")
             return nothing
         if depth.shape != nothing.shape:
-            _warn(f"`{self.name}`, depth of image {index} is {depth.shape[1]} x {depth.shape[0]}; used without depth")
+            _warn(f"`{place}`: its depth is {depth.shape[1]} x {depth.shape[0]} pixels; used without depth")
             return nothing
         return depth
+
+
+def _place(path: Path, topic: str, number: int) -> Path:
+    """How messages call one of a bag."""
+    return Path(f"{path}, {topic}, {number}")
+
+
+def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, ...], tuple[int, int]]:
+    """Of the images: all times, and width and height of the first that can be read."""
+    times, size, wrong = [], None, ""
+    for number, (time, message) in enumerate(_messages(reader, topic)):
+        times.append(time)
+        if size is None:
+            try:
+                height, width = image_of(message, _place(path, topic, number)).image.shape[:2]
+                size = width, height
+            except InputError as error:
+                wrong = wrong or str(error)
+    if size is None:
+        raise InputError(f"none of the {len(times)} images of `{path}` can be read; the first: {wrong}")
+    return tuple(times), size
+
+
+def _depth_is_usable(reader: Any, path: Path, topic: str, images: tuple[float, ...], size: tuple[int, int]) -> bool:
+    """Whether depth of the images' size has a valid pixel, and is of their times; an InputWarning for what is not."""
+    times, valid, wrong = [], False, ""
+    for number, (time, message) in enumerate(_messages(reader, topic)):
+        times.append(time)
+        if valid:
+            continue
+        try:
+            depth = metres_of(message, _place(path, topic, number))
+        except InputError as error:
+            wrong = wrong or f" ({error})"
+            continue
+        if depth.shape != size[::-1]:
+            wrong = wrong or (
+                f" (that of `{topic}` is {depth.shape[1]} x {depth.shape[0]} pixels, the images are {size[0]} x "
+                f"{size[1]}: record depth that is registered to them)"
+            )
+            continue
+        valid = bool(np.isfinite(depth).any())
+    if not valid:
+        _warn(f"`{path}`: none of the {len(times)} depth images has a valid pixel{wrong}; reading the images only")
+        return False
+    ordered = np.sort(times)
+    after = np.searchsorted(ordered, images).clip(1, max(len(ordered) - 1, 1))
+    nearest = [ordered[np.minimum(row, len(ordered) - 1)] for row in (after - 1, after)]
+    alone = int((np.minimum(*(np.abs(np.array(images) - time) for time in nearest)) > _DELAY).sum())
+    if alone:
+        only = "; reading the images only" if alone == len(images) else ""
+        _warn(f"`{path}`: {alone} of {len(images)} images have no depth within {_DELAY} s{only}")
+    return alone < len(images)
+
+
+def _camera(reader: Any, path: Path, topics: Mapping[str, str], colour: str, size: tuple[int, int]) -> Camera | None:
+    """What the topics of `CameraInfo` say of the camera of the images."""
+    kinds = [name for name, kind in topics.items() if kind == CAMERA_INFO]
+    messages = {name: [message for _, message in _messages(reader, name)] for name in kinds}
+    whole = {name: [one for one in found if not isinstance(one, Unread)] for name, found in messages.items()}
+    return camera_of(path, whole, colour, size)
+
+
+def _others(topics: Mapping[str, str]) -> str:
+    """What a bag without images has, for the message."""
+    names = ", ".join(f"`{name}` ({kind})" for name, kind in list(topics.items())[:6] if kind not in IMAGES)
+    return f"; other topics: {names}" if names else ""
 
 
 @contextmanager
@@ -166,35 +251,29 @@ def _reader(path: Path) -> Iterator[Any]:
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
-    """Time of each message's header, seconds, and the message; the recorder's time where the header has none."""
+    """Time of each message's header, seconds, and the message; the recorder's time where the header has none, and
+    `Unread` for a message that is damaged.
+    """
     connections = [connection for connection in reader.connections if connection.topic == topic]
     for connection, stamp, raw in reader.messages(connections=connections):
-        message = reader.deserialize(raw, connection.msgtype)
+        try:
+            message = reader.deserialize(raw, connection.msgtype)
+        except Exception as error:  # noqa: BLE001 - whatever a damaged message makes the package raise
+            yield 1e-9 * stamp, Unread(str(error))
+            continue
         header = message.header.stamp
         time = header.sec + 1e-9 * header.nanosec
         yield (time if time > 0 else 1e-9 * stamp), message
 
 
-def _camera(reader: Any, topics: dict[str, str], colour: str, width: int, height: int) -> Camera | None:
-    """Of the `CameraInfo` whose name shares most with the images' topic, if its size is that of the images."""
-    infos = [name for name, kind in topics.items() if kind == "sensor_msgs/msg/CameraInfo"]
-    shared = lambda name: next((n for n, (a, b) in enumerate(zip(name, colour, strict=False)) if a != b), len(name))
-    for name in sorted(infos, key=shared, reverse=True):
-        message = next(_messages(reader, name), (0.0, None))[1]
-        if message is None or (message.width, message.height) != (width, height):
-            continue
-        matrix = np.reshape(message.K if hasattr(message, "K") else message.k, (3, 3))
-        if not matrix.any():  # as the message's definition has it: uncalibrated
-            continue
-        values = np.asarray(message.D if hasattr(message, "D") else message.d, float)
-        fisheye = is_fisheye(f"`{name}`: `distortion_model`", message.distortion_model)
-        lens = tuple(values) if len(values) in (4, 5, 8) and (fisheye or values.any()) else ()
-        try:
-            intrinsics = check_intrinsics((matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
-            return Camera(intrinsics, width, height, check_distortion(lens), fisheye=fisheye)
-        except InputError as error:
-            raise InputError(f"`{name}`: {error}") from None
-    return None
+def _first(reader: Any, topic: str) -> Any:
+    """The first message of a topic that is whole; a damaged one, or None, where it has no other."""
+    damaged = None
+    for _, message in _messages(reader, topic):
+        if not isinstance(message, Unread):
+            return message
+        damaged = damaged or message
+    return damaged
 
 
 def _pose(message: Any) -> tuple[float, ...]:

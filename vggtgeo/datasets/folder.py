@@ -21,6 +21,7 @@ from vggtgeo.datasets.image_files import (
     read_image,
     read_image_file,
 )
+from vggtgeo.datasets.image_orientation import not_turned
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
@@ -118,10 +119,7 @@ class FolderSequence:
             bits = max(bits, read.bits)
             if read.orientation != 1 and not turned:
                 turned = True
-                _warn(
-                    f"`{file.image}` asks to be turned (EXIF orientation {read.orientation}): images are used as they "
-                    "are stored, and intrinsics and depth must be those of the stored images"
-                )
+                _warn(not_turned(file.image, read.orientation))
             image = read.image
             depth = self._read_depth(file) if self.has_depth else None
             if file.depth is not None and depth is not None and not np.isfinite(depth).any():

@@ -38,8 +38,8 @@ class DepthFormat:
     floats_per_metre: float = 1.0
 
 
-FARTHEST = 1000.0
-"""Metres, of a float: renderers write 1e10 where there is nothing."""
+NEAREST, FARTHEST = 1e-3, 1000.0
+"""Metres, of a float: renderers write 1e10 where there is nothing, and bytes in the wrong order are 1e-40."""
 
 MILLIMETRES = DepthFormat(1000.0, (0, 65535))
 """7-Scenes: 0 and, as published, 65535 mean none."""
@@ -79,7 +79,7 @@ def read_image_file(path: Path, least_bits: int = 8) -> ImageFile:
 
 def image_in(content: bytes, path: Path, least_bits: int = 8) -> ImageFile:
     """The image whose file has these bytes. path: for messages; otherwise as `read_image_file`."""
-    image = _decode(content, path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decoded(content, path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image.dtype not in (np.uint8, np.uint16) or image.ndim != 3:
         raise InputError(f"`{path}`: found {image.dtype} of shape {image.shape}; images must have 8 or 16 bits")
     bits = 8
@@ -99,9 +99,7 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     codes = read_codes(path)
     codes = codes[..., 0] if codes.ndim == 3 and codes.shape[2] == 1 else codes
     if codes.ndim == 2 and np.issubdtype(codes.dtype, np.floating):
-        with np.errstate(over="ignore", invalid="ignore"):
-            depth = np.divide(codes, coding.floats_per_metre).astype(np.float32)
-            return np.where((depth > 0) & (depth <= FARTHEST), depth, np.float32(np.nan))
+        return metres_of_floats(codes, coding.floats_per_metre)
     if codes.dtype != np.uint16 or codes.ndim != 2:
         raise InputError(
             f"`{path}`: found {codes.dtype} of shape {codes.shape}; depth must have one channel, of uint16 or of "
@@ -113,13 +111,20 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
     return depth
 
 
+def metres_of_floats(codes: np.ndarray, per_metre: float = 1.0) -> Float[np.ndarray, "h w"]:
+    """Depth that is stored as floats, float32 metres, NaN for what no camera of a room sees."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = np.divide(codes, per_metre).astype(np.float32)
+        return np.where((depth >= NEAREST) & (depth <= FARTHEST), depth, np.float32(np.nan))
+
+
 def read_codes(path: Path) -> np.ndarray:
     """The numbers in an image or an array of NumPy, as they are stored; InputError where it cannot be read."""
     if path.suffix.lower() == ".npy":
         return _array(path)
     if path.suffix.lower() == ".exr":
         return exr_depth(path)
-    return _decode(file_content(path), path, cv2.IMREAD_UNCHANGED)
+    return decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
 
 
 def _array(path: Path) -> np.ndarray:
@@ -162,8 +167,8 @@ def file_content(path: Path, most: int = MOST_BYTES) -> bytes:
         raise InputError(f"`{path}` cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def _decode(content: bytes, path: Path, flags: int) -> np.ndarray:
-    """The image in the bytes of a file."""
+def decoded(content: bytes, path: Path, flags: int) -> np.ndarray:
+    """The image in the bytes of a file, as OpenCV has it. path: for messages; InputError with what is wrong."""
     wrong = defect(content)
     if wrong:
         raise InputError(f"`{path}` {wrong}")

@@ -7,6 +7,7 @@ can be told so for JPEG, PNG and WebP; a TIFF it turns all the same.
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 
 from vggtgeo.datasets.image_defects import jpeg_segments, png_chunks
 from vggtgeo.datasets.tiff_tags import STARTS, tiff_tags
@@ -18,6 +19,14 @@ def orientation(content: bytes) -> int:
     """The EXIF orientation of a JPEG, PNG, WebP or TIFF, 1 to 8; 1, as it is stored, where it has none."""
     tag = tiff_tags(_exif(content)).get(_ORIENTATION)
     return tag.value if tag is not None and 1 <= tag.value <= 8 else 1
+
+
+def not_turned(name: Path, orientation: int) -> str:
+    """What a user is told of a file that asks to be turned."""
+    return (
+        f"`{name}` asks to be turned (EXIF orientation {orientation}): images are used as they are stored, and "
+        "intrinsics and depth must be those of the stored images"
+    )
 
 
 def as_stored(content: bytes) -> bytes:

@@ -60,6 +60,15 @@ def intrinsics_of(file: Path, values: object) -> tuple[float, float, float, floa
         raise InputError(f"`{file}`: {error}") from None
 
 
+def pinhole_of(matrix: np.ndarray) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy, pixels, of a matrix of intrinsics [3, 3]; InputError for one of anything else."""
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    values = check_intrinsics((fx, fy, cx, cy))
+    if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6):
+        raise InputError(f"found {matrix.tolist()}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    return values
+
+
 def is_fisheye(where: str, model: str) -> bool:
     """Whether the word for a lens is that of a fisheye; InputError for one of neither kind. where: it stands."""
     if model.lower() not in (*_OPENCV, *_FISHEYES):
@@ -80,7 +89,7 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
         if file.is_file():
             camera = read(file, width, height)
             check_plausible(f"`{file}`", camera)
-            _warn_of_other_size(file, camera)
+            warn_of_other_size(f"`{file}`", camera)
             return camera
     return _camera_of_record3d(folder, width, height) or _camera_of_another_name(folder, width, height)
 
@@ -227,11 +236,10 @@ def _read_matrix(file: Path, width: int, height: int) -> Camera:
     numbers = _numbers(f"`{file}`", _without_comments(file), "a 3 x 3 matrix of intrinsics")
     if len(numbers) != 9:
         raise InputError(f"`{file}`: found {len(numbers)} numbers; expected a 3 x 3 matrix of intrinsics")
-    matrix = np.reshape(numbers, (3, 3))
-    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6):
-        raise InputError(f"`{file}`: found {matrix.tolist()}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    return Camera(intrinsics_of(file, (fx, fy, cx, cy)), width, height)
+    try:
+        return Camera(pinhole_of(np.reshape(numbers, (3, 3))), width, height)
+    except InputError as error:
+        raise InputError(f"`{file}`: {error}") from None
 
 
 def _read_json_camera(file: Path, width: int, height: int) -> Camera:
@@ -281,13 +289,14 @@ def _without_comments(file: Path) -> str:
     return " ".join(line.split("#", 1)[0] for line in lines)
 
 
-def _warn_of_other_size(file: Path, camera: Camera) -> None:
+def warn_of_other_size(where: str, camera: Camera) -> None:
+    """An InputWarning for a principal point and a field of view that are odd for images of this size."""
     fx, fy, cx, cy = camera.intrinsics
     near = lambda x, y: abs(cx - x) < 0.05 * camera.width and abs(cy - y) < 0.05 * camera.height
     middle = 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)
     if near(*middle[::-1]) and not near(*middle):
         warnings.warn(
-            f"`{file}`: the principal point ({cx:g}, {cy:g}) is the middle of images of {camera.height} x "
+            f"{where}: the principal point ({cx:g}, {cy:g}) is the middle of images of {camera.height} x "
             f"{camera.width}; these are {camera.width} x {camera.height}: are cx and cy in each other's place?",
             InputWarning,
             stacklevel=3,
@@ -296,7 +305,7 @@ def _warn_of_other_size(file: Path, camera: Camera) -> None:
     field_of_view = math.degrees(2 * math.atan(0.5 * max(camera.width / fx, camera.height / fy)))
     if not centred or field_of_view < 10:
         warnings.warn(
-            f"`{file}`: principal point ({cx:g}, {cy:g}) and field of view {field_of_view:.0f} deg are odd "
+            f"{where}: principal point ({cx:g}, {cy:g}) and field of view {field_of_view:.0f} deg are odd "
             f"for images of {camera.width} x {camera.height}; was it calibrated at another image size?",
             InputWarning,
             stacklevel=3,

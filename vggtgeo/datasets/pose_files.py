@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.geometry.trajectory import Trajectory, rising
+from vggtgeo.geometry.trajectory import FARTHEST, LATEST, LONGEST, SHORTEST, Trajectory, rising
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
@@ -63,6 +63,15 @@ def trajectory_of(
             NoteWarning,
             stacklevel=3,
         )
+    near = known & (np.abs(poses[:, :3, 3]) <= FARTHEST).all(axis=1) & (np.abs(times) <= LATEST)
+    if not near[known].all():
+        warnings.warn(
+            f"`{where}`: {int((known & ~near).sum())} of {len(poses)} poses have a number that is no time or place; "
+            f"left out of the {of}",
+            InputWarning,
+            stacklevel=3,
+        )
+    known = near
     turned = known & _have_rotations(np.nan_to_num(poses, nan=0.0, posinf=0.0, neginf=0.0))
     if not turned[known].all():
         warnings.warn(
@@ -87,13 +96,16 @@ def trajectory_of_rows(
 
 
 def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
-    """Matrices of positions [n, 3] and quaternions [n, 4], x y z w; NaN where a quaternion is no rotation."""
+    """Matrices of positions [n, 3] and quaternions [n, 4], x y z w; zeros for the rotation where a quaternion is none:
+    its length is not about 1.
+    """
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    turned = (length > 0) & np.isfinite(length)
+    turned = (length >= SHORTEST) & (length <= LONGEST)
     rotations = Rotation.from_quat(np.where(turned, quaternions, [0.0, 0.0, 0.0, 1.0])).as_matrix()
-    poses[:, :3, :3] = np.where(turned[..., None], rotations, np.nan)
+    unknown = np.where(np.isfinite(length), 0.0, np.nan)
+    poses[:, :3, :3] = np.where(turned[..., None], rotations, unknown[..., None])
     poses[:, :3, 3] = positions
     return poses
 

@@ -27,12 +27,12 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
 from vggtgeo.datasets.image_files import (
-    FARTHEST,
     MILLIMETRES,
     MOST_BYTES,
     ImageFile,
     file_content,
     image_in,
+    metres_of_floats,
     read_depth,
 )
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
@@ -149,7 +149,7 @@ class Record3d(FolderSequence):
             return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height))
         shape = self.camera.height, self.camera.width
         depth = _shaped(self._unpacked(path, 4), np.float32, path, self.depth_size[::-1], shape)
-        depth = np.where((depth > 0) & (depth <= FARTHEST), depth, np.float32(np.nan))
+        depth = metres_of_floats(depth)
         trusted = path.with_suffix(".conf")
         if self.holds(trusted):
             trust = _shaped(self._unpacked(trusted, 1), np.uint8, trusted, depth.shape, shape)

@@ -1,0 +1,131 @@
+"""ROS 1 bags of a few messages, each as a test wants it: what cameras' drivers write, and what nobody should."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tiny_layouts as tiny
+
+IMAGE, COMPRESSED, INFO, POSE = (
+    *(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo")),
+    "geometry_msgs/msg/PoseStamped",
+)
+SIZE = tiny.WIDTH, tiny.HEIGHT
+COUNT = 4
+MATRIX = (50, 0, 20, 0, 50, 15, 0, 0, 1)
+Fields = Mapping[str, Any]
+Topic = tuple[str, Callable[[int], Fields | bytes | None]]
+"""Type of its messages, and what of each number is in the message: fields, or its bytes; None for no message."""
+
+
+def stamp(number: int, later: float = 0.0) -> float:
+    """Seconds of a message."""
+    return 50.0 + 0.1 * number + later
+
+
+def write(path: Path, **topics: Topic) -> Path:
+    """A bag of these topics, `_` in their names for `/`."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer(path) as writer:
+        for name, (kind, content) in topics.items():
+            connection = writer.add_connection("/" + name.replace("_", "/"), kind, typestore=store)
+            for number in range(COUNT):
+                fields = content(number)
+                if fields is not None:
+                    raw = (
+                        fields if isinstance(fields, bytes) else store.serialize_ros1(_made(store, kind, fields), kind)
+                    )
+                    writer.write(connection, int(1e9 * stamp(number)), raw)
+    return path
+
+
+def _made(store: Any, kind: str, fields: Fields) -> Any:
+    kinds = store.types
+    seconds = fields["time"]
+    time = kinds["builtin_interfaces/msg/Time"](int(seconds), round(seconds % 1 * 1e9))
+    header = kinds["std_msgs/msg/Header"](0, time, "c")
+    rest = [value for name, value in fields.items() if name != "time"]
+    if kind == POSE:
+        place, turn = rest
+        parts = kinds["geometry_msgs/msg/Point"](*place), kinds["geometry_msgs/msg/Quaternion"](*turn)
+        rest = [kinds["geometry_msgs/msg/Pose"](*parts)]
+    if kind == INFO:
+        rest.append(kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False))
+    return kinds[kind](header, *rest)
+
+
+def image(pixels: Callable[[int], np.ndarray] = tiny.image, encoding: str = "rgb8", **other: Any) -> Topic:
+    """Raw images. other: fields that are not those of the pixels."""
+
+    def fields(number: int) -> Fields:
+        array, later = pixels(number), other.get("later", 0.0)
+        data = np.frombuffer(array.tobytes(), np.uint8)
+        plain = {"time": stamp(number, later), "height": array.shape[0], "width": array.shape[1], "encoding": encoding}
+        plain |= {"is_bigendian": 0, "step": len(data) // len(array), "data": data}
+        return plain | {name: value for name, value in other.items() if name in plain}
+
+    return IMAGE, fields
+
+
+def packed(content: Callable[[int], bytes], kind: str = "jpeg") -> Topic:
+    """Compressed images, or depth."""
+    fields = lambda number: {
+        "time": stamp(number),
+        "format": kind,
+        "data": np.frombuffer(content(number), np.uint8),
+    }
+    return COMPRESSED, fields
+
+
+def info(
+    size: tuple[int, int] = SIZE,
+    matrix: Callable[[int], Any] = lambda number: MATRIX,
+    distortion: tuple[float, ...] = (0.0,) * 5,
+    lens: str = "plumb_bob",
+) -> Topic:
+    """The camera."""
+    fields = lambda number: {
+        "time": stamp(number),
+        "height": size[1],
+        "width": size[0],
+        "model": lens,
+        "d": np.array(distortion, float),
+        "k": np.array(matrix(number), float),
+        "r": np.eye(3).ravel(),
+        "p": np.zeros(12),
+        "binning_x": 0,
+        "binning_y": 0,
+    }
+    return INFO, fields
+
+
+def pose(
+    place: Callable[[int], tuple[float, ...]] = lambda number: (float(number), 0.0, 0.0),
+    turn: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0),
+    time: Callable[[int], float] = stamp,
+) -> Topic:
+    """The truth."""
+    return POSE, lambda number: {"time": time(number), "place": place(number), "turn": turn}
+
+
+def but(topic: Topic, number: int, content: Fields | bytes | None) -> Topic:
+    """The same topic, with another message of this number."""
+    kind, fields = topic
+    return kind, lambda each: content if each == number else fields(each)
+
+
+def jpeg(number: int) -> bytes:
+    """A picture, as cameras compress it."""
+    return cv2.imencode(".jpg", tiny.image(number))[1].tobytes()
+
+
+def depth_png(number: int) -> bytes:
+    """Depth in millimetres."""
+    return cv2.imencode(".png", tiny.depth_codes(number))[1].tobytes()

@@ -1,0 +1,83 @@
+"""The camera of a bag's images, by its messages of `sensor_msgs/CameraInfo`.
+
+A bag may hold those of several cameras, and some that were never calibrated: what is not used is told, and why.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vggtgeo.datasets.intrinsics import is_fisheye, pinhole_of, warn_of_other_size
+from vggtgeo.geometry.camera import Camera, check_distortion
+from vggtgeo.io.errors import InputError, InputWarning
+
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_LENSES, _FISHEYE = (0, 4, 5, 8), 4
+"""How many coefficients a lens may have."""
+_STEADY = 0.02
+"""Relative change of the focal length up to which it is one camera; autofocus changes it by less."""
+
+
+def camera_of(path: Path, infos: Mapping[str, Sequence[Any]], colour: str, size: tuple[int, int]) -> Camera | None:
+    """Of the topic whose name shares most with that of the images, `colour`, if it is of their size; None where there
+    is none. infos: messages by topic. InputWarnings for those beside the images that are not used, for a camera of
+    another folder of topics, and for one that changes; InputError for numbers that are no camera.
+    """
+    shared = lambda name: next((n for n, (a, b) in enumerate(zip(name, colour, strict=False)) if a != b), len(name))
+    for name in sorted(infos, key=shared, reverse=True):
+        where, messages = f"`{path}`: `{name}`", infos[name]
+        beside = colour.startswith(name.rpartition("/")[0] + "/")
+        if not messages:
+            continue
+        first = messages[0]
+        if (first.width, first.height) != size:
+            if beside:
+                _warn(
+                    f"{where} has a camera for {first.width} x {first.height} pixels; the images are {size[0]} x "
+                    f"{size[1]}: not used"
+                )
+            continue
+        if not _matrix(first).any():  # as the message's definition has it
+            if beside:
+                _warn(f"{where} says that the camera is not calibrated (all zeros): not used")
+            continue
+        if not beside:
+            _warn(f"{where} is taken for the camera of `{colour}`; give --intrinsics fx,fy,cx,cy if it is another's")
+        camera = _camera(where, first, size)
+        warn_of_other_size(where, camera)
+        focal = np.array([_matrix(message)[0, 0] for message in messages])
+        if np.abs(focal - focal[0]).max() > _STEADY * abs(focal[0]):
+            _warn(
+                f"{where}: the focal length goes from {focal.min():g} to {focal.max():g} pixels; the first, "
+                f"{focal[0]:g}, is taken for all images"
+            )
+        return camera
+    return None
+
+
+def _matrix(message: Any) -> np.ndarray:
+    return np.reshape(message.K if hasattr(message, "K") else message.k, (3, 3))
+
+
+def _camera(where: str, message: Any, size: tuple[int, int]) -> Camera:
+    lens = np.asarray(message.D if hasattr(message, "D") else message.d, float).tolist()
+    fisheye = is_fisheye(f"{where}: `distortion_model`", message.distortion_model)
+    lens = _without_zeros(lens, (_FISHEYE,) if fisheye else _LENSES)
+    try:
+        return Camera(pinhole_of(_matrix(message)), *size, check_distortion(lens), fisheye=fisheye)
+    except InputError as error:
+        raise InputError(f"{where}: {error}; record the right one, or give the images without it") from None
+
+
+def _without_zeros(lens: list[float], counts: Sequence[int]) -> list[float]:
+    """Coefficients that are a lens by their number, without zeros behind them: drivers write some of any kind."""
+    if len(lens) in counts and any(lens):
+        return lens
+    return next((lens[:count] for count in counts if count <= len(lens) and not any(lens[count:])), lens)
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, InputWarning, stacklevel=5)
