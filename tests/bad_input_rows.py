@@ -4,7 +4,8 @@ from bad_row import Row
 from bad_rows_bags import BAGS
 from bad_rows_commands import COMMANDS
 from bad_rows_files import FILES
+from bad_rows_layouts import LAYOUTS
 from bad_rows_strangers import STRANGERS
 
-ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS, *BAGS]
+ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS, *BAGS, *LAYOUTS]
 __all__ = ["ROWS", "Row"]

@@ -5,10 +5,11 @@ import importlib.util
 import mmap
 import os
 import re
+import warnings
 from pathlib import Path
 
-from vggtgeo.io.errors import InputError
-from vggtgeo.io.jax_environment import jax_environment
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.jax_environment import jax_environment, own_cache
 
 
 def set_jax_flags() -> None:
@@ -19,6 +20,7 @@ def set_jax_flags() -> None:
         os.environ.setdefault(name, value)
 
 
+_CACHE = "JAX_COMPILATION_CACHE_DIR"
 _COMPILED = ("run", "demo", "solve", "bench")
 
 
@@ -27,6 +29,31 @@ def check_jit(command: str) -> None:
     asked = os.environ.get("JAX_DISABLE_JIT", "").lower() in ("y", "yes", "t", "true", "on", "1")
     if asked and command in _COMPILED:
         raise InputError(f"the environment variable `JAX_DISABLE_JIT` is set; `{command}` is compiled: unset it")
+
+
+def check_cache(command: str) -> None:
+    """InputError where JAX is told to keep compiled code in what is no folder, and an InputWarning where a file lies
+    in the place of this program's own: nothing is kept then, and every call compiles for a minute or more.
+    """
+    if command not in _COMPILED:
+        return
+    given = os.environ.get(_CACHE, "")
+    if given and "://" not in given and (file := _in_the_way(Path(given))) is not None:
+        raise InputError(f"the environment variable `{_CACHE}` is `{given}`, and `{file}` is no folder; unset it")
+    if not given and (file := _in_the_way(own_cache())) is not None:
+        warnings.warn(
+            f"`{file}` is no folder: nothing that is compiled can be kept there, and each call compiles for a minute or "
+            "more; move that file away",
+            InputWarning,
+            stacklevel=2,
+        )
+
+
+def _in_the_way(folder: Path | None) -> Path | None:
+    """The first of a folder and those above it that is there and no folder."""
+    places = [] if folder is None else [folder, *folder.parents]
+    there = (place for place in places if os.path.lexists(place))
+    return next((place for place in there if not place.is_dir()), None)
 
 
 def check_xla_flags(command: str) -> None:

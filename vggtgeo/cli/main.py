@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from vggtgeo.cli.address_space import check_address_space
-from vggtgeo.cli.jax_flags import check_jit, check_xla_flags, set_jax_flags
+from vggtgeo.cli.jax_flags import check_cache, check_jit, check_xla_flags, set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.streams import exit_code, use_lasting_streams, use_readable_width
 from vggtgeo.io.errors import InputError, InputWarning
@@ -164,6 +164,7 @@ class _LazyGroup(TyperGroup):
             check_address_space(entry.name)
             check_jit(entry.name)
             check_xla_flags(entry.name)
+            check_cache(entry.name)
         return name, load_command(entry) if entry else stand_in, rest
 
     def invoke(self, ctx: Any) -> Any:

@@ -23,7 +23,7 @@ def solve(
     output: Annotated[Path, typer.Option("-o", "--output", help="Solution (.npz): T, k, d.")],
     max_steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Most iterations (tried steps).")] = 50,
     dtype: Annotated[Precision, typer.Option(help="Precision of the solve.")] = Precision.float64,
-    repeat: Annotated[int, typer.Option(min=1, help="Runs to take the median time of.")] = 1,
+    repeat: Annotated[int, typer.Option(min=1, max=100_000, help="Runs to take the median time of.")] = 1,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:

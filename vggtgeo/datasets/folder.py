@@ -26,6 +26,8 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
 
+LATEST = 1e11
+"""Seconds of a time stamp, 3,000 years: nanoseconds since 1970 are 1e18."""
 _SAMPLES = 3
 _NAMED_EMPTY_DEPTHS = 3
 
@@ -62,6 +64,11 @@ class FolderSequence:
         for file in self.files:
             if not math.isfinite(file.timestamp):
                 raise InputError(f"`{self.folder}`: `{file.image}` has the time {file.timestamp}; expected seconds")
+            if abs(file.timestamp) > LATEST:
+                raise InputError(
+                    f"`{self.folder}`: `{file.image}` has the time {file.timestamp:g}, which is beyond all clocks; it "
+                    "must be in seconds"
+                )
             if file.image == file.depth:
                 raise InputError(
                     f"`{self.folder}`: `{file.image}` is listed as an image and as depth; expected two files"

@@ -18,7 +18,7 @@ from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, 
 from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, NoteWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
 RATE = 10.0
@@ -108,6 +108,9 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
         values = _calibration(file)
         if _is_unrectified(file, values, name, width, height):
             return _as_calibrated(file, values, name, width, height), 0.0
+        if values and not values.keys() & {*_LINES[name]}:
+            lines = " or ".join(f"`{key}:`" for key in _LINES[name])
+            warnings.warn(f"`{file}` has no line {lines}, the camera of `{name}`: not used", InputWarning, stacklevel=4)
         for key in _LINES[name]:
             if key in values:
                 row = _numbers(file, key, values[key], 12)

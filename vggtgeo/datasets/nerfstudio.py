@@ -5,6 +5,7 @@
 | `frames`: `file_path`, `transform_matrix` | image, and camera -> world, OpenGL's axes (x right, y up, z backward) |
 | `depth_file_path` or `depth_path` of a frame | 16-bit depth, millimetres, or `integer_depth_scale` metres a unit |
 | `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, `k1` ... `p2` | the camera; pixel (0, 0) is the corner of the top-left pixel |
+| `camera_model`, `is_fisheye` | the lens: a pinhole, distorted or not, or a fisheye of `k1` ... `k4` |
 | `camera_angle_x` | field of view, radians, where there is no focal length |
 
 The poses are those of another program (COLMAP, ARKit), often of free scale: no independent truth.
@@ -158,10 +159,7 @@ def _pose(file: Path, frame: Mapping[str, Any]) -> np.ndarray:
 
 def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], width: int, height: int) -> Camera:
     """The camera of the file, or the middle of those of its frames, for images of this size."""
-    model = str(content.get("camera_model", "")).upper()
-    if model not in (*_PINHOLES, _FISHEYE):
-        known = ", ".join((*_PINHOLES[1:], _FISHEYE))
-        raise InputError(f"`{file}`: `camera_model` is {model}; read are {known}: undistort the images")
+    fisheye = _is_fisheye(file, content)
     across, down = (
         float(size) if stated is None else _positive(file, key, stated)
         for key, size in (("w", width), ("h", height))
@@ -173,7 +171,6 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
     fy = _number(file, content, frames, "fl_y") or focal
     cx, cy = _number(file, content, frames, "cx"), _number(file, content, frames, "cy")
     centre = (0.5 * across if cx is None else cx) - 0.5, (0.5 * down if cy is None else cy) - 0.5
-    fisheye = model == _FISHEYE
     lens = tuple(_number(file, content, frames, key) or 0.0 for key in (_OF_FISHEYE if fisheye else _DISTORTION))
     try:
         distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
@@ -186,6 +183,22 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
         )
     camera = Camera(intrinsics_of(file, (focal, fy, *centre)), round(across), round(down), distortion, fisheye=fisheye)
     return camera.resized(width, height)
+
+
+def _is_fisheye(file: Path, content: Mapping[str, Any]) -> bool:
+    """By `camera_model` (nerfstudio) and `is_fisheye` (instant-ngp), which must not contradict each other."""
+    model, stated = str(content.get("camera_model", "")).upper(), content.get("is_fisheye")
+    if model not in (*_PINHOLES, _FISHEYE):
+        known = ", ".join((*_PINHOLES[1:], _FISHEYE))
+        raise InputError(f"`{file}`: `camera_model` is {model}; read are {known}: undistort the images")
+    if stated is None:
+        return model == _FISHEYE
+    if not isinstance(stated, bool) or (model and stated != (model == _FISHEYE)):
+        beside = f" beside the `camera_model` {model}" if model else ""
+        raise InputError(
+            f"`{file}`: `is_fisheye` is {str(stated)[:40]}{beside}; expected true for {_FISHEYE}, and false for others"
+        )
+    return stated
 
 
 def _focal(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], width: float) -> float | None:

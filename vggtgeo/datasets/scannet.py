@@ -109,8 +109,10 @@ def _depth(folder: Path, image: Path) -> Path | None:
 
 def _info(folder: Path) -> Path | None:
     """The file of both cameras that SensReader in C++ writes; another program's `info.txt` is none."""
-    there = (folder / name for name in ("_info.txt", "info.txt"))
-    return next((file for file in there if file.is_file() and "m_calibration" in read_text(file)), None)
+    own, other = folder / "_info.txt", folder / "info.txt"
+    if own.is_file():
+        return own
+    return other if other.is_file() and "m_calibration" in read_text(other) else None
 
 
 def _intrinsics(folder: Path, camera: str) -> tuple[float, float, float, float]:

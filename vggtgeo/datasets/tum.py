@@ -18,7 +18,7 @@ from typing import Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.folder import LATEST, FolderSequence, FrameFile, common_size, depth_is_usable
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
@@ -30,8 +30,6 @@ MAX_DEPTH_DELAY = 0.02
 """Seconds between an image and its depth."""
 
 MOST_LETTERS = 200
-LATEST = 1e11
-"""Seconds of a time stamp, 3,000 years: nanoseconds since 1970 are 1e18."""
 LEAST_FALLING, LEAST_LINES = 0.1, 10
 """Share of the lines at which the first column of a list falls, and lines, for it to be no time: lists that two
 processes wrote have a line out of order now and then, and what frames took to come falls at every second line."""

@@ -21,12 +21,20 @@ def jax_environment() -> dict[str, str]:
     return found
 
 
-def cache_folder() -> Path | None:
-    """`$XDG_CACHE_HOME/vggtgeo/jax` (`~/.cache/...` without that variable), or None where it cannot be written."""
+def own_cache() -> Path | None:
+    """`$XDG_CACHE_HOME/vggtgeo/jax` (`~/.cache/...` without that variable); None without a home folder."""
     try:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(base) / "vggtgeo" / "jax"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vggtgeo" / "jax"
+    except RuntimeError:
         return None
-    return folder if os.access(folder, os.W_OK) else None
+
+
+def cache_folder() -> Path | None:
+    """`own_cache`, made if need be; None where it cannot be written."""
+    folder = own_cache()
+    try:
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder if folder is not None and os.access(folder, os.W_OK) else None
