@@ -5,7 +5,8 @@ from bad_rows_bags import BAGS
 from bad_rows_commands import COMMANDS
 from bad_rows_files import FILES
 from bad_rows_layouts import LAYOUTS
+from bad_rows_maps import MAPS
 from bad_rows_strangers import STRANGERS
 
-ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS, *BAGS, *LAYOUTS]
+ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS, *BAGS, *LAYOUTS, *MAPS]
 __all__ = ["ROWS", "Row"]

@@ -42,8 +42,8 @@ def check_cache(command: str) -> None:
         raise InputError(f"the environment variable `{_CACHE}` is `{given}`, and `{file}` is no folder; unset it")
     if not given and (file := _in_the_way(own_cache())) is not None:
         warnings.warn(
-            f"`{file}` is no folder: nothing that is compiled can be kept there, and each call compiles for a minute or "
-            "more; move that file away",
+            f"`{file}` is no folder: nothing that is compiled can be kept there, and each call compiles for a minute "
+            "or more; move that file away",
             InputWarning,
             stacklevel=2,
         )

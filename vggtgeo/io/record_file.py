@@ -24,6 +24,7 @@ from vggtgeo.io.records import pack_value, unpack_value
 MOST_HEADER = 2**27
 """Bytes of JSON that are read: a state of 100,000 frames has half as many."""
 HEADER, DATA = "header", "data"
+AGAIN = "use a copy that nobody changed, or make it again"
 Header = dict[str, Any]
 _NO_HEADER = (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError, OverflowError)
 
@@ -76,7 +77,9 @@ class Layout:
         except InputError as error:
             raise InputError(f"`{path}` cannot be read as a {self.kind}: {error}") from None
         except _NO_HEADER as error:
-            raise InputError(f"`{path}` is no {self.kind} that vggtgeo wrote, or was changed since: {error}") from None
+            raise InputError(
+                f"`{path}` is no {self.kind} that vggtgeo wrote, or was changed since: {error}; {AGAIN}"
+            ) from None
 
     def facts(self, path: Path) -> dict[str, Any]:
         """The facts alone; errors as of `read`."""
@@ -110,6 +113,8 @@ class Layout:
             kind, version = header["vggtgeo"], header["version"]
             header["tree"], header["classes"], header["arrays"]
             header["facts"] = dict(header["facts"])
+            if type(version) is not int:
+                raise TypeError(f"its version is {version!r:.20}")
             known = version == self.version or version in self.upgrades
         except _NO_HEADER as error:
             raise InputError(f"`{archive.path}` is no {self.kind} that vggtgeo wrote: {error}") from None
@@ -125,7 +130,7 @@ class Layout:
                 header = {**self.upgrades[number](header), "version": number + 1}
         except _NO_HEADER as error:
             raise InputError(
-                f"`{archive.path}` is no {self.kind} that vggtgeo wrote, or was changed since: {error}"
+                f"`{archive.path}` is no {self.kind} that vggtgeo wrote, or was changed since: {error}; {AGAIN}"
             ) from None
         return header
 

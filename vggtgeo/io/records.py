@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.field_types import field_tests
 
 Tree = Any
 """What JSON holds."""
@@ -224,10 +225,12 @@ class _Unpacker:
 
     def _filled(self, tree: Tree) -> Any:
         kind = self._classes[tree["c"]]
-        names = [field.name for field in dataclasses.fields(kind)]
         made: Any = object.__new__(kind)
-        for name, item in zip(names, tree["v"], strict=True):
-            object.__setattr__(made, name, self.value(item))
+        for (name, (fits, words)), item in zip(field_tests(kind).items(), tree["v"], strict=True):
+            value = self.value(item)
+            if not fits(value):
+                raise ValueError(f"`{name}` of a `{kind.__name__}` is {value!r:.60}, expected {words}")
+            object.__setattr__(made, name, value)
         return made
 
     def _values(self, number: int) -> np.ndarray:

@@ -25,7 +25,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.checkpoint_pace import EVERY, SHARE
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.given import check_real, path_of
-from vggtgeo.io.record_file import Layout
+from vggtgeo.io.record_file import AGAIN, Layout
 from vggtgeo.io.records import by_name
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.summary import versions
@@ -153,10 +153,15 @@ def resumed(asked: Checkpoints | None, wanted: Mapping[str, str]) -> RunSoFar | 
                 f"`{asked.path}` is of a run with `{name}` {_short(before)}, and this one has {_short(now)}: give the "
                 "same, or begin anew with `--no-resume`"
             )
-    found, _ = CHECKPOINT.read(asked.path)
-    if not isinstance(found, RunSoFar) or not found.slam.frames:
-        raise InputError(f"`{asked.path}` holds no run; begin anew with `--no-resume`")
-    checked_state(asked.path, found.slam)
+    try:
+        found, _ = CHECKPOINT.read(asked.path)
+        if not isinstance(found, RunSoFar) or not found.slam.frames:
+            raise InputError(f"`{asked.path}` holds no run")
+        checked_state(asked.path, found.slam)
+        if not all(0 <= took < math.inf for took in (*found.seconds.values(), found.tracking, found.whole)):
+            raise InputError(f"`{asked.path}` says that a part of the run took {dict(found.seconds)} s: {AGAIN}")
+    except InputError as error:
+        raise InputError(f"{error}; begin anew with `--no-resume`") from None
     return found
 
 
@@ -166,7 +171,9 @@ def _facts(path: Path) -> dict[str, Any]:
         found = CHECKPOINT.facts(path)
     except InputError as error:
         raise InputError(f"{error}; begin anew with `--no-resume`") from None
-    if found.keys() != {"identity", "frames", "last", "digest"} or not isinstance(found["identity"], dict):
+    kinds = {"identity": dict, "frames": int, "last": int, "digest": str}
+    whole = found.keys() == kinds.keys() and all(type(found[name]) is kind for name, kind in kinds.items())
+    if not whole or not all(type(value) is str for value in found["identity"].values()):
         raise InputError(f"`{path}` holds no run; begin anew with `--no-resume`")
     return found
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 from vggtgeo.results.checkpoints import RunSoFar
 from vggtgeo.slam.callback import Callback
@@ -41,9 +42,16 @@ class RunCallbacks:
         return {name: value for name, value in found.items() if value is not None}
 
     def resume(self, before: RunSoFar) -> None:
-        """Each goes on from what it gave."""
+        """Each goes on from what it gave; InputError where that is something else than what it gives."""
         for member in self.members:
-            member.on_resume(before.callbacks.get(type(member).__name__), before.slam)
+            name = type(member).__name__
+            kept, fresh = before.callbacks.get(name), member.so_far()
+            if fresh is not None and not isinstance(kept, type(fresh)):
+                raise InputError(
+                    f"the run that was killed kept {type(kept).__name__} of `{name}`; expected "
+                    f"{type(fresh).__name__}: begin anew with `--no-resume`"
+                )
+            member.on_resume(kept, before.slam)
 
     def each(self, hook: str, *arguments: Any) -> None:
         """Call one hook of every member."""

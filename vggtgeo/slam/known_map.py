@@ -93,7 +93,7 @@ def load_map(path: str | os.PathLike[str]) -> Slam:
     """
     found, _ = MAP.read(path_of("path", path))
     known = checked_state(Path(path), found)
-    if not known.keyframes or known.frames or known.window:
+    if not known.keyframes or known.frames or known.window or any(one.frame >= 0 for one in known.keyframes):
         raise InputError(f"`{path}` holds no map; expected keyframes alone: save one with `vggtgeo run --save-map`")
     return known
 

@@ -12,8 +12,14 @@ from vggtgeo.models.checks import check_array, check_confidence, check_index, ch
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.factors import Factor, MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe, Slots
 from vggtgeo.slam.state import Slam
+
+_BEYOND_ALL_PIXELS = 1e6
+_BEYOND_ALL_LENGTHS = 1e15
+_MOST_INFORMATION = 1e30
+_UNIT = 1.001
 
 
 def check_state(slam: Slam) -> None:
@@ -21,13 +27,11 @@ def check_state(slam: Slam) -> None:
     count = len(slam.keyframes)
     if [keyframe.number for keyframe in slam.keyframes] != list(range(count)):
         raise ValueError("its keyframes are not numbered one after the other")
-    for name in ("intrinsics", "given_intrinsics", "intrinsics_sigma"):
-        values = getattr(slam, name)
-        check_array(name, values, (4,))
-        if not (values[:2] > 0).all():
-            raise ValueError(f"`{name}` begins with {values[:2].tolist()}, expected positive pixels")
+    _check_camera(slam)
     for keyframe in slam.keyframes:
         _check_keyframe(keyframe)
+    for factor in slam.factors:
+        _check_factor(factor)
     for one, other in pairwise(slam.keyframes):
         if one.size != other.size:
             raise ValueError(f"its images are of {other.size} and of {one.size} pixels, expected one size")
@@ -47,8 +51,27 @@ def check_state(slam: Slam) -> None:
             check_array("pixels", record.seen.pixels, (len(record.seen.slots), 2))
 
 
+def _check_camera(slam: Slam) -> None:
+    """The camera, how it moves, and how well its places are known."""
+    for name in ("intrinsics", "given_intrinsics", "intrinsics_sigma"):
+        values = getattr(slam, name)
+        check_array(name, values, (4,))
+        if not (values[:2] > 0).all():
+            raise ValueError(f"`{name}` begins with {values[:2].tolist()}, expected positive pixels")
+        _check_near(name, values)
+    check_pose("velocity", slam.velocity)
+    if slam.lost < 0:
+        raise ValueError(f"`lost` is {slam.lost}, expected a count of frames")
+    if slam.pose_sigma is not None:
+        check_array("pose_sigma", slam.pose_sigma, (None, 2), finite=False)
+        _check_not_negative("pose_sigma", slam.pose_sigma)
+
+
 def _check_keyframe(keyframe: Keyframe) -> None:
     check_pose("pose", keyframe.pose)
+    times = [keyframe.timestamp, 0.0 if keyframe.recorded is None else keyframe.recorded]
+    if not np.isfinite(times).all():
+        raise ValueError(f"the time of keyframe {keyframe.number} is {times}, expected seconds")
     height, width = keyframe.size
     images = keyframe.images
     parts = (images.colour, images.depth, images.depth_sigma, images.depth_confidence)
@@ -63,16 +86,24 @@ def _check_keyframe(keyframe: Keyframe) -> None:
     _check_slots("points", keyframe.points, len(keyframe.features))
     segments = keyframe.lines.segments
     check_array("endpoints", segments.endpoints, (None, 2, 2))
+    _check_near("endpoints", segments.endpoints)
+    check_array("scores of segments", segments.scores, (len(segments.endpoints),))
+    if isinstance(keyframe.lines.descriptors, np.ndarray):
+        check_array("descriptors of lines", keyframe.lines.descriptors, (len(segments.endpoints), None))
     check_array("line_depths", keyframe.line_depths, (len(segments.endpoints), 2), finite=False)
+    _check_not_negative("line_depths", keyframe.line_depths)
     _check_rows("sample_segment", keyframe.sample_segment, len(segments.endpoints))
     _check_slots("samples", keyframe.samples, len(keyframe.sample_segment))
     if keyframe.place is not None:
         check_array("place", keyframe.place, (None,))
+        if np.abs(keyframe.place).max(initial=0.0) > _UNIT:
+            raise ValueError("`place` is no vector of unit length")
 
 
 def _check_features(features: Features, shape: tuple[int, int]) -> None:
     count = len(features.pixels)
     check_array("pixels", features.pixels, (count, 2))
+    _check_near("pixels", features.pixels)
     check_array("scores", features.scores, (count,))
     described = features.descriptors
     if isinstance(described, PixelDescriptors):
@@ -82,8 +113,12 @@ def _check_features(features: Features, shape: tuple[int, int]) -> None:
 
 def _check_slots(name: str, slots: Slots, count: int) -> None:
     check_array(f"pixels of {name}", slots.pixels, (count, 2))
+    _check_near(f"pixels of {name}", slots.pixels)
     for field in ("inverse_depth", "prior", "sigma"):
         check_array(f"{field} of {name}", getattr(slots, field), (count,), finite=False)
+        _check_not_negative(f"{field} of {name}", getattr(slots, field))
+    if ((slots.sigma == 0) & (slots.prior > 0)).any():
+        raise ValueError(f"`sigma of {name}` is 0 where there is a prior, expected deviations")
     for field in ("prior_confidence", "confidence"):
         check_confidence(f"{field} of {name}", getattr(slots, field), (count,))
 
@@ -98,12 +133,40 @@ def _check_pair(pair: Pair, slam: Slam) -> None:
     _check_rows("index_j of points", points.index_j, len(second.features), lowest=-1)
     for name in ("pixels_i", "pixels_j"):
         check_array(name, getattr(points, name), (count, 2))
+        _check_near(name, getattr(points, name))
     check_array("index_j of points", points.index_j, (count,))
     check_confidence("confidence of points", points.confidence, (count,))
     _check_rows("index_i of lines", lines.index_i, len(first.lines))
     _check_rows("index_j of lines", lines.index_j, len(second.lines))
     check_array("index_j of lines", lines.index_j, (len(lines.index_i),))
     check_confidence("confidence of lines", lines.confidence, (len(lines.index_i),))
+
+
+def _check_factor(factor: Factor) -> None:
+    if isinstance(factor, MeasuredBaseline):
+        if not (np.isfinite([factor.length, factor.sigma]).all() and factor.sigma > 0):
+            raise ValueError(f"a baseline is {factor.length} with a deviation of {factor.sigma}")
+        return
+    if isinstance(factor, MeasuredRelativePose):
+        check_pose("pose of a factor", factor.pose)
+    else:
+        check_array("rotation of a factor", factor.rotation, (3, 3))
+    size = 6 if isinstance(factor, MeasuredRelativePose) else 3
+    check_array("information of a factor", factor.information, (size, size))
+    if np.diag(factor.information).min() < 0 or np.abs(factor.information).max() > _MOST_INFORMATION:
+        raise ValueError(f"`information of a factor` has the diagonal {np.diag(factor.information)}")
+
+
+def _check_near(name: str, pixels: np.ndarray) -> None:
+    """Pixels may lie beyond the border, where a lens has moved them, and not beyond all images."""
+    if np.abs(pixels).max(initial=0.0) > _BEYOND_ALL_PIXELS:
+        raise ValueError(f"`{name}` goes to {np.abs(pixels).max():.3g} pixels")
+
+
+def _check_not_negative(name: str, values: np.ndarray) -> None:
+    """NaN is what is not known."""
+    if values.dtype.kind not in "fiu" or (values < 0).any() or (values > _BEYOND_ALL_LENGTHS).any():
+        raise ValueError(f"`{name}` has values that are negative or no lengths")
 
 
 def _check_rows(name: str, rows: np.ndarray, count: int, lowest: int = 0) -> None:

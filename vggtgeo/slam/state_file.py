@@ -27,7 +27,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import path_of
-from vggtgeo.io.record_file import Header, Layout
+from vggtgeo.io.record_file import AGAIN, Header, Layout
 from vggtgeo.io.records import by_name, with_field
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.onnx.fit import Fit
@@ -187,5 +187,5 @@ def checked_state(path: Path, found: object) -> Slam:
     try:
         check_state(found)
     except (TypeError, AttributeError, ValueError, IndexError) as error:
-        raise InputError(f"`{path}` is no state that vggtgeo wrote, or was changed since: {error}") from None
+        raise InputError(f"`{path}` is no state that vggtgeo wrote, or was changed since: {error}; {AGAIN}") from None
     return found

@@ -1,0 +1,173 @@
+"""Rows of the table of bad inputs: maps that were kept, and changed since."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import bad_files as bad
+import numpy as np
+from bad_row import Row, rows
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
+from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
+
+from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.keyframe_images import KeyframeImages
+from vggtgeo.slam.known_map import MAP, save_map
+from vggtgeo.slam.state import Slam
+
+WIDTH, HEIGHT = bad.WIDTH, bad.HEIGHT
+COUNT = 8
+CAMERA = np.array([55.0, 55.0, 31.5, 23.5])
+
+
+def slots(count: int) -> Slots:
+    """Points at 2 m."""
+    half, one = np.full(count, 0.5), np.ones(count)
+    return Slots(pixels(count), half, half, 0.1 * half, one, one)
+
+
+def pixels(count: int) -> np.ndarray:
+    """Along a diagonal."""
+    return np.linspace(5.0, 40.0, 2 * count).reshape(count, 2)
+
+
+def keyframe(number: int) -> Keyframe:
+    """A picture with a few key points and a segment."""
+    depth = np.full((HEIGHT, WIDTH), 2.0, np.float16)
+    images = KeyframeImages(bad.picture(number), depth, depth, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    described = PixelDescriptors(np.eye(COUNT, 128, dtype=np.float32), np.zeros((HEIGHT, WIDTH), np.uint8))
+    lines = LineFeatures(Segments(np.array([[[5.0, 5.0], [40.0, 30.0]]]), np.ones(1)), np.ones((1, 64), np.float32))
+    return Keyframe(
+        number=number,
+        frame=number,
+        timestamp=float(number),
+        pose=np.eye(4),
+        images=images,
+        features=Features(pixels(COUNT), np.ones(COUNT), described),
+        lines=lines,
+        line_depths=np.full((1, 2), 2.0),
+        points=slots(COUNT),
+        samples=slots(2),
+        sample_segment=np.zeros(2, int),
+    )
+
+
+def state() -> Slam:
+    """Two keyframes that see the same."""
+    index, sure = np.arange(COUNT), np.ones(COUNT)
+    matches = PointMatches(index, index, pixels(COUNT), pixels(COUNT), sure)
+    pair = Pair(0, 1, matches, LineMatches(np.zeros(1, int), np.zeros(1, int), np.ones(1)))
+    motion = MeasuredRelativePose(0, 1, np.eye(4), np.eye(6))
+    return Slam(
+        CAMERA, CAMERA, 0.1 * CAMERA, True, (keyframe(0), keyframe(1)), (pair,), factors=(motion,), origins=(0,)
+    )
+
+
+def changed(change: Callable[[Slam], Slam]) -> Callable[[Path], Path]:
+    """Good images, and beside them a map of a state that `change` has changed."""
+
+    def make(folder: Path) -> Path:
+        save_map(folder / "office.map", change(state()))
+        return bad.frames(folder / "frames")
+
+    return make
+
+
+def first(**fields: Any) -> Callable[[Path], Path]:
+    """A map whose first keyframe has other fields."""
+    return changed(lambda slam: replace(slam, keyframes=(replace(slam.keyframes[0], **fields), slam.keyframes[1])))
+
+
+def motion(**fields: Any) -> Callable[[Path], Path]:
+    """A map whose keyframes are tied otherwise."""
+    return changed(lambda slam: replace(slam, factors=(replace(slam.factors[0], **fields),)))
+
+
+def headed(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], Path]:
+    """A map with another header."""
+
+    def make(folder: Path) -> Path:
+        made = changed(lambda slam: slam)(folder)
+        with zipfile.ZipFile(folder / "office.map") as archive:
+            header, data = (
+                json.loads(np.load(io.BytesIO(archive.read("header.npy"))).tobytes()),
+                archive.read("data.npy"),
+            )
+        change(header)
+        with zipfile.ZipFile(folder / "office.map", "w") as archive, io.BytesIO() as content:
+            np.save(content, np.frombuffer(json.dumps(header).encode(), np.uint8))
+            archive.writestr("header.npy", content.getvalue())
+            archive.writestr("data.npy", data)
+        return made
+
+    return make
+
+
+def cut(folder: Path) -> Path:
+    """Half a map."""
+    made, file = changed(lambda slam: slam)(folder), folder / "office.map"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    return made
+
+
+def in_a_folder(folder: Path) -> Path:
+    """A folder that is called like a map."""
+    (folder / "office.map").mkdir()
+    return bad.frames(folder / "frames")
+
+
+def of_a_run(folder: Path) -> Path:
+    """The state of a run, as a map."""
+    MAP.write(folder / "office.map", state())
+    return bad.frames(folder / "frames")
+
+
+def with_points(points: Slots) -> Callable[[Path], Path]:
+    """A map whose first keyframe has these points."""
+    return first(points=points)
+
+
+FAR = np.where(np.arange(2 * COUNT).reshape(COUNT, 2) == 3, 1e300, pixels(COUNT))
+MAPS: list[Row] = rows(
+    "Known maps",
+    [
+        ("a folder", in_a_folder),
+        ("cut off", cut),
+        ("of a newer version", headed(lambda header: header.update(version=99))),
+        ("whose version is a text", headed(lambda header: header.update(version="12"))),
+        ("a checkpoint", headed(lambda header: header.update(vggtgeo="checkpoint"))),
+        ("a field that another version has", headed(lambda header: header["classes"][1][1].append("weather"))),
+        ("the state of a run", of_a_run),
+        ("a time that is a text", headed(lambda header: header["tree"]["v"][4][0]["v"].__setitem__(12, "noon"))),
+        ("lengths that are text", headed(lambda header: header["tree"]["v"].__setitem__(3, "yes"))),
+        ("a number of a frame that is none", headed(lambda header: header["tree"]["v"][4][0]["v"].__setitem__(1, "x"))),
+        ("a time that is NaN", first(recorded=float("nan"))),
+        ("a pose with a NaN", first(pose=np.full((4, 4), np.nan))),
+        ("key points at 1e300", first(features=replace(keyframe(0).features, pixels=FAR))),
+        ("depth that is negative", with_points(replace(slots(COUNT), inverse_depth=-np.ones(COUNT)))),
+        ("a deviation of zero", with_points(replace(slots(COUNT), sigma=np.zeros(COUNT)))),
+        ("a motion that is no pose", motion(pose=np.zeros((4, 4)))),
+        ("information with a NaN", motion(information=np.full((6, 6), np.nan))),
+        ("information that is negative", motion(information=-np.eye(6))),
+        ("deviations of poses that are negative", changed(lambda slam: replace(slam, pose_sigma=-np.ones((2, 2))))),
+        ("lines without their descriptors", first(lines=replace(keyframe(0).lines, descriptors=np.ones((0, 64))))),
+        (
+            "matches of key points that are not there",
+            changed(
+                lambda slam: replace(
+                    slam,
+                    keyframes=(replace(slam.keyframes[0], features=Features(pixels(3), np.ones(3))), slam.keyframes[1]),
+                )
+            ),
+        ),
+    ],
+    argv=lambda made: ["run", made, "-o", made.parent / "out", "--map", made.parent / "office.map"],
+)

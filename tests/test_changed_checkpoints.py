@@ -1,0 +1,71 @@
+"""Checkpoints that somebody changed end with a sentence before the run goes on. Oracle: the sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bad_rows_maps import state
+
+from vggtgeo.io.errors import InputError
+from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, RunSoFar, resumed
+from vggtgeo.results.run_callbacks import RunCallbacks
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.state import FramePose
+from vggtgeo.slam.window_recorder import WindowRecorder
+
+FACTS = {"identity": {"seed": "0"}, "frames": 1, "last": 0, "digest": "0"}
+
+
+def run(**other: Any) -> RunSoFar:
+    """A run of one frame."""
+    slam = replace(state(), frames=(FramePose(0, 0.0, 0, np.eye(4), True, 8),))
+    return RunSoFar(**({"slam": slam, "callbacks": {}, "notices": (), "refused": {}, "seconds": {}} | other), **TIMES)
+
+
+TIMES = {"tracking": 1.0, "whole": 1.0}
+
+
+def asked(folder: Path, kept: RunSoFar, facts: dict[str, Any]) -> RunSoFar | None:
+    """The run that goes on from this one."""
+    CHECKPOINT.write(folder / "kept.npz", kept, facts)
+    return resumed(Checkpoints(folder / "kept.npz", resume=True), {"seed": "0"})
+
+
+def test_an_unchanged_one_is_read(tmp_path: Path) -> None:
+    """Else the others would prove nothing."""
+    found = asked(tmp_path, run(), FACTS)
+    assert found is not None
+    assert len(found.slam.frames) == 1
+
+
+@pytest.mark.parametrize(
+    "facts", [{"identity": {"seed": 5}}, {"identity": []}, {"frames": "many"}, {"last": None}, {"digest": 7}]
+)
+def test_facts_of_another_kind(facts: dict[str, Any], tmp_path: Path) -> None:
+    """What the header says of a run has its types."""
+    with pytest.raises(InputError, match=r"`.*kept.npz` holds no run; begin anew with `--no-resume`"):
+        asked(tmp_path, run(), FACTS | facts)
+
+
+def test_times_that_are_none(tmp_path: Path) -> None:
+    """A NaN would end the run when its summary is written, after all its work."""
+    with pytest.raises(InputError, match=r"took {'align': nan} s: use a copy .*; begin anew with `--no-resume`"):
+        asked(tmp_path, run(seconds={"align": float("nan")}), FACTS)
+
+
+def test_a_state_that_does_not_fit(tmp_path: Path) -> None:
+    """What is wrong with the state ends with what to do, too."""
+    kept = run(slam=replace(run().slam, velocity=np.full((4, 4), np.nan)))
+    with pytest.raises(InputError, match=r"`velocity` has 16 values that are not.*begin anew with `--no-resume`"):
+        asked(tmp_path, kept, FACTS)
+
+
+def test_callbacks_that_kept_nothing() -> None:
+    """A callback that keeps records goes on from records."""
+    callbacks = RunCallbacks((WindowRecorder(),), Clock())
+    with pytest.raises(InputError, match=r"kept NoneType of `WindowRecorder`; expected tuple: begin anew"):
+        callbacks.resume(run())
