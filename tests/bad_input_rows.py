@@ -2,11 +2,12 @@
 
 from bad_row import Row
 from bad_rows_bags import BAGS
+from bad_rows_clouds import ALL_CLOUDS
 from bad_rows_commands import COMMANDS
 from bad_rows_files import FILES
 from bad_rows_layouts import LAYOUTS
 from bad_rows_maps import MAPS
 from bad_rows_strangers import STRANGERS
 
-ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS, *BAGS, *LAYOUTS, *MAPS]
+ROWS: list[Row] = [*COMMANDS, *FILES, *STRANGERS, *BAGS, *LAYOUTS, *MAPS, *ALL_CLOUDS]
 __all__ = ["ROWS", "Row"]

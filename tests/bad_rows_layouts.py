@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import bad_files as bad
@@ -23,6 +24,12 @@ def cached_in(name: str, folder: Path) -> None:
             patch.delenv(other, raising=False)
         patch.setenv(name, str(folder / "mine"))
         check_cache("run")
+
+
+def piped_suite(folder: Path) -> Path:
+    """Nobody writes into it."""
+    os.mkfifo(folder / "suite.toml")
+    return folder / "suite.toml"
 
 
 TIMES = rows(
@@ -71,4 +78,14 @@ SOLVE = rows(
     "`vggtgeo solve`",
     [("`--repeat` of 10^20", bad.problem(), {"argv": solve_with("--repeat", "100000000000000000000")})],
 )
-LAYOUTS: list[Row] = [*TIMES, *CAMERAS, *ENVIRONMENT, *SOLVE]
+SUITES = rows(
+    "Other commands",
+    [
+        (
+            "`bench` of a suite that is a pipe",
+            piped_suite,
+            {"argv": lambda made: ["bench", made, "-o", made.parent / "o"]},
+        )
+    ],
+)
+LAYOUTS: list[Row] = [*TIMES, *CAMERAS, *ENVIRONMENT, *SOLVE, *SUITES]

@@ -112,6 +112,8 @@ REFUSED: tuple[tuple[str, Change, str], ...] = (
     ("scene", array("intrinsics", np.array([1.0, np.nan, 1.0, 1.0])), r"its intrinsics are \[ 1. nan"),
     ("scene", array("poses", np.zeros((2, 4, 4))), r"its poses are not all rigid"),
     ("scene", array("size", np.array([64, -48])), r"its pictures are 64 x -48 pixels"),
+    ("scene", array("track_points", np.full((1, 3), 1e300)), r"its points or their pixels are beyond all rooms"),
+    ("scene", array("intrinsics", np.full(4, 1e300)), r"its intrinsics are \[1.e\+300"),
     ("scene", array("track_points", np.full((1, 3), np.inf)), r"its points or their pixels hold a NaN or an infinity"),
     ("scene", array("track_colours", np.zeros((1, 3))), r"its colours are float64; expected uint8"),
     ("KITTI times", lambda _: b"0\nnan\n2\n", r"000001.png` has the time nan; expected seconds"),

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from vggtgeo.geometry.point_cloud import UNREADABLE, check_head
+from vggtgeo.geometry.point_cloud import (
+    UNREADABLE,
+    bytes_of_colours,
+    check_end,
+    check_head,
+    check_places,
+    columns_of,
+)
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.io.given import path_of
@@ -35,7 +42,8 @@ class Mesh:
         if self.faces.ndim != 2 or self.faces.shape[1] != 3:
             raise InputError(f"`faces` has shape {self.faces.shape}; it must be [m, 3]")
         if len(self.faces) and not (self.faces.min() >= 0 and self.faces.max() < count):
-            raise InputError(f"`faces` names vertex {self.faces.max()}; there are {count}")
+            wrong = self.faces.min() if self.faces.min() < 0 else self.faces.max()
+            raise InputError(f"`faces` names vertex {wrong}; there are {count}")
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -58,19 +66,41 @@ class Mesh:
         """Reads what `save_ply` wrote."""
         path = path_of("path", path)
         try:
-            _check_counts(path)
+            head = _check_counts(path)
             data = PlyData.read(os.fspath(path), known_list_len={"face": {"vertex_indices": 3}})
-            vertices, faces = data["vertex"].data, data["face"].data["vertex_indices"]
-            column = lambda *names: np.column_stack([vertices[name] for name in names])
-            return cls(column("x", "y", "z"), np.array(faces), column("nx", "ny", "nz"), column("red", "green", "blue"))
+            check_end(path, head, data)
+            vertices, faces = data["vertex"].data, _triangles(data["face"].data["vertex_indices"])
+            places, normals = (check_places(columns_of(vertices, names)) for names in ("xyz", ("nx", "ny", "nz")))
+            if not (np.isfinite(places).all() and np.isfinite(normals).all()):
+                raise ValueError("a vertex or its normal has a NaN or an infinity")
+            colours = bytes_of_colours(columns_of(vertices, ("red", "green", "blue")))
+            return replace(cls(places, faces, normals, colours), faces=faces.astype(np.int32))
         except UNREADABLE as error:
-            raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY mesh: {error}") from None
+            raise InputError(
+                f"`{os.fspath(path)}` cannot be read as a PLY mesh: {error}; give one that `vggtgeo run` wrote, of "
+                "triangles, with normals and colours"
+            ) from None
 
 
-def _check_counts(path: str | os.PathLike[str]) -> None:
-    """ValueError where the head declares more than a byte each could hold: space is taken before faces are read."""
+def _triangles(listed: np.ndarray) -> np.ndarray:
+    """int64 [m, 3] of the lists of a file, which come one by one where it is text; ValueError for other lists."""
+    if listed.dtype == object:
+        corners = sorted({len(one) for one in listed} - {3})
+        if corners:
+            raise ValueError(f"it has faces of {corners[0]} corners; expected triangles")
+        listed = np.stack(list(listed)) if len(listed) else np.zeros((0, 3), np.int64)
+    if listed.dtype.kind not in "iu":
+        raise ValueError(f"its faces name their vertices by {listed.dtype}; expected whole numbers")
+    return listed.astype(np.int64)
+
+
+def _check_counts(path: str | os.PathLike[str]) -> bytes:
+    """The head of a file; ValueError where it declares more than a byte each could hold: space is taken before faces
+    are read.
+    """
     head = check_head(path)
     declared = sum(int(count) for count in re.findall(rb"^element\s+\S+\s+(\d{1,18})\s*$", head, re.MULTILINE))
     size = os.path.getsize(path)
     if declared > size:
         raise ValueError(f"it declares {declared} vertices and faces, and has {size} bytes")
+    return head

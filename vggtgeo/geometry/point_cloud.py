@@ -1,11 +1,13 @@
 """Coloured point clouds as binary PLY files."""
 
 import os
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
+from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyListProperty, PlyParseError
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
@@ -16,6 +18,12 @@ UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowErr
 """What the parser raises for files that are none, or that declare more than they hold."""
 
 _NORMAL = ("nx", "ny", "nz")
+_COLOUR = ("red", "green", "blue")
+_NEAREST, _FARTHEST = 1e-30, 1e10
+"""Metres, or millimetres of the largest coordinates that surveyors have; bytes in the wrong order are often less than
+the least."""
+_LINE_END = 2
+"""Bytes that some programs write behind the last element."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,24 +85,89 @@ class PointCloud:
         """
         path = path_of("path", path)
         try:
-            check_head(path)
-            vertices = PlyData.read(os.fspath(path))["vertex"].data
+            head = check_head(path)
+            data = PlyData.read(os.fspath(path))
+            check_end(path, head, data)
+            vertices = data["vertex"].data
             names = vertices.dtype.names or ()
-            points = np.column_stack([vertices[name] for name in "xyz"])
+            points = check_places(columns_of(vertices, "xyz"))
             colours = np.zeros((len(points), 3), np.uint8)
-            if {"red", "green", "blue"} <= set(names):
-                colours = np.column_stack([vertices[name] for name in ("red", "green", "blue")]).astype(np.uint8)
+            if set(_COLOUR) <= set(names):
+                colours = bytes_of_colours(columns_of(vertices, _COLOUR))
             confidence = np.array(vertices["confidence"]) if "confidence" in names else None
             normals = np.column_stack([vertices[name] for name in _NORMAL]) if set(_NORMAL) <= set(names) else None
             return cls(points, colours, confidence, normals)
         except UNREADABLE as error:
-            raise InputError(f"`{os.fspath(path)}` cannot be read as a PLY point cloud: {error}") from None
+            raise InputError(
+                f"`{os.fspath(path)}` cannot be read as a PLY point cloud: {error}; give a whole one whose vertices "
+                "have x, y and z"
+            ) from None
+
+
+def columns_of(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:
+    """[n, c] of the properties of these names; ValueError where one is no number, but a list."""
+    names = tuple(names)
+    for name in names:
+        if vertices[name].dtype.kind not in "fiu" or vertices[name].ndim != 1:
+            raise ValueError(f"the property `{name}` is no number")
+    return np.column_stack([vertices[name] for name in names])
+
+
+def check_places(points: np.ndarray) -> np.ndarray:
+    """The same points; ValueError for places of nowhere, as bytes in the wrong order give."""
+    sizes = np.abs(points[np.isfinite(points)])
+    if ((sizes > _FARTHEST) | ((sizes > 0) & (sizes < _NEAREST))).any():
+        raise ValueError(
+            f"its coordinates go from {sizes.min():.3g} to {sizes.max():.3g} m, which are no places; maybe the order "
+            "of its bytes is not the one that its header says"
+        )
+    return points
+
+
+def bytes_of_colours(values: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
+    """Colours as bytes, of bytes, of 16 bits, or of floats up to 1 or 255; black where there is none."""
+    if values.dtype == np.uint8:
+        return values
+    known = np.nan_to_num(values.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    most = 65535.0 if values.dtype == np.uint16 else 1.0 if known.max(initial=0.0) <= 1.0 else 255.0
+    return np.rint(255.0 / most * known.clip(0.0, most)).astype(np.uint8)
+
+
+def check_end(path: str | os.PathLike[str], head: bytes, data: PlyData) -> None:
+    """ValueError for a file that holds more than its header declares: the count of a copy that was cut or joined."""
+    with open(path, "rb") as handle:
+        handle.seek(len(head))
+        handle.readline()
+        if data.text:
+            more = sum(1 for line in handle if line.strip()) - sum(len(element) for element in data.elements)
+            rest = f"{more} lines"
+        else:
+            more = os.path.getsize(path) - handle.tell() - sum(map(_size_of, data.elements)) - _LINE_END
+            rest = f"{more + _LINE_END} bytes"
+    if more > 0:
+        raise ValueError(f"it has {rest} behind what its header declares")
+
+
+def _size_of(element: PlyElement) -> int:
+    """Bytes of an element in a binary file."""
+    lists = [entry for entry in element.properties if isinstance(entry, PlyListProperty)]
+    own = {entry.name for entry in lists}
+    plain = sum(element.data.dtype[name].itemsize for name in element.data.dtype.names or () if name not in own)
+    size = len(element) * plain
+    for entry in lists:
+        count, item = (np.dtype(kind).itemsize for kind in entry.list_dtype())
+        values = element.data[entry.name]
+        size += len(element) * count + item * (values.size if values.dtype != object else sum(map(len, values)))
+    return size
 
 
 def check_head(path: str | os.PathLike[str]) -> bytes:
     """The header of a PLY file; ValueError for a long file without one, which would be read to its end as one line."""
+    if os.path.exists(path) and not os.path.isfile(path):  # a pipe has no end
+        raise ValueError("it is no regular file")
     with open(path, "rb") as handle:
-        head, end, _ = handle.read(LONGEST_HEAD).partition(b"end_header")
-    if not end and os.path.getsize(path) > LONGEST_HEAD:
+        start = handle.read(LONGEST_HEAD)
+    end = re.search(rb"^end_header\s", start, re.MULTILINE)
+    if end is None and os.path.getsize(path) > LONGEST_HEAD:
         raise ValueError(f"its first {LONGEST_HEAD} bytes have no `end_header`")
-    return head
+    return start if end is None else start[: end.start()]

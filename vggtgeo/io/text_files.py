@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from pathlib import Path
 
 from vggtgeo.io.errors import InputError
@@ -19,7 +20,10 @@ def whole_text(file: Path, errors: str = "replace") -> str:
         OSError: it cannot be read for another reason.
 
     """
-    size = file.stat().st_size
+    status = file.stat()
+    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):  # a pipe has no end
+        raise InputError(f"`{file}` is no regular file; give a text that lies on the disk")
+    size = status.st_size
     if size > MOST_BYTES:
         raise InputError(f"`{file}` has {size} bytes; expected a text of at most {MOST_BYTES}")
     try:

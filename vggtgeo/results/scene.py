@@ -43,6 +43,7 @@ _LAYOUT: dict[str, tuple[int | str, ...]] = {
     "track_pixel": ("m", 2),
 }
 """Shapes of the arrays: `k` views, `n` points, `m` observations."""
+_FAR, _FAR_PIXELS = 1e10, 1e7
 _LARGEST, _RIGID = 100_000, 1e-3
 """Pixels of a side; how far a rotation's product with its transpose may be from the unit matrix."""
 _WHOLE = ("frames", "size", "track_point", "track_view")
@@ -148,13 +149,19 @@ def _impossible(poses: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
         return "it has no view"
     if not (0 < min(size) <= max(size) <= _LARGEST):
         return f"its pictures are {size[0]} x {size[1]} pixels"
-    if not (np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all()):
+    if not (np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all() and np.abs(intrinsics).max() < _FAR_PIXELS):
         return f"its intrinsics are {intrinsics}"
     turns = poses[:, :3, :3].astype(np.float64)
-    if not (np.isfinite(poses).all() and np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() < _RIGID):
+    if not (
+        np.isfinite(poses).all()
+        and np.abs(poses).max() < _FAR
+        and np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() < _RIGID
+    ):
         return "its poses are not all rigid"
     if not (np.isfinite(tracks.points).all() and np.isfinite(tracks.pixel).all()):
         return "its points or their pixels hold a NaN or an infinity"
+    if np.abs(tracks.points).max(initial=0.0) > _FAR or np.abs(tracks.pixel).max(initial=0.0) > _FAR_PIXELS:
+        return "its points or their pixels are beyond all rooms and pictures"
     if tracks.colours.dtype != np.uint8:
         return f"its colours are {tracks.colours.dtype}; expected uint8"
     seen = np.bincount(tracks.point, minlength=len(tracks))
