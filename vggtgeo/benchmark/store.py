@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +18,35 @@ from vggtgeo.io.text_files import whole_text
 
 Row = Mapping[str, Any]
 """A line of the table: plain values by the names of the columns."""
+
+
+_NUMBER = re.compile(
+    r"(_m|_deg|_rel|_25|_per_second|_gb|_wall|score|error|frames|tracked|coverage|matched|scale|precision|recall)$"
+)
+"""Names of columns that tables compute with."""
+_LARGEST = 2**63
+
+
+def _check_row(row: Row, job: Job) -> None:
+    """ValueError or KeyError for a row that is of another run, or that the tables could not be made of."""
+    for name, wanted in (("sequence", job.sequence), ("setting", job.setting), ("seed", job.seed)):
+        if row[name] != wanted or type(row[name]) is not type(wanted):
+            raise ValueError(f"its `{name}` is {row[name]!r:.40}; expected {wanted!r}")
+    for name, value in row.items():
+        if not (value is None or isinstance(value, bool | int | float | str)):
+            raise ValueError(f"its `{name}` is {value!r:.40}; expected a number or a text")
+        if isinstance(value, str):
+            value.encode("utf-8", "surrogateescape")
+        if _NUMBER.search(name) and (isinstance(value, str) or (isinstance(value, int) and abs(value) >= _LARGEST)):
+            raise ValueError(f"its `{name}` is {value!r:.40}; expected a number")
+    if row["status"] == "ok":
+        for name, kind in (("frames", int), ("tracked", int), ("verdict", str)):
+            if type(row[name]) is not kind:
+                raise ValueError(f"its `{name}` is {row[name]!r:.40}; expected {kind.__name__}")
+        if row["protocol"] != job.spec["protocol"]:
+            raise ValueError(f"its `protocol` is {row['protocol']!r:.40}; expected {job.spec['protocol']!r}")
+    elif not isinstance(row["status"], str):
+        raise ValueError(f"its `status` is {row['status']!r:.40}; expected a word")
 
 
 @dataclass(frozen=True)
@@ -42,7 +72,9 @@ class Store:
         try:
             row = json.loads(whole_text(path, errors="strict"))
             same, status = row["fingerprint"] == job.fingerprint(self.source), row["status"]
-        except (ValueError, KeyError, TypeError) as error:
+            if same:
+                _check_row(row, job)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"`{path}` is no finished run ({error}); delete it and call again") from None
         return row if same and not (retry and status != "ok") else None
 
