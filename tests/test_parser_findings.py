@@ -232,5 +232,5 @@ def test_a_listed_name_that_no_file_system_takes_costs_its_frame(tmp_path: Path)
 def test_a_quaternion_of_length_zero_is_no_pose(tmp_path: Path) -> None:
     """It is left out of the truth, with a warning; oracle: the warning."""
     zero = put(b",0,0,0,1,0,0,0,", b",0,0,0,0,0,0,0,")
-    with pytest.warns(InputWarning, match="1 of 3 poses have a NaN or an infinity"):
+    with pytest.warns(InputWarning, match="1 of 3 poses have no rotation"):
         read("EuRoC truth", zero, tmp_path)
