@@ -144,20 +144,21 @@ def test_a_wrong_command_line_is_one_line(arguments: tuple[str, ...], message: s
 
 
 def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
-    # Proves that the program computes in 64 bits, keeps compiled code in the user's cache folder, and leaves memory of
-    # a GPU to others.
+    # Proves that the program computes in 64 bits, keeps compiled code in the user's cache folder, adjusts on the
+    # processor, and, where it is told to use a GPU, leaves its memory to others.
     script = (
         "from vggtgeo.cli.jax_flags import set_jax_flags; set_jax_flags(); import jax, os; "
         "print(jax.numpy.ones(1).dtype, jax.config.jax_compilation_cache_dir, "
-        "jax.config.jax_persistent_cache_min_compile_time_secs, os.environ['XLA_PYTHON_CLIENT_PREALLOCATE'])"
+        "jax.config.jax_persistent_cache_min_compile_time_secs, os.environ['XLA_PYTHON_CLIENT_PREALLOCATE'], "
+        "jax.config.jax_platforms)"
     )
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     compiled = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
-    for name in ("JAX_ENABLE_X64", "XLA_PYTHON_CLIENT_PREALLOCATE", *compiled):
+    for name in ("JAX_ENABLE_X64", "JAX_PLATFORMS", "XLA_PYTHON_CLIENT_PREALLOCATE", *compiled):
         environment.pop(name, None)
     command = [sys.executable, "-c", script]
     result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
-    assert result.stdout.split() == ["float64", str(tmp_path / "vggtgeo" / "jax"), "0.0", "false"]
+    assert result.stdout.split() == ["float64", str(tmp_path / "vggtgeo" / "jax"), "0.0", "false", "cpu"]
 
 
 def test_no_cache_where_none_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
