@@ -140,7 +140,8 @@ def test_every_keyframe_is_in_a_stretch() -> None:
 def test_matches_are_without_the_rolling_shutter_that_was_found() -> None:
     """Oracle: each key point, moved by the time of its row."""
     slam, every = _walk(still), np.arange(KEYFRAMES)
-    plain, rolled = (zoom._matches(state, every) for state in (slam, replace(slam, readout=Readout(0.3, False, 1.0))))
+    states = slam, replace(slam, readout=Readout(0.3, False, 1.0))
+    plain, rolled = (zoom.matches_among(state, every) for state in states)
     assert plain is not None
     assert rolled is not None
     motions, size = camera_motions(slam, KEYFRAMES), slam.keyframes[0].size
@@ -157,19 +158,19 @@ def test_matches_are_without_the_rolling_shutter_that_was_found() -> None:
 def test_derivatives() -> None:
     """Oracle: central differences."""
     slam = _walk(grows)
-    seen = zoom._matches(slam, np.arange(KEYFRAMES))
+    seen = zoom.matches_among(slam, np.arange(KEYFRAMES))
     assert seen is not None
     rng = np.random.default_rng(0)
     poses = np.array([k.pose for k in slam.keyframes])
-    at = zoom._Unknowns(poses, rng.normal(0, 0.1, KEYFRAMES), seen.depth)
-    _, by_frames, by_depth = zoom._derivatives(seen, at)
+    at = zoom.Unknowns(poses, rng.normal(0, 0.1, KEYFRAMES), seen.depth)
+    _, by_frames, by_depth = zoom.derivatives(seen, at)
     step = rng.normal(0, 1e-6, (KEYFRAMES, 7))
     deeper = rng.normal(0, 1e-6, len(seen.depth))
     beside = [
-        zoom._Unknowns(rigid.moved(poses, sign * step[:, :6]), at.focal + sign * step[:, 6], at.depth + sign * deeper)
+        zoom.Unknowns(rigid.moved(poses, sign * step[:, :6]), at.focal + sign * step[:, 6], at.depth + sign * deeper)
         for sign in (1, -1)
     ]
-    ahead, behind = (zoom._derivatives(seen, unknowns)[0] for unknowns in beside)
+    ahead, behind = (zoom.derivatives(seen, unknowns)[0] for unknowns in beside)
     both = np.concatenate([step[seen.host], step[seen.target]], 1)
     expected = np.einsum("mij,mj->mi", by_frames, both) + by_depth * deeper[seen.point, None]
     assert np.allclose((ahead - behind) / 2, expected, atol=1e-8)

@@ -25,6 +25,7 @@ from vggtgeo.slam.trust.islands import check_islands
 from vggtgeo.slam.trust.pace import pace
 from vggtgeo.slam.trust.parallax import check_parallax
 from vggtgeo.slam.trust.record import check_record
+from vggtgeo.slam.trust.reversal import check_reversal
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
 from vggtgeo.slam.trust.scale_hand_over import check_hand_over
 from vggtgeo.slam.trust.sensor_drift import check_sensors
@@ -58,6 +59,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
         found += check_hand_over(slam)
         found += check_parallax(slam)
         found += check_zoom(slam)
+        found += check_reversal(slam)
     for piece in pieces_by_size(slam) if estimate.started else ():
         own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]
         found += check_matches(own, estimate.intrinsics, estimate.pieces == 1, estimate.metric)

@@ -115,20 +115,20 @@ def focal_lengths(slam: Slam, stretch: np.ndarray) -> FocalLengths | None:
 
     stretch: int [n], places in `slam.keyframes`.
     """
-    seen = _matches(slam, stretch)
+    seen = matches_among(slam, stretch)
     if seen is None:
         return None
     poses = np.array([slam.keyframes[place].pose for place in stretch], np.float64)
-    unknowns = _Unknowns(poses, np.zeros(len(stretch)), seen.depth)
-    linear, damping = _linearise(seen, unknowns), 1e-3
+    unknowns = Unknowns(poses, np.zeros(len(stretch)), seen.depth)
+    linear, damping = linearise(seen, unknowns), 1e-3
     for _ in range(ITERATIONS):
         step, depth_step = linear.step(damping)
-        moved = _Unknowns(
+        moved = Unknowns(
             rigid.moved(unknowns.poses, step[:, :6]),
             unknowns.focal + step[:, 6],
             unknowns.depth + np.clip(depth_step, -LONGEST_DEPTH_STEP, LONGEST_DEPTH_STEP),
         )
-        tried = _linearise(seen, moved)
+        tried = linearise(seen, moved)
         if not tried.cost < linear.cost:
             damping *= 10
             continue
@@ -139,7 +139,7 @@ def focal_lengths(slam: Slam, stretch: np.ndarray) -> FocalLengths | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Matches:
+class Matches:
     """host, target: int [m], keyframes of a stretch; edges: int [e], the first match of each edge; point: int [m], of
     `depth`, log inverse depths [p]; before, after: float64 [m, 2], pixels; intrinsics: of the run.
     """
@@ -155,7 +155,7 @@ class _Matches:
 
 
 @dataclass(frozen=True, eq=False)
-class _Unknowns:
+class Unknowns:
     """poses: float64 [n, 4, 4]; focal: [n], log factors; depth: [p], log inverse depths."""
 
     poses: np.ndarray
@@ -164,7 +164,7 @@ class _Unknowns:
 
 
 @dataclass(frozen=True, eq=False)
-class _Linear:
+class Linear:
     """Normal equations: of the keyframes [7n, 7n] and [7n], of the depths [p] and [p], both [p, 7n]; the robust cost;
     noise: standard deviation of a match, pixels.
     """
@@ -201,7 +201,7 @@ def _stretches(slam: Slam) -> Iterable[np.ndarray]:
     return (own[start : start + STRETCH] for start in starts if len(own) >= LEAST_KEYFRAMES)
 
 
-def _matches(slam: Slam, stretch: np.ndarray) -> _Matches | None:
+def matches_among(slam: Slam, stretch: np.ndarray) -> Matches | None:
     """Key points of known depth in these keyframes, and where others of them saw each."""
     keyframes = slam.keyframes
     place_of = {keyframes[place].number: row for row, place in enumerate(stretch)}
@@ -237,11 +237,18 @@ def _matches(slam: Slam, stretch: np.ndarray) -> _Matches | None:
         return None
     _, first, point = np.unique(slots, return_index=True, return_inverse=True)
     edges = np.cumsum([0, *(len(column[1]) for column in columns[:-1])])
-    return _Matches(ends_of[:, 0], ends_of[:, 1], edges, point, before, after, depth[first], intrinsics)
+    return Matches(ends_of[:, 0], ends_of[:, 1], edges, point, before, after, depth[first], intrinsics)
 
 
-def _linearise(seen: _Matches, unknowns: _Unknowns) -> _Linear:
-    residual, by_frames, by_depth = _derivatives(seen, unknowns)
+def match_energies(seen: Matches, unknowns: Unknowns) -> np.ndarray:
+    """Robust energy of each match, squared pixels, float64 [m]."""
+    squared = np.sum(derivatives(seen, unknowns)[0] ** 2, 1)
+    return np.asarray(ROBUST**2 * np.log1p(np.where(np.isfinite(squared), squared, BEHIND) / ROBUST**2))
+
+
+def linearise(seen: Matches, unknowns: Unknowns) -> Linear:
+    """The normal equations there."""
+    residual, by_frames, by_depth = derivatives(seen, unknowns)
     squared = np.sum(residual**2, 1)
     good = np.isfinite(squared)
     squared = np.where(good, squared, BEHIND)
@@ -267,10 +274,10 @@ def _linearise(seen: _Matches, unknowns: _Unknowns) -> _Linear:
     frames_side[focal] -= unknowns.focal / PRIOR**2
     cost += float(np.sum(unknowns.focal**2)) / PRIOR**2
     noise = 1.48 * float(np.median(np.abs(residual[good]))) if good.any() else np.inf
-    return _Linear(frames, frames_side, HELD + total(by_depth**2), -total(by_depth * residual), both, cost, noise)
+    return Linear(frames, frames_side, HELD + total(by_depth**2), -total(by_depth * residual), both, cost, noise)
 
 
-def _derivatives(seen: _Matches, unknowns: _Unknowns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def derivatives(seen: Matches, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals float64 [m, 2], NaN behind the camera; derivatives by host and target [m, 2, 14], by depth [m, 2]."""
     centre = seen.intrinsics[2:]
     focal = seen.intrinsics[:2] * np.exp(unknowns.focal)[:, None]

@@ -1,0 +1,96 @@
+"""A camera that nobody gave: the motion to the other side, with near and far exchanged, against that of the map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from test_keyframe_depth import SIZE, keyframe
+from test_trust_sensor_drift import K
+from vggtgeo.models.roles import Features, PointMatches
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.covisibility import without_matches
+from vggtgeo.slam.keyframe import Slots
+from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.trust import reversal
+from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.trust.reversal import check_reversal
+from vggtgeo.slam.trust.zoom import Unknowns, matches_among
+
+KEYFRAMES, POINTS = 6, 150
+GUESSED = np.array([0.3 * K[0], 0.3 * K[1], 10.0, 10.0])
+
+
+@cache
+def _pan() -> Slam:
+    """A camera that nobody gave turns by 20 degrees, and moves by 0.5 m, before things 2.5 to 3 m away."""
+    rng = np.random.default_rng(0)
+    shares = np.linspace(0, 1, KEYFRAMES)
+    world = rng.uniform((-1.2, -1, 2.5), (1.7, 1, 3), (POINTS, 3))
+    poses = np.tile(np.eye(4), (KEYFRAMES, 1, 1))
+    for pose, share in zip(poses, shares, strict=True):
+        pose[:3, :3] = Rotation.from_rotvec([0.0, -np.radians(20) * (share - 0.5), 0.0]).as_matrix()
+        pose[:3, 3] = -pose[:3, :3] @ (0.5 * (share - 0.5), 0.02 * np.sin(9 * share), -0.05 * share)
+    found, unknown, one = [], np.full(POINTS, np.nan), np.ones(POINTS)
+    for number, pose in enumerate(poses):
+        pixels = rigid.project(world, pose, K) + rng.normal(0, 0.5, (POINTS, 2))
+        slots = Slots(pixels, 1.0 / (world @ pose[2, :3] + pose[2, 3]), unknown, unknown, one, one)
+        made = replace(keyframe(number, np.ones(SIZE), slots), pose=pose)
+        found.append(replace(made, features=Features(made.points.pixels, one)))
+    pairs, rows = [], np.arange(POINTS)
+    for first in range(KEYFRAMES):
+        for second in range(first + 1, KEYFRAMES):
+            points = PointMatches(rows, rows, found[first].points.pixels, found[second].points.pixels, one)
+            pairs.append(replace(without_matches(first, second), points=points))
+    records = [FramePose(k.frame, k.timestamp, k.number, np.eye(4), True, POINTS) for k in found]
+    return Slam(K, K, GUESSED, False, keyframes=tuple(found), pairs=tuple(pairs), frames=tuple(records))
+
+
+@cache
+def _wrong_way() -> Slam:
+    """The same pictures in a map that began with the other motion, and was adjusted to all matches from there."""
+    slam = _pan()
+    seen = matches_among(slam, np.arange(KEYFRAMES))
+    assert seen is not None
+    poses = np.array([keyframe.pose for keyframe in slam.keyframes])
+    start = reversal._reversed_poses(seen, poses), np.zeros(KEYFRAMES), reversal._reversed_depth(seen.depth)
+    found = reversal._adjusted(seen, Unknowns(*start))
+    inverse = np.exp(found.depth).reshape(KEYFRAMES, POINTS)
+    keyframes = tuple(
+        replace(keyframe, pose=pose, points=replace(keyframe.points, inverse_depth=own))
+        for keyframe, pose, own in zip(slam.keyframes, found.poses, inverse, strict=True)
+    )
+    return replace(slam, keyframes=keyframes, intrinsics=K * np.exp([*found.focal[:2], 0.0, 0.0]))
+
+
+def test_map_of_the_wrong_motion_is_told() -> None:
+    """Oracle: the true motion, from which the map's goes to the other side."""
+    true, wrong = (
+        rigid.invert(np.array([keyframe.pose for keyframe in slam.keyframes]))[:, :3, 3]
+        for slam in (_pan(), _wrong_way())
+    )
+    assert np.dot(true[-1] - true[0], wrong[-1] - wrong[0]) < 0
+    (finding,) = check_reversal(_wrong_way())
+    assert finding.level == "degraded"
+    assert "near and far exchanged" in finding.text
+    assert any("near and far exchanged" in reason for reason in judge(_wrong_way()).reasons)
+
+
+def test_map_of_the_right_motion_is_not() -> None:
+    """Oracle: the poses are the true ones."""
+    assert not check_reversal(_pan())
+
+
+def test_given_camera_or_measured_depth_is_not_asked() -> None:
+    """Their focal length, or their depth, tells the two apart."""
+    assert not check_reversal(replace(_wrong_way(), intrinsics_sigma=np.ones(4)))
+    assert not check_reversal(replace(_wrong_way(), metric=True))
+
+
+def test_few_keyframes_say_nothing() -> None:
+    """Three are less than what is asked for."""
+    slam = _pan()
+    assert not check_reversal(replace(slam, keyframes=slam.keyframes[:3], pairs=slam.pairs[:2]))
