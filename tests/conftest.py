@@ -11,6 +11,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # where there is a GPU, too: kept programs are those of the processor
 # Most of the tests' time is compilation of what then runs on tiny arrays. Compiling `solve` takes 8.7 s with XLA's own
 # settings, 4.8 s without LLVM's optimisation, 2.0 s if fused loops do not go through MLIR, and 1.6 s in one piece (with
 # a fifth of the memory mappings). `XLA_FLAGS= make test` compiles as users do; test_optimised.py does so for the core.
