@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from test_keyframe_depth import SIZE, keyframe
 from test_trust_sensor_drift import K
@@ -81,6 +82,13 @@ def test_map_of_the_wrong_motion_is_told() -> None:
 
 def test_map_of_the_right_motion_is_not() -> None:
     """Oracle: the poses are the true ones."""
+    assert not check_reversal(_pan())
+
+
+def test_reversal_that_comes_back_is_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Oracle: it ends where the map is, so that both explain the matches alike."""
+    monkeypatch.setattr(reversal, "_reversed_poses", lambda _, poses: poses)
+    monkeypatch.setattr(reversal, "_reversed_depth", lambda depth: depth)
     assert not check_reversal(_pan())
 
 

@@ -7,7 +7,8 @@ with the wrong one stays there: it is a minimum of its own. Matches agree with t
 (`contradicted.py` has the same shares for them, to 1 %), and the covariances are those of either minimum.
 
 So a map is reversed, adjusted to its own matches from there, and both are compared: a right map explains the matches of
-all its keyframes better than its reversal does.
+all its keyframes better than its reversal does, or is what the reversal comes back to (a film of a room from its last
+frame to the first, whose map was that of the film forwards to 3.5 % of its extent).
 """
 
 from __future__ import annotations
@@ -80,6 +81,8 @@ def refuses_reversal(slam: Slam, stretch: np.ndarray) -> bool | None:
     none = np.zeros(len(stretch))
     own = _adjusted(seen, Unknowns(poses, none, seen.depth))
     other = _adjusted(seen, Unknowns(_reversed_poses(seen, poses), none, _reversed_depth(seen.depth)))
+    if _path(own).ravel() @ _path(other).ravel() >= 0:  # it came back: there is no minimum on the other side
+        return True
     worse = match_energies(seen, other) - match_energies(seen, own)
     touched = [(seen.host == row) | (seen.target == row) for row in range(len(stretch))]
     each = np.array([worse[rows].mean() for rows in touched if np.count_nonzero(rows) >= LEAST_MATCHES])
@@ -87,6 +90,12 @@ def refuses_reversal(slam: Slam, stretch: np.ndarray) -> bool | None:
         return None
     needed = float(student_t.isf(CHANCE, len(each) - 1)) * float(np.std(each, ddof=1)) / np.sqrt(len(each))
     return bool(each.mean() > needed)
+
+
+def _path(unknowns: Unknowns) -> np.ndarray:
+    """Camera centres from the first, float64 [n, 3]."""
+    centres = rigid.invert(unknowns.poses)[:, :3, 3]
+    return np.asarray(centres - centres[0])
 
 
 def _stretches(slam: Slam) -> list[np.ndarray]:
