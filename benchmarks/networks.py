@@ -30,7 +30,7 @@ from pathlib import Path
 
 from vggtgeo.models.exporters.recipes import RECIPES
 from vggtgeo.models.onnx.file_checks import NetworkFileError
-from vggtgeo.models.onnx.providers import CUDA_OPTIONS, NAMES, choose_provider, load_cuda_libraries
+from vggtgeo.models.onnx.providers import CUDA_OPTIONS, NAMES, check_started, choose_provider, load_cuda_libraries
 
 from vggtgeo.slam.presets import NEEDED
 
@@ -171,8 +171,7 @@ def measure(file: Path, threads: int, provider: str) -> dict:
         if provider == "cuda":
             load_cuda_libraries()
         session = onnxruntime.InferenceSession(str(file), options, providers=PROVIDERS[provider])
-        if NAMES[provider] not in session.get_providers():
-            raise SystemExit(f"onnxruntime could not start {NAMES[provider]}: {load_cuda_libraries()}")
+        check_started(provider, provider, "cuda" if NAMES["cuda"] in session.get_providers() else "cpu")
         with np.load(f"{file}.parity.npz") as parity:
             inputs = {value.name: parity[f"input.{value.name}"] for value in session.get_inputs()}
         session.run(None, inputs)

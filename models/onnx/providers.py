@@ -31,13 +31,15 @@ def choose_provider(provider: Provider) -> str:
 
     Warns where the package for CUDA is installed and out of use.
     """
-    has_cuda = NAMES["cuda"] in onnxruntime.get_available_providers()
-    if provider == "cuda" and not has_cuda:
-        why = _covered() or f"this onnxruntime runs on the CPU only; {install_hint('gpu')}"
+    if provider == "cpu" or NAMES["cuda"] in onnxruntime.get_available_providers():
+        return "cpu" if provider == "cpu" else "cuda"
+    covered = _covered()
+    if provider == "cuda":
+        why = covered or f"this onnxruntime runs on the CPU only; {install_hint('gpu')}"
         raise NetworkFileError(f"`provider` is cuda, but {why}")
-    if provider == "auto" and not has_cuda and _covered():
-        warn_once(_covered())
-    return provider if provider != "auto" else "cuda" if has_cuda else "cpu"
+    if covered:
+        warn_once(covered)
+    return "cpu"
 
 
 def _covered() -> str:

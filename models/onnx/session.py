@@ -7,6 +7,7 @@ import logging
 import re
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -235,7 +236,7 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
         limit = {} if memory_limit_gb is None else {"gpu_mem_limit": int(memory_limit_gb * 2**30)}
         providers.insert(0, (NAMES["cuda"], {**CUDA_OPTIONS, **limit}))
     try:
-        with quiet():
+        with quiet() if device == "cuda" else nullcontext():
             return onnxruntime.InferenceSession(str(path), options, providers)
     except (*_RUNTIME_ERRORS, UnicodeError) as error:  # of a name that is no UTF-8, in the file or of it
         raise NetworkFileError(_why_not_opened(path, str(error))) from None

@@ -57,29 +57,16 @@ def trajectory_of(
     poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     times = np.asarray(times, np.float64)[: len(poses)]
     known = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    if not known.all():
-        warnings.warn(
-            f"`{where}`: {int((~known).sum())} of {len(poses)} poses have a NaN or an infinity; left out of the {of}",
-            NoteWarning,
-            stacklevel=3,
-        )
     near = known & (np.abs(poses[:, :3, 3]) <= FARTHEST).all(axis=1) & (np.abs(times) <= LATEST)
-    if not near[known].all():
-        warnings.warn(
-            f"`{where}`: {int((known & ~near).sum())} of {len(poses)} poses have a number that is no time or place; "
-            f"left out of the {of}",
-            InputWarning,
-            stacklevel=3,
-        )
-    known = near
-    turned = known & _have_rotations(np.nan_to_num(poses, nan=0.0, posinf=0.0, neginf=0.0))
-    if not turned[known].all():
-        warnings.warn(
-            f"`{where}`: {int((known & ~turned).sum())} of {len(poses)} poses have no rotation (all zeros, say); left "
-            f"out of the {of}",
-            InputWarning,
-            stacklevel=3,
-        )
+    turned = near & _have_rotations(np.nan_to_num(poses, nan=0.0, posinf=0.0, neginf=0.0))
+    for lost, why, kind in (
+        (~known, "a NaN or an infinity", NoteWarning),
+        (known & ~near, "a number that is no time or place", InputWarning),
+        (near & ~turned, "no rotation (all zeros, say)", InputWarning),
+    ):
+        if lost.any():
+            text = f"`{where}`: {int(lost.sum())} of {len(poses)} poses have {why}; left out of the {of}"
+            warnings.warn(text, kind, stacklevel=3)
     if not turned.any():
         return None
     rows = np.flatnonzero(turned)

@@ -22,7 +22,6 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.zoom import (
     LEAST_MATCHES,
-    LONGEST_DEPTH_STEP,
     Matches,
     Unknowns,
     linearise,
@@ -152,11 +151,7 @@ def _adjusted(seen: Matches, unknowns: Unknowns) -> Unknowns:
         own[6:] = np.linalg.solve(reduced[6:, 6:] + HELD * np.eye(len(side) - 6), side[6:])
         step = (shared @ own).reshape(-1, 7)
         depth_step = (linear.depths_side - linear.both @ step.ravel()) / depths
-        moved = Unknowns(
-            rigid.moved(unknowns.poses, step[:, :6]),
-            unknowns.focal + step[:, 6],
-            unknowns.depth + np.clip(depth_step, -LONGEST_DEPTH_STEP, LONGEST_DEPTH_STEP),
-        )
+        moved = unknowns.moved(step, depth_step)
         tried = linearise(seen, moved)
         if tried.cost < linear.cost:
             fall = linear.cost - tried.cost

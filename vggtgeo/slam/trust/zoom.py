@@ -123,11 +123,7 @@ def focal_lengths(slam: Slam, stretch: np.ndarray) -> FocalLengths | None:
     linear, damping = linearise(seen, unknowns), 1e-3
     for _ in range(ITERATIONS):
         step, depth_step = linear.step(damping)
-        moved = Unknowns(
-            rigid.moved(unknowns.poses, step[:, :6]),
-            unknowns.focal + step[:, 6],
-            unknowns.depth + np.clip(depth_step, -LONGEST_DEPTH_STEP, LONGEST_DEPTH_STEP),
-        )
+        moved = unknowns.moved(step, depth_step)
         tried = linearise(seen, moved)
         if not tried.cost < linear.cost:
             damping *= 10
@@ -161,6 +157,11 @@ class Unknowns:
     poses: np.ndarray
     focal: np.ndarray
     depth: np.ndarray
+
+    def moved(self, step: np.ndarray, depth_step: np.ndarray) -> Unknowns:
+        """After a step of the keyframes, [n, 7], and of the depths, [p], which is cut where it is long."""
+        depth = self.depth + np.clip(depth_step, -LONGEST_DEPTH_STEP, LONGEST_DEPTH_STEP)
+        return Unknowns(rigid.moved(self.poses, step[:, :6]), self.focal + step[:, 6], depth)
 
 
 @dataclass(frozen=True, eq=False)
