@@ -45,10 +45,11 @@ def damaged(content: bytes, rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 @pytest.mark.filterwarnings("ignore::vggtgeo.io.errors.InputWarning")
 def test_a_whole_file_is_read(kind: Kind, tmp_path: Path) -> None:
-    """What the damage begins with is no damaged file itself; oracle: no InputError."""
+    """What the damage begins with is no damaged file itself; oracle: no InputError, and the file as it was."""
     content = kind.content(tmp_path)
     (tmp_path / kind.file).write_bytes(content)
     kind.read(tmp_path / kind.file)
+    assert (tmp_path / kind.file).read_bytes() == content
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)

@@ -9,9 +9,8 @@ import numpy as np
 
 from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.statistics import Summary, paired, select, values
-from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import number
+from vggtgeo.benchmark.table import Row, number
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 from vggtgeo.benchmark.jobs import Job
 from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.provenance import input_hash
-from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.suite import ExternalTable, Suite
+from vggtgeo.benchmark.table import Row
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.trajectory_files import load_trajectory
 from vggtgeo.geometry.trajectory import Trajectory

@@ -8,8 +8,8 @@ from vggtgeo.benchmark import cells
 from vggtgeo.benchmark.cells import Cell
 from vggtgeo.benchmark.published import PublishedTable, published
 from vggtgeo.benchmark.statistics import select
-from vggtgeo.benchmark.store import Row
 from vggtgeo.benchmark.suite import Suite
+from vggtgeo.benchmark.table import Row
 
 
 def page(suite: Suite, rows: Sequence[Row]) -> str:

@@ -19,9 +19,9 @@ from vggtgeo.benchmark.page import write_page
 from vggtgeo.benchmark.processes import Limits
 from vggtgeo.benchmark.provenance import source_digest
 from vggtgeo.benchmark.scheduling import run_jobs
-from vggtgeo.benchmark.store import Row, Store
+from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.suite import Suite, limited, load_suite
-from vggtgeo.benchmark.table import as_csv, write_parquet
+from vggtgeo.benchmark.table import Row, as_csv, write_parquet
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.errors import InputError

@@ -15,7 +15,8 @@ from vggtgeo.benchmark.inputs import walk_name
 from vggtgeo.benchmark.jobs import Job
 from vggtgeo.benchmark.processes import Ending, Limits, run_limited, shares
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.store import Row, Store
+from vggtgeo.benchmark.store import Store
+from vggtgeo.benchmark.table import Row
 from vggtgeo.benchmark.worker import LOG
 
 Command = Callable[[Path, Path], Sequence[str]]

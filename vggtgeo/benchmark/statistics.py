@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import t as student
 
-from vggtgeo.benchmark.store import Row
-from vggtgeo.benchmark.table import number
+from vggtgeo.benchmark.table import Row, number
 
 LEVEL = 0.95
 SAME = 1e-6

@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.jobs import Job
+from vggtgeo.benchmark.table import NUMBERS, Row
 from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 from vggtgeo.io.text_files import whole_text
 
-Row = Mapping[str, Any]
-"""A line of the table: plain values by the names of the columns."""
-
-
-_NUMBER = re.compile(
-    r"(_m|_deg|_rel|_25|_per_second|_gb|_wall|score|error|frames|tracked|coverage|matched|scale|precision|recall)$"
-)
-"""Names of columns that tables compute with."""
 _LARGEST = 2**63
 
 
@@ -37,7 +28,7 @@ def _check_row(row: Row, job: Job) -> None:
             raise ValueError(f"its `{name}` is {value!r:.40}; expected a number or a text")
         if isinstance(value, str):
             value.encode("utf-8", "surrogateescape")
-        if _NUMBER.search(name) and (isinstance(value, str) or (isinstance(value, int) and abs(value) >= _LARGEST)):
+        if name in NUMBERS and (isinstance(value, str) or (isinstance(value, int) and abs(value) >= _LARGEST)):
             raise ValueError(f"its `{name}` is {value!r:.40}; expected a number")
     if row["status"] == "ok":
         for name, kind in (("frames", int), ("tracked", int), ("verdict", str)):

@@ -5,17 +5,18 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.benchmark.store import Row
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
 from vggtgeo.models.extras import install_hint
 
-FIRST = (
-    *("suite", "sequence", "setting", "seed", "status", "message", "simulated", "protocol", "verdict"),
+Row = Mapping[str, Any]
+"""A line of the table: plain values by the names of the columns."""
+
+NUMBERS = (
     *("frames", "tracked", "coverage", "keyframes", "matched", "metric", "path_m"),
     *("ate_se3_m", "ate_sim3_m", "scale", "ate_yaw_m", "ate_unaligned_m", "rte_1s_m", "rre_1s_deg"),
     *("rte_1m_m", "rre_1m_deg", "depth_rmse_m", "depth_abs_rel", "depth_below_1_25"),
@@ -23,6 +24,8 @@ FIRST = (
     *("mesh_f_score", "mesh_accuracy_m", "mesh_completeness_m", "nees_place", "nees_rotation", "focal_error"),
     *("frames_per_second", "seconds_wall", "peak_memory_gb"),
 )
+"""Columns that tables compute with."""
+FIRST = ("suite", "sequence", "setting", "seed", "status", "message", "simulated", "protocol", "verdict", *NUMBERS)
 """Columns that people look for; the others follow by name."""
 
 

@@ -11,7 +11,7 @@ import typer
 from vggtgeo.cli.options import JsonOption
 
 if TYPE_CHECKING:
-    from vggtgeo.benchmark.store import Row
+    from vggtgeo.benchmark.table import Row
 
 
 def bench(
