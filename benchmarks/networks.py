@@ -10,7 +10,8 @@ Printed as Markdown. Disk needed: 13 GB; memory: 8 GB (VGGT).
 With `--provider cuda` a call is timed by the clock, the memory is the GPU's, as nvidia-smi sees it rise (so nothing
 else may use that GPU), and the line after the table is the whole front end: all networks of the paper's preset
 loaded together, every role asked once a frame of a simulated walk. `--front-end` prints that line alone, on any
-provider.
+provider. `--against-cpu` prints instead how far the provider's answers are from the CPU's, as the program runs networks
+and in TF32, as onnxruntime would.
 """
 
 from __future__ import annotations
@@ -92,6 +93,7 @@ def main() -> None:
     parser.add_argument(
         "--front-end", type=int, metavar="FRAMES", help="only time all roles together on so many frames"
     )
+    parser.add_argument("--against-cpu", action="store_true", help="only compare the files of --out with the CPU")
     parser.add_argument("--measure", type=Path, help=argparse.SUPPRESS)  # the process that measures one file
     arguments = parser.parse_args()
     try:
@@ -100,6 +102,10 @@ def main() -> None:
         raise SystemExit(str(error)) from None
     if arguments.measure:
         print(json.dumps(measure(arguments.measure, arguments.threads, arguments.provider)))
+        return
+    if arguments.against_cpu:
+        for file in sorted(arguments.out.glob(f"{arguments.only or '*'}.onnx")):
+            print(file.stem, json.dumps(against_cpu(file, arguments.provider)), flush=True)
         return
     if arguments.front_end:
         print(json.dumps(front_end(arguments.out, arguments.front_end, arguments.provider)))
@@ -182,6 +188,28 @@ def measure(file: Path, threads: int, provider: str) -> dict:
             session.run(None, inputs)
             seconds.append(clock() - started)
     return {"seconds": statistics.median(seconds), **memory}
+
+
+def against_cpu(file: Path, provider: str) -> dict[str, dict[str, float]]:
+    """Largest difference of each output from the CPU's, relative to its largest value, in float32 and in TF32."""
+    import numpy as np
+    import onnxruntime
+
+    def answers(providers: list) -> dict[str, np.ndarray]:
+        session = onnxruntime.InferenceSession(str(file), providers=providers)
+        with np.load(f"{file}.parity.npz") as parity:
+            inputs = {value.name: parity[f"input.{value.name}"] for value in session.get_inputs()}
+        return {
+            value.name: found for value, found in zip(session.get_outputs(), session.run(None, inputs), strict=True)
+        }
+
+    if provider == "cuda":
+        load_cuda_libraries()
+    expected = answers(PROVIDERS["cpu"])
+    ways = {"float32": PROVIDERS[provider], "TF32": [(NAMES["cuda"], {**CUDA_OPTIONS, "use_tf32": "1"})]}
+    found = {way: answers(providers) for way, providers in ways.items() if way == "float32" or provider == "cuda"}
+    off = lambda one, other: float(np.abs(one - other).max() / np.abs(other).max())
+    return {way: {name: off(one[name], expected[name]) for name in expected} for way, one in found.items()}
 
 
 def front_end(folder: Path, frames: int, provider: str) -> dict:
