@@ -1,0 +1,137 @@
+"""Folders of images and depth, as people and programs write them: pairs, units, and what is no recording."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tiny_layouts as tiny
+import tiny_sequences
+from layout_checks import checked
+
+from vggtgeo.datasets import open_sequence, with_depth_scale, with_rate
+from vggtgeo.io.errors import InputError, InputWarning
+
+
+@pytest.mark.parametrize(
+    ("colour", "depth"),
+    [
+        ("rgb/{}.png", "depth/{}.png"),
+        ("color/{:06d}.png", "depth/{:06d}.png"),  # Open3D's
+        ("RGB/rgb_{}.png", "Depth/depth_00{}.png"),
+        ("images/130503110{}.175304.png", "depth/130503110{}.162211.png"),
+        ("image/{}_left_a1.png", "depth/{}_depth_a1.png"),  # only the order tells
+        ("rgb/{}.png", "aligned_depth_to_color/{}.png"),
+        ("color_{}.png", "depth_{}.png"),  # one folder for both
+        ("{:05d}-color.png", "{:05d}-depth.png"),
+        ("{}.png", "depth{}.png"),
+    ],
+)
+def test_folders_of_colour_and_depth_are_paired(tmp_path: Path, colour: str, depth: str) -> None:
+    # Proves pairing by name, number, time and order, millimetres, and the camera of Open3D's recorders. Oracle: what
+    # was written: the depth of a frame tells which it is.
+    sequence = tiny.quietly_opened(tiny.rgbd(tmp_path / "own", colour, depth))
+    frames = checked(sequence, "RgbdFolders")
+    assert [frame.depth[3, 7] for frame in frames] == pytest.approx([1.007, 1.017, 1.027])
+    halved = with_depth_scale(sequence, 2000.0)
+    assert next(iter(halved.frames())).depth[3, 7] == pytest.approx(1.007 / 2)
+    assert next(iter(with_rate(sequence, 10.0).frames(2))).timestamp == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".tiff", ".pfm"])
+def test_depth_of_floats_is_in_metres(tmp_path: Path, suffix: str) -> None:
+    # Proves the convention, its other units, and what is no depth: nothing, infinities, what a renderer writes for the
+    # sky, no picture but an array. Oracle: what was written.
+    folder = tiny.rgbd(tmp_path / "own")
+    for file in sorted((folder / "depth").iterdir()):
+        depth = np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float32) / 1000
+        depth[0, :5] = 0.0, -1.0, np.inf, np.nan, 1e10
+        np.save(file.with_suffix(".npy"), depth) if suffix == ".npy" else cv2.imwrite(
+            str(file.with_suffix(suffix)), depth
+        )
+        file.unlink()
+    sequence = tiny.quietly_opened(folder)
+    frames = checked(sequence, "RgbdFolders")
+    assert [frame.depth[3, 7] for frame in frames] == pytest.approx([1.007, 1.017, 1.027])
+    assert np.isnan(frames[0].depth[0, :5]).all()
+    assert next(iter(with_depth_scale(sequence, 2.0).frames())).depth[3, 7] == pytest.approx(1.007 / 2)
+
+
+def test_depth_of_a_phone_is_enlarged_to_the_images(tmp_path: Path) -> None:
+    # Proves that depth of fewer pixels and the same shape is used, told, and that of another shape is not. Oracle: what
+    # was written.
+    folder = tiny.rgbd(tmp_path / "phone")
+    for file in sorted((folder / "depth").iterdir()):
+        tiny_sequences.write_image(file, tiny_sequences.depth_codes(int(file.stem), 20, 15))
+    with pytest.warns(InputWarning, match="20 x 15 pixels; the colour images are 40 x 30: taken for the same view"):
+        frames = list(open_sequence(folder).frames())
+    assert frames[1].depth.shape == (tiny_sequences.HEIGHT, tiny_sequences.WIDTH)
+    assert [frames[1].depth[3, column] for column in (6, 7, 8)] == pytest.approx([1.013, 1.013, 1.014])
+    for file in sorted((folder / "depth").iterdir()):
+        tiny_sequences.write_image(file, tiny_sequences.depth_codes(int(file.stem), 20, 16))
+    with pytest.raises(InputError, match="register the depth to the images"):
+        open_sequence(folder)
+
+
+def test_pictures_of_which_one_is_called_depth_are_pictures(tmp_path: Path) -> None:
+    # Proves that a folder is one of RGB-D only where half of the images have a depth.
+    folder = tiny.rgbd(tmp_path / "own", "{}.png", "other/{}.png")
+    tiny_sequences.write_image(folder / "depth_1.png", tiny_sequences.image(1))
+    assert type(tiny.quietly_opened(folder)).__name__ == "ImageFolder"
+
+
+def test_folders_that_cannot_be_paired_are_named(tmp_path: Path) -> None:
+    # Proves the errors: names without a relation, a camera of another size, a unit of depth for a sequence without.
+    folder = tiny.rgbd(tmp_path / "own", "rgb/{}_left_a1.png", "depth/{}_depth_a1.png")
+    (folder / "depth" / "2_depth_a1.png").unlink()
+    with pytest.raises(InputError, match=r"3 images .* and the 2 depths .* cannot be paired"):
+        open_sequence(folder)
+    folder = tiny.rgbd(tmp_path / "resized")
+    camera = folder / "intrinsic.json"
+    camera.write_text(camera.read_text().replace(f'"width": {tiny_sequences.WIDTH}', '"width": 848'))
+    with pytest.raises(InputError, match="is of images of 848 x 30 pixels; those here are 40 x 30"):
+        open_sequence(folder)
+    camera.write_text('{"fx": 50, "fy": 50, "ppx": 20, "ppy": 15}')
+    assert open_sequence(folder).camera.intrinsics == (50, 50, 20, 15)
+    camera.write_text('{"fx": 50}')
+    with pytest.raises(InputError, match=r"expected `intrinsic_matrix` \(nine numbers"):
+        open_sequence(folder)
+    camera.unlink()
+    shutil.rmtree(folder / "depth")
+    alone = tiny.quietly_opened(folder)
+    assert not alone.has_depth
+    assert len(alone) == tiny.COUNT
+    with pytest.raises(InputError, match="no depth files whose unit could be another"):
+        with_depth_scale(alone, 5000.0)
+
+
+def test_the_result_of_a_run_is_no_recording(tmp_path: Path) -> None:
+    # Proves that a run's folder, which has a picture and images of keyframes, is not taken for a sequence.
+    folder = tiny.rgbd(tmp_path / "result", "images/{}.png")
+    for name in ("summary.json", "trajectory.txt", "trajectory.png"):
+        (folder / name).write_text("")
+    with pytest.raises(InputError, match="holds the result of a run; give the recording that it was made of"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize("colour", ["rgb_png/{}.png", "color_images/{}.png"])
+def test_a_few_loose_pictures_are_not_the_recording(tmp_path: Path, colour: str) -> None:
+    # Proves that folders whose names say the format, too, are paired, and that pictures beside them are left out with a
+    # word where they are few, or depth is there for every image. Oracle: what was written.
+    folder = tmp_path / "own"
+    for number in range(12):
+        tiny_sequences.write_image(folder / colour.format(number), tiny_sequences.image(number))
+        tiny_sequences.write_image(folder / f"depth_png/{number}.png", tiny_sequences.depth_codes(number))
+    tiny_sequences.write_image(folder / "example.png", tiny_sequences.image(0))
+    tiny_sequences.write_calibration(folder, tiny_sequences.INTRINSICS)
+    with pytest.warns(InputWarning, match=r"1 images beside `.*` \(example.png, ...\) are left out"):
+        sequence = open_sequence(folder)
+    assert (type(sequence).__name__, len(sequence), sequence.has_depth) == ("RgbdFolders", 12, True)
+    for number in range(2):
+        tiny_sequences.write_image(folder / f"another{number}.png", tiny_sequences.image(0))
+    with pytest.warns(InputWarning, match="3 images beside"):
+        assert len(open_sequence(folder)) == 12
+    (folder / "depth_png" / "11.png").unlink()  # now it is not so clear what is meant
+    with pytest.warns(InputWarning, match=f"`{Path(colour).parent}` in it has 12: give that folder to read those"):
+        assert len(open_sequence(folder)) == 3
