@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -33,58 +34,87 @@ SURE, MOST_WARP = 5.0, 3.0
 
 
 def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
-    """Bundle-adjust every keyframe: features and, where there is metric depth, surfaces, in a few rounds."""
+    """Bundle-adjust every keyframe: features and, where there is metric depth, surfaces, in a few rounds.
+
+    The first round also asks for a rolling shutter, and for another camera than the given or guessed one; those after
+    it take both as they are.
+    """
     if len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA or not slam.pairs:
         return slam
-    edges = _edges(slam, settings)
-    degrees = np.bincount([edge.host for edge in edges])
-    shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.factors, len(slam.pairs), settings)
-    fixed = np.isin(np.arange(len(slam.keyframes)), slam.origins)
-    surfaces, solved = _surfaces(slam), None
-    camera = CameraPrior(slam.given_intrinsics, slam.intrinsics_sigma, camera_of(slam))
+    whole, solved = _Whole.of(slam, settings), None
     for number in range(settings.refinement.global_rounds):
-        estimated = number == 0 and not slam.calibrated
-        adjustment = build(
-            slam.keyframes,
-            edges,
-            slam.intrinsics,
-            settings,
-            size=shape.size,
-            camera=camera,
-            fixed_pose=fixed,
-            terms=_terms(slam, _of_any_camera(slam) if estimated else slam.factors, surfaces, shape, settings),
-        )
-        if estimated:  # surfaces were measured with the camera of that moment, too
-            adjustment = replace(adjustment, problem=without_surfaces(adjustment.problem))
-        problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(slam.keyframes), slam.metric)
-        adjustment = replace(adjustment, problem=problem)
-        told = gauge_notes(gauge, adjustment.keyframes, "global adjustment") if number == 0 else ()
-        slam = replace(slam, notes=(*slam.notes, *told))
-        adjustment = _without_readout(slam, adjustment)
-        solver = global_solver(adjustment.problem, settings)
-        solution = solve_jit(adjustment.problem, adjustment.initial, solver)
+        is_first = number == 0
+        adjustment, notes = whole.adjustment(slam, settings, finds_camera=is_first and not slam.calibrated)
+        slam = replace(slam, notes=(*slam.notes, *notes)) if is_first else slam
+        solution = solve_jit(adjustment.problem, adjustment.initial, global_solver(adjustment.problem, settings))
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
         slam, solved = _taken(slam, adjustment, solution.state), (adjustment.problem, solution.state)
-        if number > 0:
-            continue
-        slam, adjustment, state = _with_its_readout(slam, adjustment, solution.state, settings)
-        solved = adjustment.problem, state
-        before = slam
+        if is_first:
+            slam, adjustment, state = _with_its_readout(slam, adjustment, solution.state, settings)
+            slam, whole = whole.with_its_camera(slam, adjustment, state, settings)
+            solved = adjustment.problem, state
+    sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
+    return replace(slam, pose_sigma=sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class _Whole:
+    """What the rounds share: edges between keyframes, surfaces of those with metric depth, the camera's prior, and
+    the size that all problems are padded to.
+    """
+
+    edges: list[Directed]
+    surfaces: list[Surface]
+    camera: CameraPrior
+    shape: GlobalShape
+
+    @classmethod
+    def of(cls, slam: Slam, settings: SlamSettings) -> Self:
+        edges = _edges(slam, settings)
+        degrees = np.bincount([edge.host for edge in edges])
+        shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.factors, len(slam.pairs), settings)
+        camera = CameraPrior(slam.given_intrinsics, slam.intrinsics_sigma, camera_of(slam))
+        return cls(edges, _surfaces(slam), camera, shape)
+
+    def adjustment(self, slam: Slam, settings: SlamSettings, finds_camera: bool) -> tuple[Adjustment, tuple[str, ...]]:
+        """A round's adjustment, and what its gauge is worth a word of. finds_camera: without what was measured with the
+        camera of that moment, the tracked motions and the surfaces.
+        """
+        factors = _of_any_camera(slam) if finds_camera else slam.factors
+        adjustment = build(
+            slam.keyframes,
+            self.edges,
+            slam.intrinsics,
+            settings,
+            size=self.shape.size,
+            camera=self.camera,
+            fixed_pose=np.isin(np.arange(len(slam.keyframes)), slam.origins),
+            terms=_terms(slam, factors, self.surfaces, self.shape, settings),
+        )
+        problem = without_surfaces(adjustment.problem) if finds_camera else adjustment.problem
+        problem, gauge = with_one_gauge(problem, adjustment.initial, len(slam.keyframes), slam.metric)
+        notes = gauge_notes(gauge, adjustment.keyframes, "global adjustment")
+        return _without_readout(slam, replace(adjustment, problem=problem)), notes
+
+    def with_its_camera(
+        self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
+    ) -> tuple[Slam, Self]:
+        """The state after a trial of its camera, and what the rounds that follow share: a guessed camera, once
+        estimated, is held (see `_of_any_camera`).
+        """
+        before = slam.intrinsics
         if slam.calibrated and not slam.metric:
             slam = replace(slam, focal_wanted=free_focal(adjustment.problem, state, _solves(settings)))
         if settings.camera.refine_intrinsics != "never":
-            slam = _with_its_camera(slam, adjustment, state, edges, settings)
-        if settings.refinement.global_rounds == 1:
-            break
-        if estimated or slam.intrinsics is not before.intrinsics:
-            edges, surfaces = _edges(slam, settings), _surfaces(slam)
-            camera = replace(camera, mean=slam.intrinsics)
-        if estimated:  # and held from here on: see `_of_any_camera`
+            slam = _with_its_camera(slam, adjustment, state, self.edges, settings)
+        if settings.refinement.global_rounds == 1 or (slam.calibrated and slam.intrinsics is before):
+            return slam, self
+        camera = replace(self.camera, mean=slam.intrinsics)
+        if not slam.calibrated:
             held = settings.camera.known_intrinsics_sigma * slam.intrinsics[0]
             camera = replace(camera, sigma=np.full(4, held), kind=_of_pixels(slam.intrinsics))
-    sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
-    return replace(slam, pose_sigma=sigma)
+        return slam, replace(self, edges=_edges(slam, settings), surfaces=_surfaces(slam), camera=camera)
 
 
 def _solves(settings: SlamSettings) -> Solve:
