@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 
@@ -70,7 +69,7 @@ class _Whole:
     shape: GlobalShape
 
     @classmethod
-    def of(cls, slam: Slam, settings: SlamSettings) -> Self:
+    def of(cls, slam: Slam, settings: SlamSettings) -> _Whole:
         edges = _edges(slam, settings)
         degrees = np.bincount([edge.host for edge in edges])
         shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.factors, len(slam.pairs), settings)
@@ -99,7 +98,7 @@ class _Whole:
 
     def with_its_camera(
         self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
-    ) -> tuple[Slam, Self]:
+    ) -> tuple[Slam, _Whole]:
         """The state after a trial of its camera, and what the rounds that follow share: a guessed camera, once
         estimated, is held (see `_of_any_camera`).
         """
