@@ -39,24 +39,58 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     times, poses = carried_poses(slam)
     if slam.pose_sigma is None or len(slam.pose_sigma) != len(slam.keyframes):
         return times, poses
-    rows = [row for row, record in enumerate(slam.frames) if record.seen is not None and record.tracked]
+    rows = _placed_by_points(slam)
     if not rows:
         return times, poses
-    readout = slam.readout
-    motions = None if readout is None else (camera_motions(slam, len(slam.keyframes)), frame_motions(slam))
+    motions = _motions(slam)
 
     def placed(row: int) -> np.ndarray:
-        record, pose = slam.frames[row], poses[row]
-        points, pixels = _landmarks(slam, record, None if motions is None else motions[0][record.reference])
-        if readout is not None and motions is not None:
-            inverse = 1.0 / (points @ pose[2, :3] + pose[2, 3])
-            size = slam.keyframes[record.reference].size
-            pixels = at_once(pixels, inverse, motions[1][row], slam.intrinsics, size, readout)
-        return _resected(points, pixels, pose, tracked_information(record.evidence), slam.intrinsics)
+        points, pixels = _sight(slam, row, poses[row], motions)
+        return _resected(points, pixels, poses[row], tracked_information(slam.frames[row].evidence), slam.intrinsics)
 
     found = poses.copy()
     found[rows] = np.array(map_in_threads(placed, rows))
     return times, found
+
+
+def off_landmarks(slam: Slam) -> dict[int, np.ndarray]:
+    """How far the finished map is from where frames that points alone placed show it, by row of `slam.frames`: pixels
+    [m], infinite of a landmark behind the camera. Frames that keep too few are left out, and all before the end.
+    """
+    if slam.pose_sigma is None or len(slam.pose_sigma) != len(slam.keyframes):
+        return {}
+    poses, motions = frame_poses(slam)[1], _motions(slam)
+    found = {}
+    for row in _placed_by_points(slam):
+        points, pixels = _sight(slam, row, poses[row], motions)
+        if len(points) >= LEAST_POINTS:
+            off = np.linalg.norm(rigid.project(points, poses[row], slam.intrinsics) - pixels, axis=1)
+            found[row] = np.where(points @ poses[row][2, :3] + poses[row][2, 3] > NEAREST, off, np.inf)
+    return found
+
+
+def _placed_by_points(slam: Slam) -> list[int]:
+    return [row for row, record in enumerate(slam.frames) if record.seen is not None and record.tracked]
+
+
+def _motions(slam: Slam) -> tuple[np.ndarray, np.ndarray] | None:
+    """Of all keyframes and of all frames, where a readout is known."""
+    return None if slam.readout is None else (camera_motions(slam, len(slam.keyframes)), frame_motions(slam))
+
+
+def _sight(
+    slam: Slam, row: int, pose: np.ndarray, motions: tuple[np.ndarray, np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """World points [m, 3] of what a frame at about this pose has kept, and the pixels [m, 2] where it shows them, as if
+    all were read at once.
+    """
+    record = slam.frames[row]
+    points, pixels = _landmarks(slam, record, None if motions is None else motions[0][record.reference])
+    if slam.readout is not None and motions is not None:
+        inverse = 1.0 / (points @ pose[2, :3] + pose[2, 3])
+        size = slam.keyframes[record.reference].size
+        pixels = at_once(pixels, inverse, motions[1][row], slam.intrinsics, size, slam.readout)
+    return points, pixels
 
 
 def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

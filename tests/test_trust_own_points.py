@@ -1,0 +1,84 @@
+"""Frames against the landmarks that they were placed by, in a map whose depths are right and in one where they are not.
+
+Oracles: the cameras and the depths that the landmarks were projected with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_keyframe_depth import INTRINSICS, SIZE, keyframe
+from vggtgeo.models.rigid_motion import exponential
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.keyframe import Slots
+from vggtgeo.slam.state import FramePose, SeenPoints, Slam
+from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.trust.own_points import IN_A_ROW, agreeing_landmarks, check_own_points
+
+FRAMES, POINTS = 24, 120
+FIRST_OFF = 12
+
+
+def _glide(noise: float) -> Slam:
+    """A camera that glides past things 1 to 1.5 m and 4 to 6 m away, one keyframe and frames with a noise in pixels."""
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(8, [SIZE[1] - 8, SIZE[0] - 8], (POINTS, 2))
+    near = np.arange(POINTS) % 3 == 0
+    inverse = 1 / np.where(near, rng.uniform(1.0, 1.5, POINTS), rng.uniform(4.0, 6.0, POINTS))
+    one, unknown = np.ones(POINTS), np.full(POINTS, np.nan)
+    first = keyframe(0, np.ones(SIZE), Slots(pixels, inverse, unknown, unknown, one, one))
+    world = rigid.unproject(pixels, inverse, first.pose, INTRINSICS)
+    records = [FramePose(0, 0.0, 0, np.eye(4), True, POINTS)]
+    for row in range(1, FRAMES):
+        motion = exponential(np.array([-0.05 * row, 0.002 * row, 0.004 * row, 0.0, 0.003 * row, 0.0]))
+        shown = rigid.project(world, motion @ first.pose, INTRINSICS) + rng.normal(0, noise, (POINTS, 2))
+        seen = SeenPoints(np.arange(POINTS, dtype=np.int32), shown.astype(np.float32))
+        records.append(FramePose(row, row / 10, 0, motion, True, POINTS, seen=seen))
+    return Slam(
+        INTRINSICS,
+        INTRINSICS,
+        np.full(4, 1.0),
+        False,
+        keyframes=(first,),
+        frames=tuple(records),
+        pose_sigma=np.full((1, 2), 0.01),
+    )
+
+
+def _with_wrong_depths(slam: Slam) -> Slam:
+    """The same, but what is near lies half as far again in the map: no pose explains near and far."""
+    first = slam.keyframes[0]
+    inverse = first.points.inverse_depth
+    wrong = np.where(inverse > 0.5, inverse / 1.5, inverse)
+    return replace(slam, keyframes=(replace(first, points=replace(first.points, inverse_depth=wrong)),))
+
+
+@pytest.mark.parametrize("noise", [0.5, 2.0])
+def test_right_map_is_silent_in_any_noise(noise: float) -> None:
+    """All but one landmark in ninety, and what a robust fit leaves of that, agree."""
+    slam = _glide(noise)
+    rows, shares = agreeing_landmarks(slam)
+    np.testing.assert_array_equal(rows, np.arange(1, FRAMES))
+    assert np.median(shares) > 0.95
+    assert check_own_points(slam) == []
+
+
+def test_map_of_wrong_depths_is_told_where_its_frames_have_moved() -> None:
+    """Each frame is placed by the far two thirds, and what is near is elsewhere by more the farther it has moved."""
+    (finding,) = check_own_points(_with_wrong_depths(_glide(0.5)))
+    assert finding.level == "degraded"
+    assert not finding.local
+    assert finding.end == FRAMES - 1
+    assert finding.start is not None
+    assert 1 <= finding.start <= FIRST_OFF
+    assert any("were placed are elsewhere" in reason for reason in judge(_with_wrong_depths(_glide(0.5))).reasons)
+
+
+def test_nothing_is_asked_with_depth_of_few_frames_and_before_the_end() -> None:
+    wrong = _with_wrong_depths(_glide(0.5))
+    assert check_own_points(replace(wrong, metric=True)) == []
+    assert check_own_points(replace(wrong, frames=wrong.frames[:IN_A_ROW])) == []
+    assert check_own_points(replace(wrong, pose_sigma=None)) == []
