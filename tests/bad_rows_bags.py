@@ -41,12 +41,66 @@ def small(number: int) -> np.ndarray:
     return pixels[: 20 if number == 1 else None]
 
 
+def wide(number: int, channels: int = 3) -> np.ndarray:
+    """An image of 12 bits."""
+    return np.full((*SIZE[::-1], channels), 1000 + 500 * number, np.uint16)
+
+
+def swapped(number: int) -> np.ndarray:
+    """The same, the bytes in the order of other processors."""
+    return wide(number).byteswap()
+
+
+def squares(number: int) -> np.ndarray:
+    """Grey values, and below them a colour for each two by two."""
+    return np.full((SIZE[1] * 3 // 2, SIZE[0]), 100 + number, np.uint8)
+
+
+def binned(
+    binning: int, size: tuple[int, int], region: tuple[int, int, int, int] = (0, 0, 0, 0)
+) -> Callable[[Path], Path]:
+    """Images beside a camera of this sensor."""
+    matrix = (100, 0, size[0] / 2, 0, 100, size[1] / 2, 0, 0, 1)
+    return bag(c_info=info(size=size, matrix=lambda number: matrix, binning=binning, region=region))
+
+
+def parts(folder: Path) -> Path:
+    """A recording in two files."""
+    for number in range(2):
+        bags.write(folder / f"c_{number}.bag", c_image=image())
+    return folder
+
+
+def ros2(folder: Path, declared: int = bags.COUNT) -> Path:
+    """A bag beside the camera of its images."""
+    made = bags.write_ros2(folder / "c", declared)
+    (made / "calibration.txt").write_text("50 50 20 15")
+    return made
+
+
+def changed_ros2(folder: Path, change: Callable[[Path], object]) -> Path:
+    """A bag whose file of messages was changed."""
+    made = ros2(folder)
+    change(next(made.glob("*.db3")))
+    return made
+
+
+def doubled(file: Path) -> None:
+    """A second file of messages."""
+    file.with_name("c_1.db3").write_bytes(file.read_bytes())
+
+
 BAGS: list[Row] = rows(
     "ROS bags",
     [
         ("no topic of images", only(c_info=info())),
         ("a topic of images without a message", only(c_image=(bags.IMAGE, lambda number: None))),
-        ("an encoding that is not read", bag(c_image=image(lambda number: np.zeros(SIZE[::-1], np.uint16), "mono16"))),
+        ("an encoding that is not read", bag(c_image=image(lambda number: np.zeros(SIZE[::-1], np.int32), "32SC1"))),
+        ("grey of 16 bits", bag(c_image=image(lambda number: wide(number)[..., 0], "mono16"))),
+        ("colours of 16 bits, the other byte order", bag(c_image=image(swapped, "rgb16", is_bigendian=1))),
+        ("four channels of 8 bits", bag(c_image=image(lambda number: wide(number, 4).astype(np.uint8), "8UC4"))),
+        ("NV12", bag(c_image=image(squares, "nv12", height=SIZE[1]))),
+        ("NV21 that lacks its colours", bag(c_image=image(lambda number: squares(number)[: SIZE[1]], "nv21"))),
         (
             "a video, H.264, as compressed images",
             bag(c_image=packed(lambda number: b"\0\0\0\1\x67" + bytes(90), "h264")),
@@ -80,6 +134,14 @@ BAGS: list[Row] = rows(
         ),
         ("a camera of other topics alone", only(left_image=image(), right_info=info())),
         ("a camera that zooms", bag(c_info=info(matrix=lambda number: (50 + 20 * number, *bags.MATRIX[1:])))),
+        ("a camera whose images have one pixel for two by two", binned(2, (2 * SIZE[0], 2 * SIZE[1]))),
+        ("a camera whose images are a part of the sensor", binned(1, (640, 480), (300, 225, SIZE[1], SIZE[0]))),
+        ("a camera of one pixel for two by two, and images of all pixels", binned(2, SIZE)),
+        ("times of more than a second beside the seconds", bag(c_image=image(time=(50, 2_500_000_000)))),
+        ("a folder of several bags of ROS 1", parts),
+        ("a ROS 2 bag that lacks one of its files", lambda folder: changed_ros2(folder, Path.unlink)),
+        ("a ROS 2 bag with a file that its metadata does not name", lambda folder: changed_ros2(folder, doubled)),
+        ("a ROS 2 bag whose metadata counts more images than it has", lambda folder: ros2(folder, 400)),
         ("depth of NaN", depth(NAN)),
         ("depth of 1e30", depth(1e30)),
         ("depth of bytes in the other order", depth(1.5, is_bigendian=1)),

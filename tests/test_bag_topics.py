@@ -10,7 +10,9 @@ import pytest
 import tiny_layouts as tiny
 import tiny_sequences
 
-from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, image_of, metres_of, told
+from vggtgeo.datasets.bag_cameras import camera_of
+from vggtgeo.datasets.bag_images import image_of, metres_of
+from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, told
 from vggtgeo.datasets.check import inspect
 from vggtgeo.io.errors import InputError
 
@@ -52,6 +54,11 @@ def packed(kind: str, data: bytes = b"") -> Any:
         ({"/camera/infra1/image": "mono8", "/camera/infra2/image": "mono8"}, "/camera/infra1/image", ""),
         ({"/cam0/image_raw": "mono8", "/cam1/image_raw": "mono8"}, "/cam0/image_raw", ""),
         ({"/cam/grey": "mono8", "/cam/raw": "bayer_rggb8"}, "/cam/raw", ""),
+        (
+            {"/camera/depth/image": "mono16", "/camera/thermal/image": "mono16"},
+            "/camera/thermal/image",
+            "/camera/depth/image",
+        ),
         ({"/depth/false_colours": "rgb8", "/front/image": "mono8"}, "/front/image", ""),
     ],
 )
@@ -71,8 +78,8 @@ def test_compressed_topics() -> None:
 
 def test_what_cannot_be_read_is_named() -> None:
     # Proves that the sentence has the topics with what they hold, since one encoding is all that is wrong.
-    with pytest.raises(InputError, match=r"its topics of images: `/a` \(rgb16\), `/d` \(16UC1\)"):
-        chosen_topics({"/a": raw("rgb16"), "/d": raw("16UC1")})
+    with pytest.raises(InputError, match=r"its topics of images: `/a` \(64FC1\), `/d` \(16UC1\)"):
+        chosen_topics({"/a": raw("64FC1"), "/d": raw("16UC1")})
     with pytest.raises(InputError, match=r"its topics of images: none"):
         chosen_topics({})
 
@@ -142,3 +149,45 @@ def test_a_choice_is_a_note_and_no_problem(tmp_path: Path) -> None:
         "depth of `/camera/aligned_depth/image_raw`, truth of `/mocap/pose`; not read: `/camera/depth/image_raw`"
         in note
     )
+
+
+@pytest.mark.parametrize(
+    ("encoding", "channels", "order"),
+    [("mono16", 1, "<"), ("rgb16", 3, ">"), ("bgr16", 3, "<"), ("bgra16", 4, "<"), ("16UC3", 3, ">")],
+)
+def test_images_of_16_bits(encoding: str, channels: int, order: str) -> None:
+    # Proves that 12 bits are scaled as those of a file are, by the bits that the values need, in either byte order.
+    codes = np.arange(4 * 6 * channels).reshape(4, 6, channels) * 25 + 1200  # up to 3575
+    message = raw(encoding, codes.astype(np.dtype(np.uint16).newbyteorder(order)))
+    message.is_bigendian = int(order == ">")
+    read = image_of(message, PLACE)
+    colours = np.broadcast_to(codes, (4, 6, 3)) if channels == 1 else codes[..., :3]
+    expected = (colours if encoding.startswith(("rgb", "mono")) else colours[..., ::-1]) >> 4
+    np.testing.assert_array_equal(read.image, expected)
+    assert read.bits == 12
+    assert (image_of(message, PLACE, 16).image == expected >> 4).all()
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+def test_images_of_grey_and_one_colour_for_four_pixels(encoding: str) -> None:
+    # Oracle: OpenCV's own conversion of an image of few colours to planes, put together as the encoding has them.
+    image = np.repeat(np.repeat(np.array([[[200, 40, 30], [20, 90, 220]]], np.uint8), 4, 0), 4, 1)
+    planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
+    u, v = planes[4:5].reshape(2, 4), planes[5:].reshape(2, 4)
+    pairs = np.stack([u, v] if encoding == "nv12" else [v, u], axis=2).reshape(2, 8)
+    message = raw(encoding, np.concatenate([planes[:4], pairs]))
+    message.height, message.step = 4, 8
+    assert np.abs(image_of(message, PLACE).image.astype(int) - image).max() <= 4
+    message.height = 6
+    with pytest.raises(InputError, match="they do not belong together"):
+        image_of(message, PLACE)
+
+
+def test_the_camera_of_a_part_of_the_sensor_with_pixels_put_together() -> None:
+    # Oracle: the definition of the message, on a sensor of 640 x 480 of which 400 x 200 pixels are read, two as one.
+    region = SimpleNamespace(x_offset=120, y_offset=200, width=400, height=200)
+    info = SimpleNamespace(width=640, height=480, binning_x=2, binning_y=2, roi=region, distortion_model="plumb_bob")
+    info.k, info.d = np.array([500.0, 0, 320, 0, 510, 300, 0, 0, 1]), np.zeros(5)
+    found = camera_of(Path("a.bag"), {"/c/info": [info]}, "/c/image", (200, 100))
+    assert found is not None
+    np.testing.assert_allclose(found.intrinsics, (250.0, 255.0, 100.0, 50.0))

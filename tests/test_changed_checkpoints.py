@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from bad_rows_maps import state
+from vggtgeo.models.onnx.bounds import Refusals
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, RunSoFar, resumed
 from vggtgeo.results.run_callbacks import RunCallbacks
+from vggtgeo.results.run_folder import taken
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.state import FramePose
 from vggtgeo.slam.window_recorder import WindowRecorder
@@ -69,3 +72,26 @@ def test_callbacks_that_kept_nothing() -> None:
     callbacks = RunCallbacks((WindowRecorder(),), Clock())
     with pytest.raises(InputError, match=r"kept NoneType of `WindowRecorder`; expected tuple: begin anew"):
         callbacks.resume(run())
+
+
+@pytest.mark.parametrize("refused", [{"weather": (1, 2, 3, 4)}, {"depth": (1, 2)}, {"depth": (1, 2, 3, -4)}, {}])
+def test_refusals_of_other_networks(refused: dict[str, tuple[int, ...]]) -> None:
+    """Counts are those of the networks that play."""
+    with pytest.raises(InputError, match=r"kept .*; expected counts of depth: begin anew with `--no-resume`"):
+        run(refused=refused).restore_refusals({"depth": Refusals()})
+
+
+def test_a_place_that_is_no_file(tmp_path: Path) -> None:
+    """What lies there is named; a run would neither go on from it nor keep its state there."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for name, found in (("folder", "a folder"), ("pipe", "a pipe"), ("link", "a link that leads nowhere")):
+        with pytest.raises(InputError, match=rf"`.*{name}` is {found}, and a run keeps its state there, in a file"):
+            resumed(Checkpoints(tmp_path / name), {})
+        (tmp_path / "out" / "unfinished").mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).rename(tmp_path / "out" / "unfinished" / "checkpoint.npz")
+        with pytest.raises(InputError, match=f"is {found}, and a run"), taken(tmp_path / "out"):
+            pass
+        place = tmp_path / "out" / "unfinished" / "checkpoint.npz"
+        place.rmdir() if found == "a folder" else place.unlink()

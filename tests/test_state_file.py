@@ -30,7 +30,6 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.evidence import Evidence
 from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRotation
 from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_images import CompressedImage
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.state import PendingWindow, Readout, SeenPoints, Slam, Waiting
@@ -345,12 +344,23 @@ def test_matches_of_key_points_that_are_not_there_are_refused(tmp_path: Path) ->
             load_state(tmp_path / "state.npz")
 
 
-def test_a_damaged_image_of_a_keyframe_is_told() -> None:
-    """Bytes that are no image, or one of another size, are an error that says whose they are; oracle: the sentence."""
-    whole = CompressedImage.of(np.zeros((6, 8, 3), np.uint8))
-    for wrong in (replace(whole, data=b""), replace(whole, data=bytes(50)), replace(whole, shape=(6, 9, 3))):
-        with pytest.raises(InputError, match="an image of a keyframe is damaged"):
-            wrong.array()
+def test_a_damaged_image_of_a_keyframe_is_told(tmp_path: Path) -> None:
+    """Bytes that are no image, or one of another size, are an error when the file is read, which says of which
+    keyframe; oracle: the sentence.
+    """
+    slam = settled(recorded_run().slam)
+    small = slam.keyframes[0].compressed()
+    for name, wrong, sentence in (
+        ("colour", {"data": b""}, "is empty"),
+        ("depth", {"data": bytes(50)}, "cannot be decoded"),
+        ("depth_sigma", {"data": small.images.depth_sigma.data[:-30]}, "is cut off"),
+        ("depth_confidence", {"data": small.images.colour.data}, "is an image of uint8"),
+    ):
+        images = replace(small.images, **{name: replace(getattr(small.images, name), **wrong)})
+        keyframes = (replace(small, images=images), *slam.keyframes[1:])
+        STATE.write(tmp_path / "state.npz", replace(slam, keyframes=keyframes))
+        with pytest.raises(InputError, match=rf"`.*state.npz` .* the {name} of keyframe 0 {sentence}"):
+            load_state(tmp_path / "state.npz")
 
 
 def test_reading_keeps_the_callers_precision(saved: Path) -> None:

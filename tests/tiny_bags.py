@@ -1,4 +1,4 @@
-"""ROS 1 bags of a few messages, each as a test wants it: what cameras' drivers write, and what nobody should."""
+"""ROS bags of a few messages, each as a test wants it: what cameras' drivers write, and what nobody should."""
 
 from __future__ import annotations
 
@@ -46,10 +46,31 @@ def write(path: Path, **topics: Topic) -> Path:
     return path
 
 
+def write_ros2(folder: Path, declared: int = COUNT) -> Path:
+    """A ROS 2 bag of images, whose metadata declares so many of them."""
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, (kind, content) = get_typestore(Stores.ROS2_HUMBLE), image()
+    with Writer(folder, version=8) as writer:
+        connection = writer.add_connection("/c/image", kind, typestore=store)
+        for number in range(COUNT):
+            fields = content(number)
+            assert isinstance(fields, Mapping)
+            whole, rest = divmod(round(1e9 * fields["time"]), 10**9)
+            header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](whole, rest), "c")
+            message = store.types[kind](header, *(value for name, value in fields.items() if name != "time"))
+            writer.write(connection, int(1e9 * stamp(number)), store.serialize_cdr(message, kind))
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace(f"message_count: {COUNT}", f"message_count: {declared}"))
+    return folder
+
+
 def _made(store: Any, kind: str, fields: Fields) -> Any:
     kinds = store.types
     seconds = fields["time"]
-    time = kinds["builtin_interfaces/msg/Time"](int(seconds), round(seconds % 1 * 1e9))
+    parts = (int(seconds), round(seconds % 1 * 1e9)) if isinstance(seconds, float) else seconds
+    time = kinds["builtin_interfaces/msg/Time"](*parts)
     header = kinds["std_msgs/msg/Header"](0, time, "c")
     rest = [value for name, value in fields.items() if name != "time"]
     if kind == POSE:
@@ -57,7 +78,7 @@ def _made(store: Any, kind: str, fields: Fields) -> Any:
         parts = kinds["geometry_msgs/msg/Point"](*place), kinds["geometry_msgs/msg/Quaternion"](*turn)
         rest = [kinds["geometry_msgs/msg/Pose"](*parts)]
     if kind == INFO:
-        rest.append(kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False))
+        rest.append(kinds["sensor_msgs/msg/RegionOfInterest"](*rest.pop(), False))
     return kinds[kind](header, *rest)
 
 
@@ -65,9 +86,9 @@ def image(pixels: Callable[[int], np.ndarray] = tiny.image, encoding: str = "rgb
     """Raw images. other: fields that are not those of the pixels."""
 
     def fields(number: int) -> Fields:
-        array, later = pixels(number), other.get("later", 0.0)
+        array, late = pixels(number), other.get("later", 0.0)
         data = np.frombuffer(array.tobytes(), np.uint8)
-        plain = {"time": stamp(number, later), "height": array.shape[0], "width": array.shape[1], "encoding": encoding}
+        plain = {"time": stamp(number, late), "height": array.shape[0], "width": array.shape[1], "encoding": encoding}
         plain |= {"is_bigendian": 0, "step": len(data) // len(array), "data": data}
         return plain | {name: value for name, value in other.items() if name in plain}
 
@@ -89,8 +110,10 @@ def info(
     matrix: Callable[[int], Any] = lambda number: MATRIX,
     distortion: tuple[float, ...] = (0.0,) * 5,
     lens: str = "plumb_bob",
+    binning: int = 0,
+    region: tuple[int, int, int, int] = (0, 0, 0, 0),
 ) -> Topic:
-    """The camera."""
+    """The camera. region: x, y, height, width."""
     fields = lambda number: {
         "time": stamp(number),
         "height": size[1],
@@ -100,8 +123,9 @@ def info(
         "k": np.array(matrix(number), float),
         "r": np.eye(3).ravel(),
         "p": np.zeros(12),
-        "binning_x": 0,
-        "binning_y": 0,
+        "binning_x": binning,
+        "binning_y": binning,
+        "region": region,
     }
     return INFO, fields
 

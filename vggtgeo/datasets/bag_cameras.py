@@ -1,6 +1,8 @@
 """The camera of a bag's images, by its messages of `sensor_msgs/CameraInfo`.
 
-A bag may hold those of several cameras, and some that were never calibrated: what is not used is told, and why.
+A bag may hold those of several cameras, and some that were never calibrated: what is not used is told, and why. Images
+of a part of the sensor, and those whose pixels were put together, have the matrix that ROS gives them
+(`image_geometry`, `PinholeCameraModel`): shifted by the region's corner, then divided by the pixels that make one.
 """
 
 import warnings
@@ -33,12 +35,11 @@ def camera_of(path: Path, infos: Mapping[str, Sequence[Any]], colour: str, size:
         if not messages:
             continue
         first = messages[0]
-        if (first.width, first.height) != size:
+        sizes = {(first.width, first.height), _size(first)}
+        if size not in sizes:
             if beside:
-                _warn(
-                    f"{where} has a camera for {first.width} x {first.height} pixels; the images are {size[0]} x "
-                    f"{size[1]}: not used"
-                )
+                found = " or ".join(f"{width} x {height}" for width, height in sorted(sizes))
+                _warn(f"{where} has a camera for {found} pixels; the images are {size[0]} x {size[1]}: not used")
             continue
         if not _matrix(first).any():  # as the message's definition has it
             if beside:
@@ -46,7 +47,13 @@ def camera_of(path: Path, infos: Mapping[str, Sequence[Any]], colour: str, size:
             continue
         if not beside:
             _warn(f"{where} is taken for the camera of `{colour}`; give --intrinsics fx,fy,cx,cy if it is another's")
-        camera = _camera(where, first, size)
+        whole = (first.width, first.height) == size
+        if whole and (_size(first) != size or _shift(first).any()):
+            _warn(
+                f"{where} tells of a part of the sensor, or of pixels that were put together, and the images are as "
+                "large as its whole: used as it is for the whole"
+            )
+        camera = _camera(where, first, _matrix(first) if whole else _of_images(first), size)
         warn_of_other_size(where, camera)
         focal = np.array([_matrix(message)[0, 0] for message in messages])
         if np.abs(focal - focal[0]).max() > _STEADY * abs(focal[0]):
@@ -62,12 +69,35 @@ def _matrix(message: Any) -> np.ndarray:
     return np.reshape(message.K if hasattr(message, "K") else message.k, (3, 3))
 
 
-def _camera(where: str, message: Any, size: tuple[int, int]) -> Camera:
+def _binning(message: Any) -> np.ndarray:
+    return np.maximum([message.binning_x, message.binning_y], 1)  # 0 is 1, as the message's definition has it
+
+
+def _shift(message: Any) -> np.ndarray:
+    return np.array([message.roi.x_offset, message.roi.y_offset])
+
+
+def _size(message: Any) -> tuple[int, int]:
+    """Of the images that a message speaks of: a region of zeros is all of the sensor."""
+    region = np.array([message.roi.width or message.width, message.roi.height or message.height])
+    width, height = (region // _binning(message)).tolist()
+    return width, height
+
+
+def _of_images(message: Any) -> np.ndarray:
+    """The matrix of the images, of that of the whole sensor."""
+    matrix = np.array(_matrix(message), float)
+    matrix[:2, 2] -= _shift(message)
+    matrix[:2] /= _binning(message)[:, None]
+    return matrix
+
+
+def _camera(where: str, message: Any, matrix: np.ndarray, size: tuple[int, int]) -> Camera:
     lens = np.asarray(message.D if hasattr(message, "D") else message.d, float).tolist()
     fisheye = is_fisheye(f"{where}: `distortion_model`", message.distortion_model)
     lens = _without_zeros(lens, (_FISHEYE,) if fisheye else _LENSES)
     try:
-        return Camera(pinhole_of(_matrix(message)), *size, check_distortion(lens), fisheye=fisheye)
+        return Camera(pinhole_of(matrix), *size, check_distortion(lens), fisheye=fisheye)
     except InputError as error:
         raise InputError(f"{where}: {error}; record the right one, or give the images without it") from None
 

@@ -16,7 +16,8 @@ from typing import Any, Self
 import numpy as np
 
 from vggtgeo.datasets.bag_cameras import CAMERA_INFO, camera_of
-from vggtgeo.datasets.bag_topics import IMAGES, Unread, chosen_topics, image_of, metres_of, told, truth_topic
+from vggtgeo.datasets.bag_images import Unread, image_of, metres_of
+from vggtgeo.datasets.bag_topics import IMAGES, chosen_topics, told, truth_topic
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_orientation import not_turned
 from vggtgeo.datasets.intrinsics import guess_with_warning
@@ -24,10 +25,13 @@ from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.models.extras import install_hint
 
 _DELAY = 0.02
 """Seconds between an image and its depth."""
+_SECOND = 1_000_000_000
+"""Nanoseconds."""
 _BEGINS = b"#ROSBAG V"
 METADATA = "metadata.yaml"
 ROS_2 = (".db3", ".mcap")
@@ -39,12 +43,18 @@ def is_bag(path: Path) -> bool:
     return path.suffix in (".bag", *ROS_2) or (path / METADATA).is_file()
 
 
-def lacks_metadata(folder: Path) -> str | None:
-    """A sentence about the files of a ROS 2 bag that were copied without the one that tells what they hold; None where
-    there are none such.
+def no_whole_bag(folder: Path) -> str | None:
+    """A sentence about several bags of ROS 1, and one about the files of a ROS 2 bag that were copied without the one
+    that tells what they hold; None where there are none such.
     """
     if not folder.is_dir() or (folder / METADATA).is_file():
         return None
+    bags = sorted(path.name for path in folder.iterdir() if path.suffix == ".bag")
+    if len(bags) > 1:
+        return (
+            f"`{folder}` holds {len(bags)} bags of ROS 1, `{bags[0]}` to `{bags[-1]}`; give one of them; parts of one "
+            "recording can be joined: `rosbags-convert --src` all of them `--dst` a new folder"
+        )
     file = next((path for path in sorted(folder.iterdir()) if path.suffix in ROS_2), None)
     if file is None:
         return None
@@ -78,6 +88,7 @@ class RosBag:
             except InputError as error:
                 raise InputError(f"`{path}` {error}{_others(topics)}") from None
             poses = truth_topic(topics)
+            _tell_of_parts(path)
             if text := told(chosen, poses):
                 _warn(f"`{path}`: {text}", NoteWarning)
             times, (width, height) = _times_and_size(reader, path, chosen.colour)
@@ -158,6 +169,20 @@ class RosBag:
         return depth
 
 
+def _tell_of_parts(path: Path) -> None:
+    """An InputWarning for files of a ROS 2 bag that its metadata does not name: they are not read."""
+    folder = path.parent if path.suffix in ROS_2 else path
+    if not (folder / METADATA).is_file():
+        return
+    text = whole_text(folder / METADATA)
+    unnamed = sorted(file.name for file in folder.iterdir() if file.suffix in ROS_2 and file.name not in text)
+    if unnamed:
+        _warn(
+            f"`{folder}` holds {len(unnamed)} files that its `{METADATA}` does not name, `{unnamed[0]}` first: not "
+            f"read; `ros2 bag reindex {folder}` takes them in"
+        )
+
+
 def _place(path: Path, topic: str, number: int) -> Path:
     """How messages call one of a bag."""
     return Path(f"{path}, {topic}, {number}")
@@ -165,9 +190,10 @@ def _place(path: Path, topic: str, number: int) -> Path:
 
 def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, ...], tuple[int, int]]:
     """Of the images: all times, and width and height of the first that can be read."""
-    times, size, wrong = [], None, ""
+    times, size, wrong, over = [], None, "", 0
     for number, (time, message) in enumerate(_messages(reader, topic)):
         times.append(time)
+        over += not isinstance(message, Unread) and message.header.stamp.nanosec >= _SECOND
         if size is None:
             try:
                 height, width = image_of(message, _place(path, topic, number)).image.shape[:2]
@@ -176,6 +202,14 @@ def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, .
                 wrong = wrong or str(error)
     if size is None:
         raise InputError(f"none of the {len(times)} images of `{path}` can be read; the first: {wrong}")
+    if len(times) < (declared := reader.topics[topic].msgcount):
+        text = f"`{path}` declares {declared} images of `{topic}` and has {len(times)}; the rest is lost"
+        _warn(text, LeftOutWarning)
+    if over:
+        _warn(
+            f"`{path}`: {over} of {len(times)} images of `{topic}` have a time of {_SECOND} nanoseconds or more beside "
+            "its seconds; added to them"
+        )
     return tuple(times), size
 
 
@@ -239,7 +273,7 @@ def _reader(path: Path) -> Iterator[Any]:
             if not file.read(len(_BEGINS)) == _BEGINS:
                 raise InputError(f"`{path}` is no bag of ROS: it does not begin with `{_BEGINS.decode()}`")
     place = path.parent if path.suffix in ROS_2 else path
-    if reason := lacks_metadata(place):
+    if reason := no_whole_bag(place):
         raise InputError(reason)
     try:
         with AnyReader([place], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -247,7 +281,8 @@ def _reader(path: Path) -> Iterator[Any]:
     except InputError:
         raise
     except Exception as error:  # noqa: BLE001 - whatever a damaged file makes the package raise
-        raise InputError(f"`{path}` cannot be read as a bag of ROS: {error}") from None
+        again = f"; copy all of it again, or see whether `ros2 bag reindex {place}` mends it" if place.is_dir() else ""
+        raise InputError(f"`{path}` cannot be read as a bag of ROS: {error}{again}") from None
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:

@@ -82,14 +82,19 @@ def image_in(content: bytes, path: Path, least_bits: int = 8) -> ImageFile:
     image = decoded(content, path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image.dtype not in (np.uint8, np.uint16) or image.ndim != 3:
         raise InputError(f"`{path}`: found {image.dtype} of shape {image.shape}; images must have 8 or 16 bits")
-    bits = 8
-    if image.dtype == np.uint16:
-        needed = max(int(image.max()).bit_length(), least_bits)
-        bits = next(known for known in BITS if known >= needed)
-        image = (image >> (bits - 8)).astype(np.uint8)
-    elif 0 < (white := declared_white(content)) < WHITE:  # OpenCV scales those of text files alone
+    image, bits = eight_bits(image, least_bits)
+    if bits == BITS[0] and 0 < (white := declared_white(content)) < WHITE:  # OpenCV scales those of text files alone
         image = cv2.convertScaleAbs(image, alpha=WHITE / white)
     return ImageFile(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), bits, orientation(content))
+
+
+def eight_bits(image: np.ndarray, least_bits: int = 8) -> tuple[np.ndarray, int]:
+    """An image of 8 or 16 bits as uint8, and how many bits its values need, one of `BITS`; see `read_image_file`."""
+    if image.dtype == np.uint8:
+        return image, BITS[0]
+    needed = max(int(image.max(initial=0)).bit_length(), least_bits)
+    bits = next(known for known in BITS if known >= needed)
+    return (image >> (bits - 8)).astype(np.uint8), bits
 
 
 def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:

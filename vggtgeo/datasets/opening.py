@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
-from vggtgeo.datasets.bags import RosBag, is_bag, lacks_metadata
+from vggtgeo.datasets.bags import RosBag, is_bag, no_whole_bag
 from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim
@@ -134,7 +134,7 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
         if reader.matches(place):
             return reader.open(place)
     raise InputError(
-        lacks_metadata(place)
+        no_whole_bag(place)
         or reason_not_read(place)
         or f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
         "a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of `vggtgeo data list`, or a folder "

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import os
 import re
 import time
 from collections import Counter
@@ -107,7 +108,14 @@ class RunSoFar:
         return [*(notice.warning() for notice in self.notices), *fresh]
 
     def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
-        """Counts on from those of before."""
+        """Counts on from those of before; InputError where they are of other networks, or no counts."""
+        known = {role: len(dataclasses.fields(counts)) for role, counts in refusals.items()}
+        found = {role: len(counts) for role, counts in self.refused.items()}
+        if found != known or min((value for counts in self.refused.values() for value in counts), default=0) < 0:
+            raise InputError(
+                f"the run that goes on kept {dict(self.refused)} of what networks refused; expected "
+                f"counts of {', '.join(known) or 'none'}: begin anew with `--no-resume`"
+            )
         for role, counts in self.refused.items():
             for entry, value in zip(dataclasses.fields(Refusals), counts, strict=True):
                 setattr(refusals[role], entry.name, value)
@@ -140,9 +148,11 @@ def resumed(asked: Checkpoints | None, wanted: Mapping[str, str]) -> RunSoFar | 
     """The run to go on with; None where nothing is asked, or there is none.
 
     Raises:
-        InputError: the file is damaged, or of a run of something else.
+        InputError: the file is damaged, or of a run of something else; or the path is that of no file.
 
     """
+    if asked is not None:
+        check_place(asked.path)
     if asked is None or not asked.resume or not asked.path.is_file():
         return None
     known = _facts(asked.path)["identity"]
@@ -163,6 +173,14 @@ def resumed(asked: Checkpoints | None, wanted: Mapping[str, str]) -> RunSoFar | 
     except InputError as error:
         raise InputError(f"{error}; begin anew with `--no-resume`") from None
     return found
+
+
+def check_place(path: Path) -> None:
+    """InputError for a path at which something lies that is no file: no state could be kept there."""
+    if os.path.lexists(path) and not path.is_file():
+        found = "a link that leads nowhere" if path.is_symlink() and not path.exists() else "no file"
+        found = "a folder" if path.is_dir() else "a pipe" if path.is_fifo() else found
+        raise InputError(f"`{path}` is {found}, and a run keeps its state there, in a file: take it away")
 
 
 def _facts(path: Path) -> dict[str, Any]:

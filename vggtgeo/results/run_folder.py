@@ -29,7 +29,7 @@ from vggtgeo.io.files import whole_path, write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.io.text_files import whole_text
-from vggtgeo.results.checkpoints import frames_kept
+from vggtgeo.results.checkpoints import check_place, frames_kept
 from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED
 
 NAMES = (
@@ -259,6 +259,7 @@ def _refuse_strange(stage: Path) -> None:
         return
     if not stage.is_dir():
         raise InputError(f"`{stage}` is a file, and a run makes a folder of this name; give another folder with `-o`")
+    check_place(stage / CHECKPOINT)
     for path in sorted(stage.iterdir()):
         if not (_is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, _NOTE)):
             raise InputError(

@@ -7,14 +7,15 @@ colours serve a coarse alignment and the map), depth and its deviation as PNG, w
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Self
 
 import cv2
 import numpy as np
 
+from vggtgeo.datasets.image_files import decoded
 from vggtgeo.io.errors import InputError
 
 JPEG = (".jpg", (cv2.IMWRITE_JPEG_QUALITY, 95))
@@ -43,10 +44,17 @@ class CompressedImage:
     def array(self) -> np.ndarray:
         """The image again."""
         # Colours are as they were given: encoded and decoded without a change of their order.
-        image = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_UNCHANGED) if self.data else None
-        if image is None or image.nbytes != math.prod(self.shape) * self.dtype.itemsize:
-            raise InputError("an image of a keyframe is damaged; make the map, or the run, that it was read from again")
+        image = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_UNCHANGED)
         return image.view(self.dtype).reshape(self.shape)
+
+    def check(self, name: str) -> None:
+        """ValueError where what was read from a file is no such image. name: for that."""
+        try:
+            image = decoded(self.data, Path(name), cv2.IMREAD_UNCHANGED)
+        except InputError as error:
+            raise ValueError(str(error).replace("`", "")) from None
+        if image.shape != self.shape or image.dtype.itemsize != self.dtype.itemsize:
+            raise ValueError(f"{name} is an image of {image.dtype} {image.shape}, expected {self.dtype} {self.shape}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,9 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.covisibility import Pair
 from vggtgeo.slam.factors import Factor, MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.keyframe import Keyframe, Slots
+from vggtgeo.slam.keyframe_images import CompressedImage
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.threads import map_in_threads
 
 _BEYOND_ALL_PIXELS = 1e6
 _BEYOND_ALL_LENGTHS = 1e15
@@ -28,8 +30,7 @@ def check_state(slam: Slam) -> None:
     if [keyframe.number for keyframe in slam.keyframes] != list(range(count)):
         raise ValueError("its keyframes are not numbered one after the other")
     _check_camera(slam)
-    for keyframe in slam.keyframes:
-        _check_keyframe(keyframe)
+    map_in_threads(_check_keyframe, slam.keyframes)  # each of its images is decoded
     for factor in slam.factors:
         _check_factor(factor)
     for one, other in pairwise(slam.keyframes):
@@ -82,6 +83,9 @@ def _check_keyframe(keyframe: Keyframe) -> None:
     ):
         found = ", ".join(f"{part.dtype} {part.shape}" for part in parts)
         raise ValueError(f"the images of keyframe {keyframe.number} are {found}, expected four of one size")
+    for name, part in zip(("colour", "depth", "depth_sigma", "depth_confidence"), parts, strict=True):
+        if isinstance(part, CompressedImage):
+            part.check(f"the {name} of keyframe {keyframe.number}")
     _check_features(keyframe.features, (height, width))
     _check_slots("points", keyframe.points, len(keyframe.features))
     segments = keyframe.lines.segments

@@ -1,0 +1,171 @@
+"""What a message of a bag holds: an image in colour or grey, or depth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from vggtgeo.datasets.image_files import ImageFile, decoded, eight_bits, image_in, metres_of_floats
+from vggtgeo.io.errors import InputError
+
+
+class Coding(NamedTuple):
+    """How an encoding of `sensor_msgs/Image` holds a pixel. channels: numbers a pixel. change: OpenCV's, to RGB, None
+    for none. bits: 8 or 16.
+    """
+
+    channels: int
+    change: int | None
+    bits: int = 8
+
+
+DEPTH = {"16UC1": (np.uint16, 1e-3), "mono16": (np.uint16, 1e-3), "32FC1": (np.float32, 1.0)}
+"""Type, and metres a unit."""
+GREY = ("mono8", "8UC1", "mono16", "16UC1")
+_ORDERS: dict[str, tuple[int, int | None]] = {
+    "rgb": (3, None),
+    "bgr": (3, cv2.COLOR_BGR2RGB),
+    "rgba": (4, cv2.COLOR_RGBA2RGB),
+    "bgra": (4, cv2.COLOR_BGRA2RGB),
+    "mono": (1, cv2.COLOR_GRAY2RGB),
+    # ROS names the first two pixels of the first two rows, OpenCV those one further.
+    "bayer_rggb": (1, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr": (1, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg": (1, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg": (1, cv2.COLOR_BayerGB2RGB),
+}
+_PLAIN = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
+"""Encodings that tell no order of colours: OpenCV's."""
+COLOUR: dict[str, Coding] = {
+    **{f"{order}{bits}": Coding(*coding, bits) for bits in (8, 16) for order, coding in _ORDERS.items()},
+    **{f"{bits}UC{count}": Coding(count, change, bits) for bits in (8, 16) for count, change in _PLAIN.items()},
+    "yuv422": Coding(2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": Coding(2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": Coding(2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": Coding(2, cv2.COLOR_YUV2RGB_YUY2),
+    "nv12": Coding(1, cv2.COLOR_YUV2RGB_NV12),
+    "nv21": Coding(1, cv2.COLOR_YUV2RGB_NV21),
+}
+_OF_PAIRS = 2
+"""Numbers a pixel of encodings that give each pair of pixels one colour."""
+_OF_SQUARES = ("nv12", "nv21")
+"""Encodings that give each two by two pixels one colour, in rows behind those of the grey values: half as many."""
+_HEAD = 12
+"""Bytes before the PNG of a `compressedDepth`: a format, and two numbers that floats were coded by."""
+_PNG = b"\x89PNG"
+
+
+@dataclass(frozen=True)
+class Unread:
+    """A message that is damaged. reason: why it cannot be read."""
+
+    reason: str
+
+
+def encoding_of(message: Any) -> str:
+    """The name of an image's encoding, or of what it was before it was compressed."""
+    return str(message.encoding if hasattr(message, "encoding") else message.format.split(";")[0].strip())
+
+
+def kind_of(message: Any) -> str:
+    """What kind of image a message holds, in words."""
+    if message is None:
+        return "no message"
+    if isinstance(message, Unread):
+        return "damaged"
+    return str(getattr(message, "encoding", "") or getattr(message, "format", ""))[:60] or "of no stated kind"
+
+
+def image_of(message: Any, place: Path, least_bits: int = 8) -> ImageFile:
+    """The image in a message, see `read_image_file`; InputError where there is none. place: for that."""
+    if isinstance(message, Unread):
+        raise InputError(f"`{place}` is damaged: {message.reason}")
+    if not hasattr(message, "encoding"):
+        return _compressed_image(message, place, least_bits)
+    if message.encoding not in COLOUR:
+        raise InputError(f"`{place}`: its encoding is {message.encoding}; known are {', '.join(COLOUR)}")
+    coding = COLOUR[message.encoding]
+    odd = coding.channels == _OF_PAIRS and message.width % 2
+    if odd or (message.encoding in _OF_SQUARES and (message.width % 2 or message.height % 2)):
+        raise InputError(
+            f"`{place}` is {message.width} x {message.height} pixels; expected even numbers of {message.encoding}"
+        )
+    rows = message.height * 3 // 2 if message.encoding in _OF_SQUARES else message.height
+    kind = np.dtype(np.uint8 if coding.bits == 8 else np.uint16)
+    image = _pixels(message, place, kind.newbyteorder(">" if message.is_bigendian else "<"), coding.channels, rows)
+    return _in_colour(image, coding, least_bits)
+
+
+def _in_colour(codes: np.ndarray, coding: Coding, least_bits: int) -> ImageFile:
+    image, bits = eight_bits(codes, least_bits)
+    return ImageFile(image if coding.change is None else np.asarray(cv2.cvtColor(image, coding.change)), bits, 1)
+
+
+def _compressed_image(message: Any, place: Path, least_bits: int) -> ImageFile:
+    kind = encoding_of(message)
+    try:
+        read = image_in(np.asarray(message.data, np.uint8).tobytes(), place, least_bits)
+    except InputError as error:
+        raise InputError(f"{error} (its format: {kind_of(message)}; expected JPEG or PNG)") from None
+    if kind.startswith("bayer_") and kind in COLOUR and not np.ptp(read.image, axis=2).any():  # the mosaic itself
+        mosaic = np.ascontiguousarray(read.image[..., 0])
+        return ImageFile(np.asarray(cv2.cvtColor(mosaic, COLOUR[kind].change or 0)), read.bits, read.orientation)
+    return read
+
+
+def metres_of(message: Any, place: Path) -> np.ndarray:
+    """Depth, float32 [H, W], NaN for none; InputError where it cannot be decoded. place: of the message, for that."""
+    if isinstance(message, Unread):
+        raise InputError(f"`{place}` is damaged: {message.reason}")
+    return _raw_metres(message, place) if hasattr(message, "encoding") else _compressed_metres(message, place)
+
+
+def _pixels(message: Any, place: Path, kind: np.dtype[Any], channels: int, rows: int) -> np.ndarray:
+    """What a message holds, [rows, W, channels], if it holds what it says: cameras' drivers pad rows, and no more."""
+    data, size = np.asarray(message.data, np.uint8), f"{message.width} x {message.height} pixels"
+    row = message.width * channels * kind.itemsize
+    if not row or not message.height or message.step < row or message.step * rows != len(data):
+        raise InputError(
+            f"`{place}` has {len(data)} bytes, and declares {size} of {message.encoding}, {message.step} bytes a row: "
+            "they do not belong together"
+        )
+    inside = np.ascontiguousarray(data.reshape(rows, message.step)[:, :row])
+    return inside.view(kind).reshape(rows, message.width, channels)
+
+
+def _raw_metres(message: Any, place: Path) -> np.ndarray:
+    if message.encoding not in DEPTH:
+        raise InputError(f"`{place}`: its encoding is {message.encoding}; depth has {', '.join(DEPTH)}")
+    kind, unit = DEPTH[message.encoding]
+    order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    codes = _pixels(message, place, order, 1, message.height)[..., 0]
+    return metres_of_floats(codes) if order.kind == "f" else _of_codes(codes, unit)
+
+
+def _of_codes(codes: np.ndarray, unit: float) -> np.ndarray:
+    return np.where(codes > 0, codes * np.float32(unit), np.float32(np.nan)).astype(np.float32)
+
+
+def _compressed_metres(message: Any, place: Path) -> np.ndarray:
+    """A PNG of 16 bits, millimetres, with or without the head of `compressedDepth`; or, of floats, inverse depth:
+    depth = a / (code - b), with the two numbers of the head (package compressed_depth_image_transport).
+    """
+    content = np.asarray(message.data, np.uint8).tobytes()
+    headed = not content.startswith(_PNG)
+    floats = encoding_of(message) == "32FC1"
+    wrong = f"`{place}`: its depth ({kind_of(message)}) cannot be decoded; expected a PNG of 16 bits, not RVL"
+    if floats and not headed:
+        raise InputError(f"{wrong}, behind the two numbers that floats were coded by")
+    try:
+        codes = decoded(content[_HEAD if headed else 0 :], place, cv2.IMREAD_UNCHANGED)
+    except InputError as error:
+        raise InputError(f"{wrong} ({error})") from None
+    if codes.dtype != np.uint16 or codes.ndim != 2:
+        raise InputError(f"{wrong} (found {codes.dtype} of shape {codes.shape})")
+    if floats:
+        a, b = np.frombuffer(content[4:_HEAD], "<f4").astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return metres_of_floats(np.where(codes > 0, a / (codes - b), np.float32(np.nan)))
+    return _of_codes(codes, 1e-3)
