@@ -152,6 +152,23 @@ def folder_of_run(summary: str, unfinished: bool = False) -> Any:
     return make
 
 
+def run_that_counts(poses: int) -> Any:
+    """A run's folder of sixty poses, whose summary counts others."""
+
+    def make(folder: Path) -> Path:
+        counted = json.loads(summary_of("good")) | {"pieces": [{"poses": poses, "keyframes": 60}]}
+        for name in ("trajectory.txt", "keyframes.txt"):
+            bad.walk(folder / name, 0)
+        return folder_of_run(json.dumps(counted))(folder)  # type: ignore[no-any-return]
+
+    return make
+
+
+def to_tum(made: Path) -> Any:
+    """`vggtgeo export` of its poses."""
+    return ["export", made, "--to", "tum", "-o", made / "tum"]
+
+
 def backwards(path: Path) -> None:
     """A trajectory whose last pose comes first."""
     path.write_text("\n".join(bad.walk(path, 0).read_text().splitlines()[::-1]))
@@ -534,6 +551,8 @@ RESULTS = rows(
         ("a summary that lacks the intrinsics", folder_of_run(summary_of("good")), {}),
         ("ten thousand brackets", folder_of_run("[" * 10_000), {}),
         ("a run that was killed", folder_of_run("{}", unfinished=True), {}),
+        ("a trajectory that lost its last lines", run_that_counts(90), {"argv": to_tum}),
+        ("a trajectory with more poses than the run had", run_that_counts(50), {"argv": to_tum}),
     ],
     call=Result.load,
 )

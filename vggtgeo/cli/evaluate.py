@@ -73,12 +73,14 @@ def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
     that are written without any.
     """
     from vggtgeo.datasets.trajectory_files import load_trajectory
+    from vggtgeo.results.summary_file import check_count
     from vggtgeo.results.unfinished import check_finished
 
     unfinished = check_finished(path)
     if unfinished:
         warnings.warn(unfinished, InputWarning, stacklevel=2)
-    return load_trajectory(path / "trajectory.txt" if path.is_dir() else path, truth)
+    file = path / "trajectory.txt" if path.is_dir() else path
+    return check_count(file, load_trajectory(file, truth))
 
 
 def load_scale(path: Path) -> str | None:

@@ -12,6 +12,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, path_of
 from vggtgeo.results.result import Result
+from vggtgeo.results.summary_file import check_count
 
 
 def read(path: str | os.PathLike[str]) -> Result | Sequence:
@@ -67,7 +68,8 @@ def _estimate(given: Any, truth: Trajectory) -> Trajectory:
     if isinstance(given, Result):
         return given.trajectory
     place = path_of("estimate", given)
-    return load_trajectory(place / "trajectory.txt" if place.is_dir() else place, truth)
+    file = place / "trajectory.txt" if place.is_dir() else place
+    return check_count(file, load_trajectory(file, truth))
 
 
 def _truth(given: Any) -> Trajectory:

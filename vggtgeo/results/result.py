@@ -37,7 +37,7 @@ from vggtgeo.results.files import (
 from vggtgeo.results.run_folder import RunFolder, taken_beside
 from vggtgeo.results.scene import write_scene
 from vggtgeo.results.summary import compare, summarise, with_writing
-from vggtgeo.results.summary_file import read_summary, unusable
+from vggtgeo.results.summary_file import poses_in, read_summary, unusable
 from vggtgeo.results.unfinished import check_finished
 from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import settled
@@ -163,8 +163,8 @@ class Result:
         except (KeyError, TypeError, ValueError) as error:
             raise unusable(place, error) from None
         return cls(
-            Trajectory.load_tum(place / "trajectory.txt"),
-            Trajectory.load_tum(place / "keyframes.txt"),
+            poses_in(place, "trajectory.txt"),
+            poses_in(place, "keyframes.txt"),
             PointCloud.load_ply(place / "map.ply"),
             (fx, fy, cx, cy),
             verdict.metric,

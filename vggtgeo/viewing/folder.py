@@ -11,10 +11,10 @@ import numpy as np
 
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
+from vggtgeo.results.summary_file import poses_in
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import STAND_IN
 
@@ -54,10 +54,10 @@ def log_folder(stream: Any, folder: Path) -> None:
     import rerun as rr
 
     check_folder(folder)
-    trajectory = Trajectory.load_tum(folder / "trajectory.txt")
+    trajectory = poses_in(folder, "trajectory.txt")
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.set_time("frame", sequence=0)
-    entities.log_path(stream, trajectory, Trajectory.load_tum(folder / "keyframes.txt"))
+    entities.log_path(stream, trajectory, poses_in(folder, "keyframes.txt"))
     entities.log_map(stream, PointCloud.load_ply(folder / "map.ply"))
     if (folder / "mesh.ply").is_file():
         entities.log_mesh(stream, Mesh.load_ply(folder / "mesh.ply"))
