@@ -23,7 +23,9 @@ from bad_row import Row, nothing
 from test_problem_file import SCENE
 
 import vggtgeo as vg
+from vggtgeo import evaluation
 from vggtgeo.datasets.in_memory import frame_stream
+from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.slam.run import in_order
@@ -102,6 +104,15 @@ def save_cloud(folder: Path, size: float) -> None:
     """A cloud of one point, written."""
     PointCloud(np.full((1, 3), size), np.zeros((1, 3), np.uint8)).save_ply(folder / "cloud.ply")
 
+
+def same_place(count: int, truth: Any) -> Any:
+    """Points at one place, against themselves and then against others."""
+    evaluation.cloud_error(np.zeros((count, 3)), np.zeros((count, 3)))
+    return evaluation.cloud_error(np.zeros((count, 3)), truth)
+
+
+CLOUD = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+TRIANGLE = np.eye(3), np.array([[0, 1, 2]])
 
 CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`pack`: poses of complex numbers", pack(poses=SCENE.start_poses.astype(complex))),
@@ -214,6 +225,27 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a term with a kernel of width 0", with_pair(lambda p, s: replace(p.points, kernel=vg.Huber(0.0)))),
     ("a term with a kernel's name", with_pair(lambda p, s: replace(p.points, kernel="huber"))),
     ("`Graduation`: a width below zero", lambda _: vg.Graduation((4.0, -2.0))),
+    ("`cloud_error` of lists", lambda _: evaluation.cloud_error([[0, 0]], [[0, 0, 0]])),
+    ("`cloud_error` of 200,000 equal points and none", lambda _: same_place(200_000, np.zeros((0, 3)))),
+    ("`cloud_error` of points at 1e200", lambda _: evaluation.cloud_error(np.full((1, 3), 1e200), np.zeros((1, 3)))),
+    ("`cloud_error` of complex numbers", lambda _: evaluation.cloud_error(np.ones((1, 3)) * 1j, np.zeros((1, 3)))),
+    ("`cloud_error` of a `PointCloud`", lambda _: evaluation.cloud_error(CLOUD, CLOUD.points)),
+    ("`cloud_error`: a threshold that is a text", lambda _: evaluation.cloud_error(EYE[:, :3], EYE[:, :3], "5 cm")),
+    ("`mesh_error` of names of files", lambda _: evaluation.mesh_error("a.ply", "b.ply")),
+    ("`mesh_error`: a threshold of a micrometre", lambda _: evaluation.mesh_error(TRIANGLE, TRIANGLE, 1e-6)),
+    ("`surface_points` of faces in floats", lambda _: evaluation.surface_points((EYE[:, :3], np.zeros((1, 3))), 0.1)),
+    ("`depth_error`: a mask of whole numbers", lambda _: evaluation.depth_error(DEPTH, DEPTH, mask=DEPTH.astype(int))),
+    ("`depth_error` of nothing", lambda _: evaluation.depth_error(None, DEPTH)),
+    ("`depth_of_cloud` of a camera's numbers", lambda _: evaluation.depth_of_cloud(EYE[:, :3], EYE, (50, 50, 32, 24))),
+    ("`focal_error` of two numbers", lambda _: evaluation.focal_error((50, 50), (50, 50, 32, 24))),
+    ("`scale_error` of a text", lambda _: evaluation.scale_error("1")),
+    ("`umeyama` of points at 1e200", lambda _: evaluation.umeyama(np.full((4, 3), 1e200), np.zeros((4, 3)))),
+    ("`associate` of nothing", lambda _: evaluation.associate(None, None)),
+    ("`nearest_in_time` of times out of order", lambda _: evaluation.nearest_in_time([0.0], [1.0, 0.0], 0.1)),
+    ("`consistency` of a number", lambda _: evaluation.consistency(1.0, 1.0)),
+    ("rows of a trajectory that are not there", lambda _: trajectory([0.0], [EYE])(_).select([3])),
+    ("a `PointCloud` of texts", lambda _: PointCloud("a", "b")),
+    ("a `Mesh` whose colours are floats", lambda _: Mesh(EYE[:3, :3], np.zeros((1, 3), int), EYE[:3, :3], EYE[:3, :3])),
     ("`Graduation`: a number in place of widths", lambda _: vg.Graduation(-1)),
 )
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vggtgeo.evaluation.alignment import VERTICAL, Alignment, Similarity, align
+from vggtgeo.evaluation.association import check_trajectories
 from vggtgeo.evaluation.statistics import ErrorStatistics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -37,6 +38,7 @@ def absolute_error(
 
     InputError where the two differ in length.
     """
+    check_trajectories(estimate, truth)
     if len(estimate) != len(truth):
         raise InputError(
             f"`estimate` has {len(estimate)} poses, `truth` {len(truth)}; match them first with `associate`"

@@ -10,7 +10,8 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.evaluation.association import check_trajectories
+from vggtgeo.geometry.trajectory import FARTHEST, Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import real_numbers
 
@@ -55,7 +56,7 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], 
     the points of either set all coincide (a still camera) the scale means nothing and is 1. Source: S.
     Umeyama, IEEE PAMI 13(4), 1991. InputError for no points, other shapes, or NaN.
     """
-    _check(source, target)
+    source, target = _check(source, target)
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     centred = source - source_mean
     u, d, vt = np.linalg.svd((target - target_mean).T @ centred / len(source))
@@ -77,7 +78,7 @@ def heading(
     constant, `A = sum t . s - (t . a)(s . a)`, `B = sum t . (a x s)`, so `theta = atan2(B, A)`. InputError as
     `umeyama`, or for a vertical without direction.
     """
-    _check(source, target)
+    source, target = _check(source, target)
     given = real_numbers("vertical", vertical)
     length = float(np.linalg.norm(given))
     if given.shape != (3,) or not (np.isfinite(length) and length > 0):
@@ -106,6 +107,7 @@ def align(
     """
     if kind not in ALIGNMENTS:
         raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(ALIGNMENTS)}")
+    check_trajectories(estimate, truth)
     _check(estimate.positions, truth.positions)
     if kind == "none":
         return Similarity(np.eye(3), np.zeros(3))
@@ -114,10 +116,15 @@ def align(
     return umeyama(estimate.positions, truth.positions, kind == "sim3")
 
 
-def _check(source: np.ndarray, target: np.ndarray) -> None:
+def _check(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    source, target = real_numbers("source", source), real_numbers("target", target)
     if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) == 0:
         raise InputError(
             f"`source` has shape {source.shape}, `target` {target.shape}; both must be [n, 3], n at least 1"
         )
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise InputError("`source` or `target` has a NaN or an infinity; leave such points out")
+    farthest = max(np.abs(source).max(), np.abs(target).max())
+    if farthest > FARTHEST:
+        raise InputError(f"`source` or `target` has coordinates up to {farthest:.3g} m, which are no places")
+    return source, target

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real
+from vggtgeo.io.given import check_kind, check_real, real_array
 
 MAX_TIME_DIFFERENCE = 0.01
 """Seconds between two poses that may still be compared; evo's default."""
@@ -20,6 +20,10 @@ def nearest_in_time(
     Returns the rows in `times` that have a partner and, beside each, the row in `others`. One row of `others`
     may serve several of `times`.
     """
+    times, others = real_array("times", times, (None,)), real_array("others", others, (None,))
+    check_real("max_dt", max_dt)
+    if (np.diff(others) < 0).any():
+        raise InputError("`others` has times that do not increase; sort them")
     if len(others) == 0 or len(times) == 0:
         return np.zeros(0, int), np.zeros(0, int)
     after = np.clip(np.searchsorted(others, times, side="right"), 0, len(others) - 1)
@@ -39,6 +43,7 @@ def associate(
     those of the shorter, so that they name the pairs. InputError where `max_dt` is negative or nothing
     matches.
     """
+    check_trajectories(estimate, truth)
     check_real("max_dt", max_dt)
     if not max_dt >= 0:
         raise InputError(f"`max_dt` is {max_dt}; it must be at least 0 seconds")
@@ -51,6 +56,12 @@ def associate(
     if len(times) == 0:
         raise InputError(f"no pose of the two trajectories matches within {max_dt:g} s: {_spans(estimate, truth)}")
     return Trajectory(times, estimate.poses[estimate_rows]), Trajectory(times, truth.poses[truth_rows])
+
+
+def check_trajectories(estimate: Trajectory, truth: Trajectory) -> None:
+    """InputError unless both are trajectories."""
+    for name, given in (("estimate", estimate), ("truth", truth)):
+        check_kind(name, given, Trajectory, "a `Trajectory`, such as `Trajectory.load_tum` gives")
 
 
 def _spans(estimate: Trajectory, truth: Trajectory) -> str:

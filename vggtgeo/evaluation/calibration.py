@@ -3,6 +3,7 @@
 import math
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_real, real_array
 
 
 def focal_error(estimated: tuple[float, float, float, float], true: tuple[float, float, float, float]) -> float:
@@ -10,7 +11,8 @@ def focal_error(estimated: tuple[float, float, float, float], true: tuple[float,
 
     Both are fx, fy, cx, cy in pixels. InputError where a focal length is not positive.
     """
-    for name, values in (("estimated", estimated), ("true", true)):
+    for name, given in (("estimated", estimated), ("true", true)):
+        values = real_array(name, given, (4,))
         if not (math.isfinite(values[0] * values[1]) and min(values[:2]) > 0):
             raise InputError(f"`{name}` has focal lengths {values[0]} and {values[1]}; both must be positive")
     return 0.5 * (estimated[0] / true[0] + estimated[1] / true[1]) - 1.0
@@ -21,6 +23,7 @@ def scale_error(scale: float) -> float:
 
     An estimate that is 2 % too large has scale 1 / 1.02 and an error of 0.02. InputError where it is not positive.
     """
-    if not (math.isfinite(scale) and scale > 0):
+    check_real("scale", scale, "positive")
+    if not (scale > 0 and math.isfinite(scale) and math.isfinite(1.0 / scale)):
         raise InputError(f"`scale` is {scale}; it must be positive")
     return 1.0 / scale - 1.0

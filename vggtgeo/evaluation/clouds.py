@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from vggtgeo.geometry.trajectory import FARTHEST
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_positive, real_array
 
 
 @dataclass(frozen=True)
@@ -43,15 +45,10 @@ def cloud_error(
 
     InputError for an empty cloud, NaN, other shapes, or a threshold that is not positive.
     """
-    if not threshold > 0:
-        raise InputError(f"`threshold` is {threshold}; it must be positive metres")
-    for name, points in (("estimate", estimate), ("truth", truth)):
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-            raise InputError(f"`{name}` has shape {points.shape}; it must be [n, 3], n at least 1")
-        if not np.isfinite(points).all():
-            raise InputError(f"`{name}` has a NaN or an infinity; leave such points out")
-    to_truth, _ = cKDTree(truth).query(estimate)
-    to_estimate, _ = cKDTree(estimate).query(truth)
+    check_positive("threshold", threshold, "metres")
+    estimate, truth = checked_points("estimate", estimate), checked_points("truth", truth)
+    to_truth, _ = _tree(truth).query(estimate)
+    to_estimate, _ = _tree(estimate).query(truth)
     precision, recall = float((to_truth <= threshold).mean()), float((to_estimate <= threshold).mean())
     total = precision + recall
     return CloudError(
@@ -62,3 +59,21 @@ def cloud_error(
         completeness=float(to_estimate.mean()),
         threshold=threshold,
     )
+
+
+def checked_points(name: str, given: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The points as float64; InputError where there are none, or some are no places."""
+    points = real_array(name, given, (None, 3)).astype(np.float64)
+    if not len(points):
+        raise InputError(f"`{name}` has shape {points.shape}; it must be [n, 3], n at least 1")
+    if not np.isfinite(points).all():
+        raise InputError(f"`{name}` has a NaN or an infinity; leave such points out")
+    if np.abs(points).max() > FARTHEST:
+        raise InputError(f"`{name}` has coordinates up to {np.abs(points).max():.3g} m, which are no places")
+    return points
+
+
+def _tree(points: np.ndarray) -> cKDTree:
+    """Of every place once: a tree cannot part equal points, and each query would look at all of them."""
+    ordered = points[np.lexsort(points.T)]
+    return cKDTree(ordered[np.concatenate([[True], (np.diff(ordered, axis=0) != 0).any(axis=1)])])

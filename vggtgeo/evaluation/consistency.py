@@ -12,10 +12,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, nearest_in_time
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, check_trajectories, nearest_in_time
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_positive, check_real, real_array, real_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,8 @@ def consistency(
 
     InputError for other shapes, no error, NaN, a covariance that is not positive definite, or an impossible level.
     """
+    errors, covariances = real_numbers("errors", errors), real_numbers("covariances", covariances)
+    check_real("level", level)
     if errors.ndim != 2 or not errors.size or covariances.shape != (*errors.shape, errors.shape[1]):
         raise InputError(
             f"`errors` has shape {errors.shape}, `covariances` {covariances.shape}; expected [n, k] and [n, k, k]"
@@ -90,6 +93,10 @@ def pose_consistency(
     that lengths of the estimate are to be multiplied by. Poses whose deviation is zero or NaN are left out; InputError
     where no other is left.
     """
+    check_trajectories(estimate, truth)
+    place_sigma = real_array("place_sigma", place_sigma, (None,))
+    rotation_sigma = real_array("rotation_sigma", rotation_sigma, (None,))
+    check_positive("scale", scale, "factor")
     if not len(estimate) == len(place_sigma) == len(rotation_sigma):
         raise InputError(f"`estimate` has {len(estimate)} poses; expected as many standard deviations")
     rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind, real_array, real_numbers
 from vggtgeo.models import pinhole
 
 
@@ -35,6 +36,10 @@ def depth_error(
 
     InputError where the shapes differ or a valid depth is not positive.
     """
+    depth, truth = real_numbers("depth", depth), real_numbers("truth", truth)
+    mask = None if mask is None else real_numbers("mask", mask)
+    if mask is not None and mask.dtype != np.bool_:
+        raise InputError(f"`mask` holds {mask.dtype}; expected True and False")
     if depth.shape != truth.shape or (mask is not None and mask.shape != truth.shape):
         shapes = f"`depth` has shape {depth.shape}, `truth` {truth.shape}"
         raise InputError(shapes + ("" if mask is None else f", `mask` {mask.shape}") + "; they must be equal")
@@ -65,8 +70,12 @@ def depth_of_cloud(
     `pose` is world -> camera. A pixel takes the nearest of the points that fall on it. A sparse cloud lets
     points of hidden surfaces through: use it with a dense one.
     """
+    check_kind("camera", camera, Camera, "a `Camera`")
     if camera.distorts:
         raise InputError("`camera` has distortion; give `camera.pinhole`, and undistorted depth to compare with")
+    points, pose = real_array("points", points, (None, 3)), real_array("pose", pose, (4, 4))
+    if not (np.isfinite(points).all() and np.isfinite(pose).all()):
+        raise InputError("`points` or `pose` has a NaN or an infinity; leave such points out")
     local = points @ pose[:3, :3].T + pose[:3, 3]
     inside, rows, columns = pinhole.visible(local, camera.intrinsics, (camera.height, camera.width), nearest=0.0)
     depth = np.full((camera.height, camera.width), np.inf)

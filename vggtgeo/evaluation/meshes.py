@@ -1,11 +1,16 @@
 """Points on the surface of a triangle mesh, so that meshes are compared as clouds are."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from vggtgeo.evaluation.clouds import CloudError, cloud_error
+from vggtgeo.evaluation.clouds import CloudError, checked_points, cloud_error
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_positive, check_whole, real_numbers
 
+MOST_POINTS = 50_000_000
+"""On a surface: 1.2 GB, and several times that while they are made."""
 Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices, metres, and the rows of the three corners of each face."""
 
@@ -18,13 +23,18 @@ def surface_points(mesh: Mesh, spacing: float, seed: int = 0) -> Float[np.ndarra
     wrong shapes, a corner that is no vertex, a mesh without area, or a spacing that is not positive.
     """
     vertices, faces = _checked(mesh)
-    if not (np.isfinite(spacing) and spacing > 0):
-        raise InputError(f"`spacing` is {spacing}; it must be positive metres")
+    check_positive("spacing", spacing, "metres")
+    check_whole("seed", seed)
     a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     total = float(areas.sum())
     if not total > 0:
         raise InputError("`mesh` has no face with an area")
+    if total / spacing**2 > MOST_POINTS:
+        raise InputError(
+            f"`spacing` is {spacing:g} m, which makes {total / spacing**2:.3g} points on {total:.3g} square metres; at "
+            f"most {MOST_POINTS} are made: give a larger one, or a larger threshold"
+        )
     rng = np.random.default_rng(seed)
     face = rng.choice(len(faces), max(round(total / spacing**2), 1), p=areas / total)
     s, v = np.sqrt(rng.random((len(face), 1))), rng.random((len(face), 1))
@@ -36,18 +46,21 @@ def mesh_error(estimate: Mesh, truth: Mesh, threshold: float = 0.05, seed: int =
 
     A distance to the nearest point on a surface is then at most a few per cent of the threshold too long.
     """
+    check_positive("threshold", threshold, "metres")
     spacing = threshold / 5
     return cloud_error(surface_points(estimate, spacing, seed), surface_points(truth, spacing, seed + 1), threshold)
 
 
-def _checked(mesh: Mesh) -> Mesh:
-    vertices, faces = mesh
+def _checked(mesh: Any) -> Mesh:
+    if not isinstance(mesh, tuple | list) or len(mesh) != 2:
+        raise InputError(f"`mesh` is of the type `{type(mesh).__name__}`; expected a pair: its vertices, and its faces")
+    vertices, faces = real_numbers("vertices of `mesh`", mesh[0]), real_numbers("faces of `mesh`", mesh[1])
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise InputError(
             f"`mesh` has vertices {vertices.shape} and faces {faces.shape}; both must be [n, 3], not empty"
         )
+    if faces.dtype.kind not in "iu":
+        raise InputError(f"`mesh` has faces of {faces.dtype}; expected whole numbers, the rows of their corners")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"`mesh` has a face with corner {faces.max()}, and {len(vertices)} vertices")
-    if not np.isfinite(vertices).all():
-        raise InputError("`mesh` has a vertex with a NaN or an infinity")
-    return mesh
+    return checked_points("vertices of `mesh`", vertices), faces

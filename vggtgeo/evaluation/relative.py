@@ -12,10 +12,11 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float, Int
 
+from vggtgeo.evaluation.association import check_trajectories
 from vggtgeo.evaluation.statistics import ErrorStatistics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real
+from vggtgeo.io.given import check_real, real_array
 
 Unit = Literal["poses", "seconds", "metres"]
 UNITS: tuple[Unit, ...] = get_args(Unit)
@@ -70,6 +71,7 @@ def relative_error(
     overlapping pairs with the nearest one, if that is not off by more than a tenth. No pair (a trajectory shorter than
     delta) gives empty arrays. InputError where the two differ in length, or for an impossible `delta` or `unit`.
     """
+    check_trajectories(estimate, truth)
     if len(estimate) != len(truth):
         raise InputError(
             f"`estimate` has {len(estimate)} poses, `truth` {len(truth)}; match them first with `associate`"
@@ -133,6 +135,7 @@ def _overlapping(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]
 
 def rotation_angle(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
     """The angle of each rotation, radians in [0, pi]; accurate at both ends, where an arc cosine is not."""
+    rotations = real_array("rotations", rotations, (None, 3, 3))
     skew = rotations - rotations.swapaxes(1, 2)
     sine = np.sqrt(skew[:, 2, 1] ** 2 + skew[:, 0, 2] ** 2 + skew[:, 1, 0] ** 2)
     return np.arctan2(sine, np.trace(rotations, axis1=1, axis2=2) - 1.0)

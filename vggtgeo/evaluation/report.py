@@ -7,7 +7,7 @@ import numpy as np
 
 from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
 from vggtgeo.evaluation.alignment import VERTICAL
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check_trajectories
 from vggtgeo.evaluation.relative import RelativeError, Unit, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -151,6 +151,7 @@ def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGE
 
     NaN for a truth without duration.
     """
+    check_trajectories(estimate, truth)
     if len(truth) < 2:
         return float("nan")
     begin, end = truth.timestamps[[0, -1]]

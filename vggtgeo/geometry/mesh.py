@@ -19,7 +19,7 @@ from vggtgeo.geometry.point_cloud import (
 )
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
-from vggtgeo.io.given import path_of
+from vggtgeo.io.given import path_of, real_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +35,18 @@ class Mesh:
     colours: np.ndarray
 
     def __post_init__(self) -> None:
-        count = len(self.vertices)
+        for name in ("vertices", "faces", "normals", "colours"):
+            object.__setattr__(self, name, real_numbers(name, getattr(self, name)))
+        count = len(self.vertices) if self.vertices.ndim else 0
         for name, shape in (("vertices", (count, 3)), ("normals", (count, 3)), ("colours", (count, 3))):
             if getattr(self, name).shape != shape:
                 raise InputError(f"`{name}` has shape {getattr(self, name).shape}; it must be {list(shape)}")
         if self.faces.ndim != 2 or self.faces.shape[1] != 3:
             raise InputError(f"`faces` has shape {self.faces.shape}; it must be [m, 3]")
+        if self.faces.dtype.kind not in "iu":
+            raise InputError(f"`faces` holds {self.faces.dtype}; expected whole numbers, the rows of their corners")
+        if self.colours.dtype != np.uint8:
+            raise InputError(f"`colours` holds {self.colours.dtype}; expected uint8, from 0 to 255")
         if len(self.faces) and not (self.faces.min() >= 0 and self.faces.max() < count):
             wrong = self.faces.min() if self.faces.min() < 0 else self.faces.max()
             raise InputError(f"`faces` names vertex {wrong}; there are {count}")

@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyListProperty, P
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
-from vggtgeo.io.given import path_of
+from vggtgeo.io.given import path_of, real_numbers
 
 LONGEST_HEAD = 65_536
 UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyHeaderParseError, PlyParseError)
@@ -39,7 +39,10 @@ class PointCloud:
     normals: Float[np.ndarray, "n 3"] | None = None
 
     def __post_init__(self) -> None:
-        count = len(self.points)
+        for name in ("points", "colours", "confidence", "normals"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, real_numbers(name, getattr(self, name)))
+        count = len(self.points) if self.points.ndim else 0
         if self.points.shape != (count, 3) or self.colours.shape != (count, 3) or self.colours.dtype != np.uint8:
             raise InputError(
                 f"`points` has shape {self.points.shape}, `colours` {self.colours.dtype} "

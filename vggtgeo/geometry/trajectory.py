@@ -85,7 +85,10 @@ class Trajectory:
 
     def select(self, rows: np.ndarray | slice) -> Self:
         """The poses at `rows` (indices in increasing order, a boolean mask, or a slice)."""
-        return type(self)(self.timestamps[rows], self.poses[rows])
+        try:
+            return type(self)(self.timestamps[rows], self.poses[rows])
+        except IndexError as error:
+            raise InputError(f"`rows` cannot be rows of {len(self)} poses: {error}") from None
 
     def save_tum(self, path: str | os.PathLike[str]) -> None:
         """Writes the TUM format, nine decimals, atomically."""

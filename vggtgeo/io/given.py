@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import numbers
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,13 @@ def check_real(name: str, given: Any, must: str = "a number") -> None:
         raise InputError(f"`{name}` is {what}; it must be {must}")
 
 
+def check_positive(name: str, given: Any, unit: str) -> None:
+    """One number above zero; infinity is none."""
+    check_real(name, given, f"positive {unit}")
+    if not 0 < given < math.inf:
+        raise InputError(f"`{name}` is {given}; it must be positive {unit}")
+
+
 def real_numbers(name: str, given: Any) -> np.ndarray:
     """An array of real numbers or truth values from whatever was given.
 
@@ -73,6 +81,18 @@ def real_numbers(name: str, given: Any) -> np.ndarray:
         raise InputError(
             f"`{name}` has masked entries, which have no value; leave them out, or fill them (`.filled(...)`)"
         )
+    return found
+
+
+def real_array(name: str, given: Any, shape: Sequence[int | None]) -> np.ndarray:
+    """Real numbers of this shape, None for any length; InputError as of `real_numbers`, and for another shape."""
+    found = real_numbers(name, given)
+    if found.ndim != len(shape) or any(
+        wanted not in (None, has) for wanted, has in zip(shape, found.shape, strict=True)
+    ):
+        letters = iter("nmk")
+        wanted = ", ".join(next(letters) if length is None else str(length) for length in shape)
+        raise InputError(f"`{name}` has shape {found.shape}; it must be [{wanted}]")
     return found
 
 
