@@ -376,6 +376,33 @@ def named(name: str | bytes, make: Callable[[Path], Any]) -> Callable[[Path], Pa
     return both
 
 
+def calibrated(path: Path) -> Path:
+    """The same, beside its camera."""
+    (path.parent / "calibration.txt").write_text("55 55 31.5 23.5")
+    return path
+
+
+def still_video(path: Path) -> Path:
+    """A video of one picture."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (bad.WIDTH, bad.HEIGHT))
+    for _ in range(12):
+        writer.write(bad.picture(0))
+    writer.release()
+    return calibrated(path)
+
+
+def jpegs(path: Path) -> Path:
+    """A stream that tells nothing of its times."""
+    path.write_bytes(b"".join(bad.encoded(".jpg", bad.picture(number)) for number in range(12)))
+    return calibrated(path)
+
+
+def joined_video(path: Path) -> Path:
+    """Two streams, each of which begins at its time 0."""
+    path.write_bytes(2 * bad.video(path, 20).read_bytes())
+    return calibrated(path)
+
+
 VIDEOS = rows(
     "Videos",
     [
@@ -388,6 +415,13 @@ VIDEOS = rows(
         ("a GIF that is called .mp4", bad.file("clip.mp4", bad.encoded(".gif"))),
         ("a PNG that is called .mp4", bad.file("clip.mp4", bad.encoded(".png"))),
         ("a JPEG that is called .mov", bad.file("clip.mov", bad.encoded(".jpg"))),
+        (
+            "one picture again and again, as of an interlaced one",
+            lambda folder: still_video(folder / "still.mp4"),
+        ),
+        ("JPEGs one behind the other, without a container", lambda folder: jpegs(folder / "clip.mjpg")),
+        ("two recordings that were joined (.ts)", lambda folder: joined_video(folder / "clip.ts")),
+        ("a picture of a phone (.heic)", bad.file("a.heic", b"\0\0\0\x18ftypheic" + bytes(40))),
         ("a zip archive", bad.file("clip.mp4", b"PK\x03\x04" + b"\0" * 999)),
     ],
     call=read_frames,

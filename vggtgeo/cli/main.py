@@ -245,8 +245,12 @@ def _lacks_folder() -> bool:
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
-    """Whether memory ran out, or what a thread needs: NumPy, Python and JAX each have a word of their own for it."""
+    """Whether memory ran out, or what a thread needs: NumPy, Python, JAX and the loader of libraries each have a word
+    of their own for it.
+    """
     words = ("RESOURCE_EXHAUSTED", "can't start new thread")
+    if isinstance(error, ImportError):
+        return "failed to map segment" in str(error) or "cannot allocate memory" in str(error).lower()
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(words))
 
 

@@ -1,6 +1,7 @@
 """Which reader a path needs, by looking at it."""
 
 import os
+import warnings
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
@@ -13,13 +14,13 @@ from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim
 from vggtgeo.datasets.icl_raw import IclNuimRaw
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, is_there
 from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
-from vggtgeo.datasets.not_read import reason_not_read
+from vggtgeo.datasets.not_read import OTHER_PICTURES, reason_not_read
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
 from vggtgeo.datasets.replica import Replica
@@ -30,7 +31,7 @@ from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.views import with_rate
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import path_of
 
 
@@ -124,8 +125,15 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
         return _open_video(place)
     if not place.is_dir():
         raise InputError(f"`{place}` is a file; the reader {kind!r} needs a folder")
+    return _open_folder(place, kind)
+
+
+def _open_folder(place: Path, kind: str | None) -> Sequence:
     if not any(place.iterdir()):
         raise InputError(f"`{place}` is empty; give a folder with images")
+    dead = _dead_links(place)
+    if dead and (kind is not None or any(reader.matches(place) for reader in FOLDER_KINDS.values())):
+        warnings.warn(f"`{place}`: {dead}", InputWarning, stacklevel=4)
     if kind is not None:
         return FOLDER_KINDS[kind].open(place)
     if all((place / name).is_file() for name in ("summary.json", "trajectory.txt")):
@@ -138,7 +146,24 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
         or reason_not_read(place)
         or f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
         "a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of `vggtgeo data list`, or a folder "
-        f"of images{_hint(place)}"
+        f"of images{_hint(place)}{'; ' if dead else ''}{dead}"
+    )
+
+
+def _dead_links(folder: Path) -> str:
+    """What links in a folder, and in those in it, lead nowhere, as a sentence: a disk that is not mounted, or contents
+    that a tool for large files has not fetched, would be missed without a word.
+    """
+    dead = []
+    for place in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())[:_MOST_LOOKED_AT]):
+        with suppress(OSError), os.scandir(place) as entries:
+            links = (Path(entry.path) for entry in entries if entry.is_symlink() and entry.name[0] != ".")
+            dead += [path for path in links if not is_there(path)]
+    if not dead:
+        return ""
+    return (
+        f"links that lead nowhere are not read: {len(dead)}, `{min(dead).relative_to(folder)}` first; is a disk "
+        "missing, or was the content not fetched (git annex, DVC)?"
     )
 
 
@@ -147,13 +172,16 @@ def _open_video(file: Path) -> Sequence:
         raise InputError(f"`{file}` is a folder; the reader 'video' needs a file")
     if not file.is_file():
         raise InputError(f"`{file}` is no regular file; give a folder of images or a video file")
-    with file.open("rb") as opened:
-        head = opened.read(len(_PNG))
+    try:
+        with file.open("rb") as opened:
+            head = opened.read(len(_PNG))
+    except OSError as error:  # a disk that fails, or what only looks like a file
+        raise InputError(f"`{file}` cannot be read: {error.strerror}; give a copy on a disk that works") from None
     # FFmpeg goes by the content, and takes a picture for a video of one frame; a stream of Motion JPEG begins as one.
     if file.suffix.lower() == ".gif" or head.startswith(b"GIF8"):
         raise InputError(f"`{file}` is a GIF, whose colours and times are not those of a camera; give the video itself")
     a_jpeg = head.startswith(b"\xff\xd8") and file.suffix.lower() not in _MOTION_JPEG
-    if file.suffix.lower() in IMAGE_SUFFIXES or a_jpeg or head == _PNG:
+    if file.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES or a_jpeg or head == _PNG:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
     if reason := reason_not_read(file):
         raise InputError(reason)

@@ -1,6 +1,7 @@
 """A video file, decoded frame by frame by OpenCV."""
 
 import math
+import os
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -23,6 +24,9 @@ _LOOKED_AT = 4096
 _MOST_MISSED = 1000
 """Frames in a row that are tried: a damaged header may declare 10^9 where the file ends."""
 _MADE_OF_OTHERS = tuple(map(ord, "PB"))
+_LOOKED_AT_FRAMES = 6
+"""Of a video, at its begin: no camera's noise is the same in two."""
+_CONVERT = "`ffmpeg -i FILE -c:v libx264 NEW.mp4` makes one that it does"
 _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 """Control characters other than those of text and terminals; no container of videos is without them."""
 
@@ -49,14 +53,33 @@ class VideoFile:
         with _capture(path) as capture:
             readable, image = _decoded(capture.read)
             if not readable or image is None or not image.size:  # a damaged stream may be decoded to nothing
-                raise InputError(f"`{path}` has no frame that can be decoded")
+                raise InputError(
+                    f"`{path}` has no frame that can be decoded (its codec: {_codec(capture)}): it is damaged, or of a "
+                    f"kind that OpenCV does not know; {_CONVERT}"
+                )
             rate = capture.get(cv2.CAP_PROP_FPS)
             stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
             count = int(stated) if math.isfinite(stated) else 1
             aspect = _pixel_aspect(capture)
+            alike = _alike(capture, image)
         height, width = image.shape[:2]
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
         known_rate = math.isfinite(rate) and 0 < rate < 1000
+        if alike:
+            _warn(
+                InputWarning(
+                    f"`{path}`: its first {_LOOKED_AT_FRAMES} frames are one picture, bit by bit: nothing moves there, "
+                    "or it is interlaced, which OpenCV does not decode; `ffmpeg -i FILE -vf yadif NEW.mp4` makes a "
+                    "video of whole pictures"
+                )
+            )
+        if not stated > 0:
+            _warn(
+                InputWarning(
+                    f"`{path}` is a stream that states neither its times nor how many frames it has; {rate:g} frames a "
+                    "second are taken: give `--fps` if it has others"
+                )
+            )
         return cls(path, path.name, camera, rate if known_rate else _FALLBACK_RATE, max(count, 1))
 
     def __len__(self) -> int:
@@ -74,7 +97,7 @@ class VideoFile:
         return None
 
     def _decode(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
-        time, index = -math.inf, 0
+        time, index, jumped = -math.inf, 0, False
         damaged: int | None = None  # the first frame of those that cannot be decoded, while they last
         with _capture(self.path) as capture:
             while end is None or index < end:
@@ -83,6 +106,7 @@ class VideoFile:
                     break
                 damaged = index if missed and damaged is None else damaged
                 index += missed
+                jumped = jumped or self._tell_jump(capture, index, time)
                 time = self._time(capture, index, time)
                 if damaged is not None and _stands_alone(capture):
                     self._tell_damaged(damaged, index, _chosen(start, end, stride, damaged, index))
@@ -142,6 +166,19 @@ class VideoFile:
         time = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         return time if math.isfinite(time) and time > previous else previous + 1.0 / self.rate
 
+    def _tell_jump(self, capture: Any, index: int, before: float) -> bool:
+        """Whether a container's time is before that of the last frame, which is told; 0 is that of frames without."""
+        time = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
+        back = self.given_rate is None and 0 < time < before - 1.0 / self.rate
+        if back:
+            _warn(
+                InputWarning(
+                    f"`{self.name}`: the time goes back from {before:.3f} to {time:.3f} s at frame {index}: are these "
+                    "recordings that were joined? Give each by itself"
+                )
+            )
+        return back
+
 
 def _pixel_aspect(capture: Any) -> float:
     """Width of a pixel over its height, as the container says (1440 x 1080 are shown as 16:9); 1 where it says none, or
@@ -152,6 +189,24 @@ def _pixel_aspect(capture: Any) -> float:
         across, down = down, across
     known = across > 0 and down > 0 and 1 / MOST_ASPECT <= across / down <= MOST_ASPECT
     return across / down if known else 1.0
+
+
+def _alike(capture: Any, first: np.ndarray) -> bool:
+    """Whether the frames behind the first are the same to the bit: where OpenCV 5 cannot convert a frame, it answers
+    with what was in its memory, and says that all is well.
+    """
+    for _ in range(_LOOKED_AT_FRAMES - 1):
+        readable, image = _decoded(capture.read)
+        if not readable or image is None or not np.array_equal(image, first):
+            return False
+    return True
+
+
+def _codec(capture: Any) -> str:
+    """The four letters of a codec."""
+    code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
+    letters = code.to_bytes(4, "little").decode("ascii", "replace")
+    return letters if letters.isprintable() and code else "not known"
 
 
 def _stands_alone(capture: Any) -> bool:
@@ -194,7 +249,7 @@ def _capture(path: Path) -> Iterator[Any]:
     if _is_text(path):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
     try:
-        name = str(path).encode().decode()
+        name = os.path.abspath(path).encode().decode()  # FFmpeg takes what is before a `:` for a protocol
     except UnicodeError:  # OpenCV 5 ends the process over such a name
         raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
     try:
@@ -203,7 +258,10 @@ def _capture(path: Path) -> Iterator[Any]:
         raise InputError(f"`{path}` cannot be opened as a video: {error.err}") from None
     try:
         if not capture.isOpened():
-            raise InputError(f"`{path}` cannot be opened as a video: it is damaged, or no video that OpenCV knows")
+            raise InputError(
+                f"`{path}` cannot be opened as a video: it is damaged, or no video that OpenCV knows; if other "
+                f"programs play it, {_CONVERT}"
+            )
         yield capture
     finally:
         capture.release()
