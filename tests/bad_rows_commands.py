@@ -417,6 +417,11 @@ OUTPUT = rows(
         ("of `solve`: a folder", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made.parent]}),
         ("of `solve`: a device", bad.problem(), {"argv": lambda made: ["solve", made, "-o", "/dev/full"]}),
         ("of `solve`: the problem", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made]}),
+        (
+            "of `simulate`: a link that leads nowhere",
+            lambda folder: (folder / "out").symlink_to(folder / "nowhere") or folder / "out",
+            {"argv": lambda made: ["simulate", "room", "-o", made]},
+        ),
         ("of `simulate`: a folder with files", good, {"argv": lambda made: ["simulate", "room", "-o", made]}),
     ],
 )

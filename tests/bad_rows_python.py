@@ -111,6 +111,51 @@ def same_place(count: int, truth: Any) -> Any:
     return evaluation.cloud_error(np.zeros((count, 3)), truth)
 
 
+class Fix(vg.PoseTerm):
+    """Where a camera stands."""
+
+    position: jax.Array
+
+    def residual(self, pose: Any, camera: Any) -> Any:
+        return pose.inverse().translation() - self.position
+
+
+def fix(rows: int = 1, **other: Any) -> Fix:
+    """One observation of the first keyframe."""
+    return Fix(**({"keyframe": [0], "position": jax.numpy.zeros((rows, 3)), "weight": jax.numpy.ones(1)} | other))
+
+
+def written(folder: Path, **more: Any) -> None:
+    """Three windows."""
+    size = vg.PaddedSize(keyframes=3, points=40, lines=0, degree=2)
+    with vg.WindowWriter(folder) as writer:
+        for seed in range(3):
+            writer.add(vg.simulate_window(3, points=8, lines=0, seed=seed).pack(size=size), **more)
+
+
+def dataset(
+    change: Callable[[Path], Any], use: Callable[[Any], Any] = lambda data: list(data.batches(3))
+) -> Callable[[Path], Any]:
+    """A folder of three windows that was changed, opened and used."""
+
+    def call(folder: Path) -> Any:
+        written(folder / "windows", poses=np.zeros(3))
+        change(folder / "windows")
+        return use(vg.WindowDataset.open(folder / "windows"))
+
+    return call
+
+
+def index(place: Path, **changes: Any) -> None:
+    """Another index."""
+    (place / "windows.json").write_text(json.dumps({"version": 1, "windows": 3} | changes))
+
+
+def labels(place: Path, poses: Any) -> None:
+    """Other labels of one window."""
+    np.savez_compressed(place / "0000001.labels.npz", poses=poses)
+
+
 CLOUD = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
 TRIANGLE = np.eye(3), np.array([[0, 1, 2]])
 
@@ -246,6 +291,33 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("rows of a trajectory that are not there", lambda _: trajectory([0.0], [EYE])(_).select([3])),
     ("a `PointCloud` of texts", lambda _: PointCloud("a", "b")),
     ("a `Mesh` whose colours are floats", lambda _: Mesh(EYE[:3, :3], np.zeros((1, 3), int), EYE[:3, :3], EYE[:3, :3])),
+    ("a term of a keyframe that is not there", with_pair(lambda p, s: vg.energy(p.with_term(fix(keyframe=[3])), s))),
+    ("a term of keyframe -1", with_pair(lambda p, s: vg.energy(p.with_term(fix(keyframe=[-1])), s))),
+    ("a term of keyframe one and a half", lambda _: fix(keyframe=[1.5])),
+    ("a term with two rows of data and one weight", with_pair(lambda p, s: vg.energy(p.with_term(fix(rows=2)), s))),
+    ("a term with a list as data", with_pair(lambda p, s: vg.solve(p.with_term(fix(position=[[0, 0, 0]])), s))),
+    ("`no_prior` of -1 keyframes", lambda _: vg.no_prior(-1)),
+    ("`no_prior` of 10^9 keyframes", lambda _: vg.no_prior(10**9)),
+    ("`reorder` by a text", lambda _: vg.reorder(vg.no_prior(3), "210")),
+    ("`residual_sizes` of nothing", with_pair(lambda p, s: vg.residual_sizes(None, s))),
+    ("`simulate_window` of 10^9 keyframes", lambda _: vg.simulate_window(10**9)),
+    ("a window dataset whose index counts -1", dataset(lambda place: index(place, windows=-1))),
+    ("a window dataset whose index counts fewer", dataset(lambda place: index(place, windows=1))),
+    ("a window dataset whose index counts more", dataset(lambda place: index(place, windows=5))),
+    ("a window dataset of another version", dataset(lambda place: index(place, version=9))),
+    ("a window whose labels are not there", dataset(lambda place: (place / "0000001.labels.npz").unlink())),
+    ("a window whose labels are no archive", dataset(lambda place: (place / "0000001.labels.npz").write_text("x"))),
+    ("a window whose labels are Python objects", dataset(lambda place: labels(place, np.array([{}], object)))),
+    ("a window whose labels have another shape", dataset(lambda place: labels(place, np.zeros(2)))),
+    ("a window whose labels are 300 MB, packed", dataset(lambda place: labels(place, np.zeros(40_000_000)))),
+    ("`batches` of a size that is a text", dataset(lambda place: None, lambda data: data.batches("2"))),
+    ("`batches`: one number as a share", dataset(lambda place: None, lambda data: data.batches(1, share=1))),
+    ("`batches`: -1 epochs", dataset(lambda place: None, lambda data: data.batches(1, epochs=-1))),
+    ("a window of number `a`", dataset(lambda place: None, lambda data: data["a"])),
+    ("`stack_windows` of no window", lambda _: vg.stack_windows([])),
+    ("`WindowWriter` into a folder that holds windows", dataset(written)),
+    ("`WindowWriter`: a label that is an object", lambda folder: written(folder, poses=object())),
+    ("`WindowWriter`: a label called `file`", lambda folder: written(folder, file=1.0)),
     ("`Graduation`: a number in place of widths", lambda _: vg.Graduation(-1)),
 )
 

@@ -62,6 +62,17 @@ def test_a_file_says_what_flags_say(tmp_path: Path) -> None:
     assert by_flags == {**expected, "json": True}
 
 
+def test_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves `~` in files and where a shell leaves it: in quotes, behind `=`. Oracle: the home folder.
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "frames").mkdir()
+    found = seen_by_the_command("--settings", file_with(tmp_path, 'path = "~/clip"\n'))
+    assert found["path"] == str(tmp_path / "clip")
+    for words, named in ((["~/frames"], "frames"), (["clip", "--settings=~/no.toml"], "no.toml")):
+        done = CliRunner().invoke(make_app(), ["run", *words], prog_name="vggtgeo")
+        assert f"`{tmp_path / named}`" in done.stderr, done.stderr
+
+
 def test_a_flag_takes_back_what_the_file_says(tmp_path: Path) -> None:
     # Proves that each switch of a file can be turned over by a flag, either way. Oracle: the defaults.
     path = file_with(tmp_path, "rgb-only = true\nlines = false\njson = true\n")

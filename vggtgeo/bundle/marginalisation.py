@@ -31,10 +31,12 @@ from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_whole
+from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.solvers.arrow import reduce
 
+_MOST_KEYFRAMES = 1000
+"""Of a prior, whose matrix is dense: 0.3 GB."""
 _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
@@ -47,6 +49,8 @@ def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: in
         (28, 28)
 
     """
+    check_whole("keyframes", keyframes, 1, _MOST_KEYFRAMES)
+    check_whole("parameters", parameters, 1, _MOST_KEYFRAMES)
     size = lie.TANGENT * keyframes + parameters
     identity = np.tile(np.array([1.0, 0, 0, 0, 0, 0, 0], dtype), (keyframes, 1))
     return MarginalPrior(
@@ -96,7 +100,8 @@ def reorder(prior: MarginalPrior, order: np.ndarray) -> MarginalPrior:
         (22, 22)
 
     """
-    order, count = np.asarray(order), len(prior.poses.wxyz_xyz)
+    check_kind("prior", prior, MarginalPrior, "a prior, such as `vggtgeo.marginalise` gives")
+    order, count = real_numbers("order", order), len(prior.poses.wxyz_xyz)
     inside = order[order >= 0]
     if (
         order.dtype.kind not in "iu"

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
@@ -39,6 +40,34 @@ def check_pair(problem: Any, state: Any, name: str = "state") -> None:
             f"`{name}` holds {of_state}, `problem` {of_problem}; they must be of one precision: pack both with one "
             "`dtype`"
         )
+    for term in (*problem.node_terms, *problem.camera_terms):
+        _check_term(term, wanted[0])
+
+
+def _check_term(term: PoseTerm | PairTerm | CameraTerm, keyframes: int) -> None:
+    """A term of somebody's own: as many data as weights, and keyframes that are there. JAX takes the last one for any
+    number beyond it, and counts a negative one from the end.
+    """
+    weight = getattr(term.weight, "shape", None)
+    if weight is None or len(weight) != 1:
+        raise InputError(f"`{term.name}.weight` has shape {weight}; it must be [m], a number an observation")
+    named = () if isinstance(term, CameraTerm) else term.touched()
+    for field, value in (*term.data().items(), *(("keyframes", index) for index in named)):
+        for leaf in jax.tree.leaves(value):
+            shape = getattr(leaf, "shape", ())
+            if shape[:1] != weight:
+                raise InputError(
+                    f"`{term.name}.{field}` has shape {shape}, `{term.name}.weight` {weight}; both must be arrays, "
+                    "with a row an observation"
+                )
+    for index in named:
+        if not isinstance(index, jax.core.Tracer) and not isinstance(term.weights, jax.core.Tracer):
+            asked = np.asarray(index)[np.asarray(term.weights) > 0]
+            if asked.size and not 0 <= asked.min() <= asked.max() < keyframes:
+                wrong = asked.min() if asked.min() < 0 else asked.max()
+                raise InputError(
+                    f"`{term.name}` is of keyframe {wrong}; there are {keyframes}: use 0 to {keyframes - 1}"
+                )
 
 
 def check_finite(state: State, name: str = "state") -> None:

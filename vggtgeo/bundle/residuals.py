@@ -19,7 +19,7 @@ from vggtgeo.bundle.objective import (
     relative_poses,
     view_of,
 )
-from vggtgeo.bundle.pair_checks import check_kinds
+from vggtgeo.bundle.pair_checks import check_kinds, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm, node_residuals
@@ -74,6 +74,7 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
         points 0.65 px (240), lines 0.43 px (144), depth 0.71 sigma (128)
 
     """
+    check_pair(problem, state)
     return _sizes_jit(problem, state)
 
 

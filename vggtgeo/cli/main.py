@@ -151,7 +151,7 @@ class _LazyGroup(TyperGroup):
                 InputError("an argument is empty, which would mean this folder; is a variable of the shell not set?")
             )
         try:
-            return super().parse_args(ctx, args)
+            return super().parse_args(ctx, [_at_home(word) for word in args])
         except Exception as error:
             if not _is_usage_error(error):
                 raise
@@ -176,6 +176,12 @@ class _LazyGroup(TyperGroup):
             if ctx.params.get("debug") or _is_call_for_help(error):
                 raise
             _leave(error)
+
+
+def _at_home(word: str) -> str:
+    """`~` as the home folder where a shell leaves it as it is: in quotes, and in `--output=~/runs`."""
+    option, equals, value = word.partition("=") if word.startswith("-") else ("", "", word)
+    return option + equals + (os.path.expanduser(value) if value.startswith("~") else value)
 
 
 def load_command(entry: CommandEntry) -> Any:

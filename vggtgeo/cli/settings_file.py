@@ -9,6 +9,7 @@ The file takes the place of the defaults, so a flag that is given wins over it.
 from __future__ import annotations
 
 import difflib
+import os
 import tomllib
 import typing
 from collections.abc import Mapping, Sequence
@@ -125,7 +126,11 @@ def _checked(
         wanted, accepted = _KINDS.get(types[names[key]], ("text in quotes", (str,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
             raise InputError(f"`{path}`: `{key}` is {_short(value)}; it must be {wanted}")
-    return {names[key]: value for key, value in given.items()}
+    return {names[key]: _at_home(value) for key, value in given.items()}
+
+
+def _at_home(value: Any) -> Any:
+    return os.path.expanduser(value) if isinstance(value, str) and value.startswith("~") else value
 
 
 def _short(value: Any) -> str:

@@ -9,6 +9,7 @@ own, forked ones too (collate function: `vggtgeo.stack_windows`); `batches` need
 from __future__ import annotations
 
 import json
+import numbers
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,9 +24,11 @@ from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_arrays, save_problem
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.image_files import is_there
+from vggtgeo.io.archives import read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open, write_json
-from vggtgeo.io.given import path_of
+from vggtgeo.io.given import check_kind, check_whole, path_of
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
@@ -73,10 +76,13 @@ class WindowWriter:
 
     def add(self, window: PackedWindow, **labels: Any) -> None:
         """Write a packed window and its labels (arrays of one shape for all windows)."""
+        check_kind("window", window, tuple, "all that `vggtgeo.pack` gives")
         problem, initial, index = window
-        arrays = {name: np.asarray(value) for name, value in labels.items()}
+        arrays = {name: _label(name, value) for name, value in labels.items()}
+        if not self.count and is_there(self.folder / _name(0)):
+            raise InputError(f"`{self.folder}` holds windows already; give a new folder")
         self._check(problem, initial, arrays)
-        save_problem(self.folder / f"{self.count:07d}.npz", problem, initial, index)
+        save_problem(self.folder / _name(self.count), problem, initial, index)
         with atomic_open(self.folder / f"{self.count:07d}.labels.npz", "wb") as file:
             np.savez(file, **arrays)  # type: ignore[arg-type]
         self.count += 1
@@ -152,24 +158,37 @@ class WindowDataset:
         place = path_of("folder", folder)
         try:
             index = json.loads(whole_text(place / _INDEX, errors="strict"))
-            return cls(place, int(index["windows"]), tuple(terms))
-        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            version, count = index["version"], index["windows"]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"`{place}` is no complete folder of windows; write one first") from None
+        if type(version) is not int or version != _VERSION:
+            raise InputError(f"`{place / _INDEX}` is of version {version!r:.20}; this program reads {_VERSION}")
+        if type(count) is not int or count < 0:
+            raise InputError(f"`{place / _INDEX}` counts {count!r:.20} windows; expected a number: write it again")
+        for row in {0, count - 1} - {-1}:
+            if not (place / _name(row)).is_file():
+                raise InputError(f"`{place / _name(row)}` is not there, and `{_INDEX}` counts {count} windows")
+        if is_there(place / _name(count)):
+            raise InputError(f"`{place / _name(count)}` is there, and `{_INDEX}` counts {count} windows")
+        return cls(place, count, tuple(terms))
 
     def __len__(self) -> int:
         return self.count
 
     def __getitem__(self, row: int) -> LabelledWindow:
         """Window `row`, read from the disk, with numpy leaves."""
+        check_kind("row", row, numbers.Integral, "the number of a window")
         if not 0 <= row < self.count:
             raise IndexError(f"window {row} of {self.count}")
-        problem, initial, _ = load_arrays(self.folder / f"{row:07d}.npz", self.terms)
-        with np.load(self.folder / f"{row:07d}.labels.npz", allow_pickle=False) as file:
-            labels = {name: file[name] for name in file.files}
+        problem, initial, _ = load_arrays(self.folder / _name(row), self.terms)
+        everything = lambda archive: archive.read(archive.members, lambda headers: None)
+        labels = read_archive(self.folder / f"{row:07d}.labels.npz", "the labels of a window", everything)
         return LabelledWindow(problem, initial, labels)
 
     def order(self, seed: int, epoch: int = 0) -> np.ndarray:
         """Every row once, int [n], shuffled; it follows from `seed` and `epoch` alone."""
+        check_whole("seed", seed)
+        check_whole("epoch", epoch)
         return np.random.default_rng([seed, epoch, 13]).permutation(self.count)
 
     def batches(
@@ -187,7 +206,16 @@ class WindowDataset:
             InputError: a batch larger than the share, or an impossible share.
 
         """
+        check_whole("size", size, 1)
+        for name, value in (("seed", seed), ("epochs", epochs)):
+            if value is not None:
+                check_whole(name, value)
+        check_kind("share", share, tuple, "(k, n) with 0 <= k < n")
+        if len(share) != 2:
+            raise InputError(f"`share` is {share!r:.60}; it must be (k, n) with 0 <= k < n")
         part, parts = share
+        for value in share:
+            check_whole("share", value)
         if not 0 <= part < parts:
             raise InputError(f"`share` is {share}; it must be (k, n) with 0 <= k < n")
         if not 1 <= size <= self.count // parts:
@@ -223,8 +251,31 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
         >>> loader = DataLoader(data, batch_size=8, num_workers=2, collate_fn=vg.stack_windows)  # doctest: +SKIP
 
     """
+    check_kind("windows", windows, Sequence, "a list of windows, as `WindowDataset` gives them")
+    if not windows:
+        raise InputError("`windows` is empty; give at least one")
+    for row, window in enumerate(windows):
+        check_kind(f"windows[{row}]", window, LabelledWindow, "a window, as `WindowDataset` gives it")
+        if _shapes(window) != _shapes(windows[0]):
+            raise InputError(f"`windows[{row}]` has another padded shape, other terms or other labels than the first")
     stack: LabelledWindow = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
     return stack
+
+
+def _label(name: str, given: Any) -> np.ndarray:
+    if name == "file" or "/" in name:
+        raise InputError(f"`{name}` can be no label: NumPy's files have no array of this name; give another")
+    try:
+        found = np.asarray(given)
+    except ValueError as error:
+        raise InputError(f"the label `{name}` cannot be read as an array: {error}") from None
+    if found.dtype.hasobject:
+        raise InputError(f"the label `{name}` is {given!r:.60}; expected an array of numbers or texts")
+    return found
+
+
+def _name(row: int) -> str:
+    return f"{row:07d}.npz"
 
 
 def _shapes(tree: Any) -> Any:

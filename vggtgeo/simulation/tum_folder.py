@@ -52,6 +52,8 @@ def _name(time: float) -> str:
 
 def check_new(folder: Path) -> None:
     """InputError if `folder` is there and not an empty folder."""
+    if folder.is_symlink() and not folder.exists():
+        raise InputError(f"`{folder}` is a link that leads nowhere; give the name of a new folder")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"`{folder}` is there and not an empty folder; give the name of a new one")
 

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
-from typing import Self
+from typing import Any, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.terms.term import AbstractTerm, Local, local_model
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import AbstractCamera, Cameras
+from vggtgeo.io.errors import InputError
 
 _Index = Int[Array, " m"]
-_indices: Callable[[object], Array] = lambda given: jnp.asarray(given, jnp.int32)
+
+
+def _indices(given: Any) -> Array:
+    """Numbers of keyframes; InputError for what is no whole numbers, of which the integer part would be taken."""
+    if not isinstance(given, jax.Array):
+        found = np.asarray(given)
+        if found.size and found.dtype.kind not in "iu":
+            raise InputError(f"the keyframes of a term are {given!r:.60}; expected whole numbers, one an observation")
+    return jnp.asarray(given, jnp.int32)
 
 
 class PoseTerm(AbstractTerm):
