@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import bad_files as bad
+import numpy as np
 import pytest
 import tiny_layouts as layouts
 from bad_row import Row, nothing, read_frames, rows, solve_with
 from bad_rows_strangers import other_numbers, recorded
 
 from vggtgeo.cli.jax_flags import check_cache
+from vggtgeo.datasets import open_sequence
+from vggtgeo.geometry.point_cloud import PointCloud
 
 CALIB = "P0: 55 0 20 0 0 55 15 0 0 0 1 0\n"
 
@@ -59,6 +65,44 @@ CAMERAS = rows(
     ],
     call=read_frames,
 )
+
+
+def scanned(**crop: Any) -> Callable[[Path], Path]:
+    """A scene of Tanks and Temples with a scan, and another volume in which it counts."""
+
+    def make(folder: Path) -> Path:
+        made = layouts.tanks(folder / "Ignatius")
+        points = np.random.default_rng(0).random((50, 3))
+        PointCloud(points, np.zeros((50, 3), np.uint8)).save_ply(made / "Ignatius.ply")
+        volume = json.loads((made / "Ignatius.json").read_text())
+        (made / "Ignatius.json").write_text(json.dumps(volume | crop))
+        return made
+
+    return make
+
+
+def cut_scan(folder: Path) -> Path:
+    """Half a scan."""
+    made = scanned()(folder)
+    content = (made / "Ignatius.ply").read_bytes()
+    (made / "Ignatius.ply").write_bytes(content[: len(content) // 2])
+    return made
+
+
+SCANS = rows(
+    "`vggtgeo bench`: scans",
+    [
+        ("a volume without an axis", scanned(orthogonal_axis="")),
+        ("a volume of two axes", scanned(orthogonal_axis="XY")),
+        ("a volume upside down", scanned(axis_min=1.0, axis_max=-1.0)),
+        ("a volume with a NaN", scanned(axis_min=float("nan"))),
+        ("a volume of two corners", scanned(bounding_polygon=[[0, 0, 0], [1, 0, 1]])),
+        ("a volume of words", scanned(bounding_polygon=[["a", "b", "c"]] * 3)),
+        ("a volume elsewhere", scanned(axis_min=100.0, axis_max=101.0)),
+        ("a scan that was cut off", cut_scan),
+    ],
+    call=lambda folder: open_sequence(folder).scanned_points(),  # type: ignore[attr-defined]
+)
 ENVIRONMENT = rows(
     "Environment",
     [
@@ -88,4 +132,4 @@ SUITES = rows(
         )
     ],
 )
-LAYOUTS: list[Row] = [*TIMES, *CAMERAS, *ENVIRONMENT, *SOLVE, *SUITES]
+LAYOUTS: list[Row] = [*TIMES, *CAMERAS, *SCANS, *ENVIRONMENT, *SOLVE, *SUITES]

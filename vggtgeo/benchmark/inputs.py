@@ -98,6 +98,8 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
         sequence = _without(recorded, spec)
         exact = RecordedFrames.of(recorded) if spec["exact_depth"] else None
         scan = recorded if isinstance(recorded, TanksAndTemples) else None
+        if scan is not None:
+            scan.scanned_points()  # what is wrong with it would be found behind the run, which may take hours
         return Input(sequence, _perceived(spec, sequence.has_depth), exact, scan)
     rendered = _rendered(spec["simulate"], seed, scratch)
     if spec["perception"] == "simulated":

@@ -23,6 +23,10 @@ _LINES = 5
 """Of a pose in the log: its numbers, and four rows of a matrix camera -> world."""
 _MOST_DIGITS = 9
 
+_AXES = ["X", "Y", "Z"]
+_LEAST_CORNERS = 3
+"""Of a polygon."""
+
 
 @dataclass(frozen=True)
 class TanksAndTemples(FolderSequence):
@@ -72,8 +76,15 @@ class TanksAndTemples(FolderSequence):
         scene = self._scene()
         if scene is None or not all((self.folder / f"{scene}{end}").is_file() for end in ("_trans.txt", ".ply")):
             return None
-        points = PointCloud.load_ply(self.folder / f"{scene}.ply").points.astype(np.float64)
-        return points[self.judged(points)]
+        file = self.folder / f"{scene}.ply"
+        points = PointCloud.load_ply(file).points.astype(np.float64)
+        inside = points[self.judged(points)]
+        if not len(inside):
+            raise InputError(
+                f"`{file}` has {len(points)} points, none of them in the volume of `{scene}.json`; give the scan and "
+                "the volume of this scene, as they are downloaded"
+            )
+        return inside
 
     def judged(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Which points lie in the volume that the scan is compared in; all where no `SCENE.json` tells."""
@@ -114,13 +125,17 @@ def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray
     """Which points lie in the volume of a scene's `SCENE.json`: a polygon across an axis, between two bounds on it."""
     crop = read_json(file)
     try:
-        axis = "XYZ".index(crop["orthogonal_axis"].upper())
+        axis = _AXES.index(str(crop["orthogonal_axis"]).upper())
         low, high = float(crop["axis_min"]), float(crop["axis_max"])
         polygon = np.array(crop["bounding_polygon"], np.float64).reshape(-1, 3)
     except (KeyError, ValueError, AttributeError, TypeError) as error:
         raise InputError(
             f"`{file}`: expected orthogonal_axis, axis_min, axis_max, bounding_polygon ({error!r})"
         ) from None
+    if not (np.isfinite([low, high]).all() and low < high):
+        raise InputError(f"`{file}`: axis_min is {low:g} and axis_max {high:g}; expected the lower and the upper bound")
+    if len(polygon) < _LEAST_CORNERS or not np.isfinite(polygon).all():
+        raise InputError(f"`{file}`: bounding_polygon is {polygon.tolist()}; expected three corners or more, [x, y, z]")
     across = [number for number in range(3) if number != axis]
     between = (points[:, axis] >= low) & (points[:, axis] <= high)
     return between & _in_polygon(points[:, across], polygon[:, across])
