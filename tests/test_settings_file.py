@@ -188,6 +188,29 @@ def test_help_of_every_command_is_quick_and_shows_examples() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_a_name_that_is_wrong_is_told_before_jax_is_loaded(tmp_path: Path) -> None:
+    # Proves that the commonest mistakes cost no seconds: loading JAX takes two. Oracle: what the process has loaded.
+    (tmp_path / "file").write_text("")
+    (tmp_path / "frames").mkdir()
+    calls = (
+        ["run", "nothere"],
+        ["run", "frames", "-o", "file"],
+        ["export", "nothere", "--to", "ply"],
+        ["view", "nothere"],
+    )
+    for call in calls:
+        text = f"""
+import sys
+from vggtgeo.cli.main import make_app
+try:
+    make_app()({call!r})
+except SystemExit as end:
+    print(end.code, "jax" in sys.modules)
+"""
+        done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=tmp_path, check=False)
+        assert done.stdout == "2 False\n", (call, done.stdout, done.stderr)
+
+
 def test_the_help_tells_the_exit_codes() -> None:
     # Proves that a script's author finds the codes. Oracle: the constants of the program.
     listing = " ".join(CliRunner().invoke(make_app(), ["--help"], env={"COLUMNS": "300"}).output.split())

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from vggtgeo.cli.options import JsonOption, QuietOption
+from vggtgeo.results.unfinished import check_is_run
 
 
 def export(
@@ -23,6 +24,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write the run in DIR for another program."""
+    check_is_run(folder)
     from vggtgeo.export import export as write
 
     target = output or folder / "export" / to

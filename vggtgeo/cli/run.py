@@ -16,6 +16,7 @@ from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, Reru
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
+from vggtgeo.results.unfinished import check_may_be_folder
 
 if TYPE_CHECKING:
     from vggtgeo.datasets import Sequence
@@ -72,6 +73,14 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
+    from vggtgeo.datasets.opening import check_there
+    from vggtgeo.viewing.target import check_target
+
+    rerun = check_target(rerun) if rerun else None
+    check_flags(memory_limit_gb, fps)
+    check_may_be_folder(output)
+    if kind != "camera":
+        check_there(path)
     from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.io.warned import collected_warnings
@@ -79,12 +88,9 @@ def run(
     from vggtgeo.slam.run import default_roles
     from vggtgeo.slam.setting_groups import DepthSettings
     from vggtgeo.slam.settings_table import Tables
-    from vggtgeo.viewing.target import check_target
 
-    rerun = check_target(rerun) if rerun else None
     if rerun:
         check_recording_file(rerun, output)
-    check_flags(memory_limit_gb, fps)
     check_provider(provider)
     if save_depth and dense == "none":
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"

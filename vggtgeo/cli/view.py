@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from vggtgeo.cli.options import JsonOption, QuietOption
+from vggtgeo.results.unfinished import check_can_be_shown
 
 
 def view(
@@ -24,13 +25,16 @@ def view(
 ) -> None:
     """Show the run in DIR: path, map, and depth where it was saved."""
     from vggtgeo.io.errors import InputError, InputWarning
-    from vggtgeo.viewing.folder import check_folder, log_folder, recording_of
+
+    if not folder.is_dir():
+        check_can_be_shown(folder)
+    from vggtgeo.viewing.folder import log_folder, recording_of
     from vggtgeo.viewing.target import check_target, flush, has_screen, open_target
 
     check_target(rerun)
     recording = recording_of(folder) if rerun in ("spawn", "serve") else None
     if recording is None:
-        check_folder(folder)
+        check_can_be_shown(folder)
     elif rerun == "spawn" and not has_screen():
         raise InputError(
             f"there is no screen; the recording is `{recording}`: look at it with `rerun {recording}` where there is "

@@ -109,7 +109,16 @@ def is_readable(place: Path) -> bool:
         return False
 
 
-def _open_place(place: Path, kind: str | None) -> Sequence:
+def check_there(path: str | os.PathLike[str]) -> None:
+    """InputError where nothing lies that could be opened, or what may not be read: what is asked first, and quickly."""
+    place = path_of("path", path)
+    if not is_live(os.fspath(path)):
+        with suppress(RuntimeError):
+            place = place.expanduser()
+        _check_place(place)
+
+
+def _check_place(place: Path) -> None:
     if not place.exists():
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
     if not os.access(place, os.R_OK | os.X_OK if place.is_dir() else os.R_OK):
@@ -117,6 +126,10 @@ def _open_place(place: Path, kind: str | None) -> Sequence:
             f"`{place}` may not be read by this user (permission denied); change that (`chmod -R u+rX`, as its owner), "
             "or give a copy of your own"
         )
+
+
+def _open_place(place: Path, kind: str | None) -> Sequence:
+    _check_place(place)
     if kind == "bag" or (kind is None and is_bag(place)):
         return RosBag.open(place)
     if place.is_file() and (kind == "record3d" or (kind is None and Record3d.matches(place))):

@@ -19,6 +19,7 @@ from vggtgeo.io.files import whole_path
 from vggtgeo.io.given import path_of
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.summary_file import read_summary
+from vggtgeo.results.unfinished import check_is_run
 
 FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
     "colmap": write_colmap,
@@ -55,8 +56,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     place = path_of("source", source)
     if to not in FORMATS:
         raise InputError(f"`to` is {to!r}; it must be one of {', '.join(FORMATS)}")
-    if not (place / "summary.json").is_file():
-        raise InputError(f"`{place}` holds no run (no `summary.json`); give a folder that `vggtgeo run` wrote")
+    check_is_run(place)
     output = path_of("target", target) if target is not None else place / "export" / to
     _check_target(output, place)
     verdict = read_summary(place)[1]

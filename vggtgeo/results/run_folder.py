@@ -30,7 +30,7 @@ from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.checkpoints import check_place, frames_kept
-from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED
+from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED, check_may_be_folder
 
 NAMES = (
     SUMMARY,
@@ -220,8 +220,7 @@ def _end(stage: Path) -> None:
 
 
 def _refuse_input(place: Path, source: Path | None) -> None:
-    if place.exists() and not place.is_dir():
-        raise InputError(f"`{place}` is a file; the results need a folder: give another name with `-o`")
+    check_may_be_folder(place)
     if source is not None and place.exists() and source.is_dir() and place.samefile(source):
         raise InputError(f"`{place}` is the folder that is read; give another folder for the results with `-o`")
     if not place.is_dir():

@@ -1,8 +1,12 @@
-"""Whether a folder holds a run that has not ended; asked by commands that are done before JAX would be loaded."""
+"""What commands ask of a folder before JAX is loaded, which takes seconds: whether it holds a run, whole or one that
+has not ended, and whether one can be written there.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+
+from vggtgeo.io.errors import InputError
 
 UNFINISHED = "unfinished"
 """Folder, inside that of the run, of what a run has written before it is done."""
@@ -19,3 +23,24 @@ def check_finished(folder: Path) -> str | None:
     older = ", and the files beside that are of the run before" if (folder / SUMMARY).is_file() else ""
     further = "; `vggtgeo run --resume` goes on with it" if (stage / CHECKPOINT).is_file() else ""
     return f"a run into `{folder}` goes on or was killed: what it has so far is in `{stage}`{older}{further}"
+
+
+def check_is_run(folder: Path) -> None:
+    """InputError unless `folder` is that of a run."""
+    if not (folder / SUMMARY).is_file():
+        raise InputError(f"`{folder}` holds no run (no `{SUMMARY}`); give a folder that `vggtgeo run` wrote")
+
+
+def check_can_be_shown(folder: Path) -> None:
+    """InputError unless `folder` has the path and the map of a run."""
+    if not folder.is_dir():
+        raise InputError(f"`{folder}` is no folder; give the folder that `vggtgeo run -o` wrote")
+    for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
+        if not (folder / name).is_file():
+            raise InputError(f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote")
+
+
+def check_may_be_folder(place: Path) -> None:
+    """InputError where a file lies in the place of a run's folder."""
+    if place.exists() and not place.is_dir():
+        raise InputError(f"`{place}` is a file; the results need a folder: give another name with `-o`")

@@ -15,17 +15,9 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.summary_file import poses_in
+from vggtgeo.results.unfinished import check_can_be_shown
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import STAND_IN
-
-
-def check_folder(folder: Path) -> None:
-    """InputError unless `folder` holds what `log_folder` needs."""
-    if not folder.is_dir():
-        raise InputError(f"`{folder}` is no folder; give the folder that `vggtgeo run -o` wrote")
-    for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
-        if not (folder / name).is_file():
-            raise InputError(f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote")
 
 
 def recording_of(folder: Path) -> Path | None:
@@ -53,7 +45,7 @@ def log_folder(stream: Any, folder: Path) -> None:
     """
     import rerun as rr
 
-    check_folder(folder)
+    check_can_be_shown(folder)
     trajectory = poses_in(folder, "trajectory.txt")
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.set_time("frame", sequence=0)
