@@ -25,6 +25,7 @@ from test_problem_file import SCENE
 import vggtgeo as vg
 from vggtgeo import evaluation
 from vggtgeo.datasets.in_memory import frame_stream
+from vggtgeo.export import export
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError, InputWarning
@@ -154,6 +155,12 @@ def index(place: Path, **changes: Any) -> None:
 def labels(place: Path, poses: Any) -> None:
     """Other labels of one window."""
     np.savez_compressed(place / "0000001.labels.npz", poses=poses)
+
+
+def result() -> vg.Result:
+    """Of a run that saw nothing."""
+    path = vg.Trajectory([0.0], [EYE])
+    return vg.Result(path, path, CLOUD, (50.0, 50.0, 32.0, 24.0), False, vg.Verdict("failed"), {})
 
 
 CLOUD = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
@@ -318,6 +325,16 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`WindowWriter` into a folder that holds windows", dataset(written)),
     ("`WindowWriter`: a label that is an object", lambda folder: written(folder, poses=object())),
     ("`WindowWriter`: a label called `file`", lambda folder: written(folder, file=1.0)),
+    ("depth in millimetres, in floats", stream(lambda: [(IMAGES[0], DEPTH * 1000), (IMAGES[1], DEPTH * 1000)])),
+    ("depth that is infinite", stream(lambda: [(IMAGES[0], DEPTH * np.inf)])),
+    ("an index that is a text", stream(lambda: [frame(0), frame(1, index="1")])),
+    ("an index of 10^30", stream(lambda: [frame(0), frame(1, index=10**30)])),
+    ("a time of 1e300", stream(lambda: [frame(0), frame(1, timestamp=1e300)])),
+    ("a number as matcher", lambda _: vg.Roles(points=5)),
+    ("a name as depth", lambda _: vg.Roles(depth="moge2-small")),
+    ("a result saved to nothing", lambda _: result().save(None)),
+    ("a result saved to an empty name", lambda _: result().save("")),
+    ("`export` to a list", lambda folder: export(folder, ["ply"])),
     ("`Graduation`: a number in place of widths", lambda _: vg.Graduation(-1)),
 )
 

@@ -1,6 +1,5 @@
 """What every reader gives: frames one after another, the camera, and the truth where there is one."""
 
-import math
 import numbers
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import LATEST, Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
@@ -102,7 +101,7 @@ def check_frame(frame: Frame, camera: Camera) -> None:
     image, depth, time = given.image, given.depth, given.timestamp
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(f"`{frame.name}` has an image {described(image)}; it must be uint8 [H, W, 3], RGB")
-    if not isinstance(time, numbers.Real) or not math.isfinite(time):
+    if not isinstance(time, numbers.Real) or not abs(float(time)) <= LATEST:
         shown = time if isinstance(time, float) else f"{time!r:.60}"
         raise InputError(f"`{frame.name}` has the time {shown}; expected a number of seconds")
     if depth is not None:

@@ -13,8 +13,13 @@ import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_depth, check_selection, described
 from vggtgeo.datasets.image_defects import MOST_PIXELS
+from vggtgeo.datasets.image_files import FARTHEST, NEAREST
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.given import check_whole
+
+_LAST = 2**53
+"""Number of a frame, far beyond any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +66,12 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: floa
 
 def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
     """All frames, with indices that grow; depth that comes after a frame without is told, since it is not used."""
-    last, told = first, first.depth is not None
+    last, told, doubtful = first, first.depth is not None, _tell_of_depth(first)
+    check_whole(f"the index of {first.name}", first.index, 0, _LAST)
     yield first
     for frame in others:
+        check_whole(f"the index of {frame.name}", frame.index, 0, _LAST)
+        doubtful = doubtful or _tell_of_depth(frame)
         if frame.index <= last.index:
             raise InputError(
                 f"`{frame.name}` has the index {frame.index} after {last.index}; number the frames from 0 on, as "
@@ -79,6 +87,22 @@ def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
             told = True
         yield frame
         last = frame
+
+
+def _tell_of_depth(frame: Frame) -> bool:
+    """Whether a frame has depth and none of it is one, which is told: NaN is none, as it should be."""
+    depth = frame.depth
+    if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or np.isnan(depth).all():
+        return False
+    if ((depth >= NEAREST) & (depth <= FARTHEST)).any():
+        return False
+    warnings.warn(
+        f"the depth of `{frame.name}` goes from {np.nanmin(depth):g} to {np.nanmax(depth):g}, and none of it is from "
+        f"{NEAREST:g} to {FARTHEST:g} m: are these metres (millimetres: divide by 1000.0)? It is not used",
+        InputWarning,
+        stacklevel=3,
+    )
+    return True
 
 
 def _frame(item: Any, index: int, rate: float) -> Frame:

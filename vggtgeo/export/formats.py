@@ -54,7 +54,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
 
     """
     place = path_of("source", source)
-    if to not in FORMATS:
+    if to not in tuple(FORMATS):  # a list has no hash
         raise InputError(f"`to` is {to!r}; it must be one of {', '.join(FORMATS)}")
     check_is_run(place)
     output = path_of("target", target) if target is not None else place / "export" / to

@@ -206,7 +206,7 @@ class Result:
                 from a folder, or the folder cannot be written, is in use by a run, or holds a sequence of images.
 
         """
-        with taken_beside(folder) as place:
+        with taken_beside(path_of("folder", folder)) as place:
             return self.save_into(place, depth=depth, frames=frames, settings=settings)
 
     def save_into(

@@ -35,6 +35,16 @@ from vggtgeo.slam.setting_groups import (
 )
 from vggtgeo.slam.still_parts import StillParts
 
+_ASKED = {
+    "points": ("describe", "match"),
+    "lines": ("detect",),
+    "line_matches": ("describe", "match"),
+    "depth": ("estimate",),
+    "confidence": ("confidence",),
+    "geometry": ("locate",),
+}
+"""Methods of the protocols of `models/roles.py`."""
+
 
 @dataclass(frozen=True)
 class Roles:
@@ -63,6 +73,16 @@ class Roles:
     still_parts: StillParts | None = None
     """What of the images, as they are read, belongs to the camera and not to the world: nothing is looked for there.
     `vggtgeo.reconstruct` finds it."""
+
+    def __post_init__(self) -> None:
+        """InputError for what plays no role, which would be found in the middle of a run."""
+        for role, methods in _ASKED.items():
+            given = getattr(self, role)
+            if not all(callable(getattr(given, method, None)) for method in methods):
+                raise InputError(
+                    f"`{role}` is {given!r:.60}; expected an object with the methods {', '.join(methods)}, such as "
+                    f"`vggtgeo.Roles().{role}`"
+                )
 
     def seeded(self, seed: int) -> Roles:
         """The same roles, whose robust estimators draw other samples; 0: as they draw them by themselves."""
