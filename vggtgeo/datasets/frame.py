@@ -101,7 +101,7 @@ def check_frame(frame: Frame, camera: Camera) -> None:
     image, depth, time = given.image, given.depth, given.timestamp
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(f"`{frame.name}` has an image {described(image)}; it must be uint8 [H, W, 3], RGB")
-    if not isinstance(time, numbers.Real) or not abs(float(time)) <= LATEST:
+    if not isinstance(time, numbers.Real) or not -LATEST <= given.timestamp <= LATEST:
         shown = time if isinstance(time, float) else f"{time!r:.60}"
         raise InputError(f"`{frame.name}` has the time {shown}; expected a number of seconds")
     if depth is not None:

@@ -111,7 +111,8 @@ class RunSoFar:
         """Counts on from those of before; InputError where they are of other networks, or no counts."""
         known = {role: len(dataclasses.fields(counts)) for role, counts in refusals.items()}
         found = {role: len(counts) for role, counts in self.refused.items()}
-        if found != known or min((value for counts in self.refused.values() for value in counts), default=0) < 0:
+        strange = any(known.get(role) != count for role, count in found.items())
+        if strange or min((value for counts in self.refused.values() for value in counts), default=0) < 0:
             raise InputError(
                 f"the run that goes on kept {dict(self.refused)} of what networks refused; expected "
                 f"counts of {', '.join(known) or 'none'}: begin anew with `--no-resume`"
