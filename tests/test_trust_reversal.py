@@ -7,22 +7,18 @@ from functools import cache
 
 import numpy as np
 import pytest
+from matched_slam import matched_slam
 from scipy.spatial.transform import Rotation
-from test_keyframe_depth import SIZE, keyframe
 from test_trust_sensor_drift import K
-from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.covisibility import without_matches
-from vggtgeo.slam.keyframe import Slots
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust import reversal
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.reversal import check_reversal
 from vggtgeo.slam.trust.zoom import Unknowns, matches_among
 
 KEYFRAMES, POINTS = 6, 150
-GUESSED = np.array([0.3 * K[0], 0.3 * K[1], 10.0, 10.0])
 
 
 @cache
@@ -35,19 +31,7 @@ def _pan() -> Slam:
     for pose, share in zip(poses, shares, strict=True):
         pose[:3, :3] = Rotation.from_rotvec([0.0, -np.radians(20) * (share - 0.5), 0.0]).as_matrix()
         pose[:3, 3] = -pose[:3, :3] @ (0.5 * (share - 0.5), 0.02 * np.sin(9 * share), -0.05 * share)
-    found, unknown, one = [], np.full(POINTS, np.nan), np.ones(POINTS)
-    for number, pose in enumerate(poses):
-        pixels = rigid.project(world, pose, K) + rng.normal(0, 0.5, (POINTS, 2))
-        slots = Slots(pixels, 1.0 / (world @ pose[2, :3] + pose[2, 3]), unknown, unknown, one, one)
-        made = replace(keyframe(number, np.ones(SIZE), slots), pose=pose)
-        found.append(replace(made, features=Features(made.points.pixels, one)))
-    pairs, rows = [], np.arange(POINTS)
-    for first in range(KEYFRAMES):
-        for second in range(first + 1, KEYFRAMES):
-            points = PointMatches(rows, rows, found[first].points.pixels, found[second].points.pixels, one)
-            pairs.append(replace(without_matches(first, second), points=points))
-    records = [FramePose(k.frame, k.timestamp, k.number, np.eye(4), True, POINTS) for k in found]
-    return Slam(K, K, GUESSED, False, keyframes=tuple(found), pairs=tuple(pairs), frames=tuple(records))
+    return matched_slam(world, poses)
 
 
 @cache

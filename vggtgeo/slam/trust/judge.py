@@ -21,6 +21,7 @@ from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence
 from vggtgeo.slam.trust.extent import check_extent
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
+from vggtgeo.slam.trust.focal_length import check_focal_length
 from vggtgeo.slam.trust.islands import check_islands
 from vggtgeo.slam.trust.own_points import check_own_points
 from vggtgeo.slam.trust.pace import pace
@@ -61,6 +62,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
         found += check_parallax(slam)
         found += check_zoom(slam)
         found += check_reversal(slam)
+        found += check_focal_length(slam)
         found += check_own_points(slam)
     for piece in pieces_by_size(slam) if estimate.started else ():
         own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]

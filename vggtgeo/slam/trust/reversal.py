@@ -27,6 +27,8 @@ from vggtgeo.slam.trust.zoom import (
     linearise,
     match_energies,
     matches_among,
+    one_focal_length,
+    short_stretches,
 )
 
 CHANCE = 0.05
@@ -35,10 +37,7 @@ frames, no truth): t = 3.7 with 4 degrees of freedom, all keyframes are for the 
 the first, whose map moves to the other side with 822 px of focal length (718 and 739 in two runs forwards): 0.5 with 6,
 five of seven keyframes are for the reversal. In five pieces of three clips without calibration (40 to 60 frames, 5 to
 44 keyframes), and in two rooms filmed by phones, every stretch is for the map."""
-STRETCH = 12
-"""Keyframes in a row that are asked together; one stretch that refuses its reversal holds the others of its map."""
 LEAST_KEYFRAMES = 4
-MOST_STRETCHES = 4
 ITERATIONS, SETTLED = 30, 1e-4
 """At most; and the relative fall of the energy below which there are no more."""
 WORST_DAMPING = 1e8
@@ -53,7 +52,7 @@ def check_reversal(slam: Slam) -> list[Finding]:
     if slam.metric or slam.calibrated:
         return []
     asked = False
-    for stretch in _stretches(slam):
+    for stretch in short_stretches(slam):
         sure = refuses_reversal(slam, stretch)
         if sure:
             return []
@@ -97,16 +96,6 @@ def _path(unknowns: Unknowns) -> np.ndarray:
     return np.asarray(centres - centres[0])
 
 
-def _stretches(slam: Slam) -> list[np.ndarray]:
-    """Places of the keyframes of this run, `STRETCH` in a row, evenly spread."""
-    own = np.array([place for place, keyframe in enumerate(slam.keyframes) if keyframe.recorded is None], int)
-    if len(own) < LEAST_KEYFRAMES:
-        return []
-    last = max(len(own) - STRETCH, 0)
-    count = min(int(np.ceil(last / STRETCH)) + 1, MOST_STRETCHES)
-    return [own[start : start + STRETCH] for start in np.unique(np.linspace(0, last, count).astype(int))]
-
-
 def _reversed_poses(seen: Matches, poses: np.ndarray) -> np.ndarray:
     """Poses whose translations from the first one are the opposite, and which turn so that points of the median depth
     are seen where they were; float64 [n, 4, 4].
@@ -136,11 +125,7 @@ def _reversed_depth(depth: np.ndarray) -> np.ndarray:
 
 def _adjusted(seen: Matches, unknowns: Unknowns) -> Unknowns:
     """The minimum that is reached from there, the focal length one for all keyframes."""
-    count = len(unknowns.focal)
-    shared = np.zeros((7 * count, 6 * count + 1))
-    for row in range(count):
-        shared[7 * row : 7 * row + 6, 6 * row : 6 * row + 6] = np.eye(6)
-        shared[7 * row + 6, -1] = 1.0
+    shared = one_focal_length(len(unknowns.focal))
     linear, damping = linearise(seen, unknowns), 1e-3
     for _ in range(ITERATIONS):
         depths = linear.depths * (1 + damping)

@@ -38,6 +38,8 @@ KNOWN = 0.02
 """Standard deviation of a log focal length beyond which that keyframe says nothing."""
 STRETCH = 40
 """Keyframes that are asked together; half of them are in the next stretch, too."""
+SHORT_STRETCH, MOST_SHORT = 12, 4
+"""The same where a whole map is asked something that one part of it can answer, and stretches at most."""
 LEAST_KEYFRAMES = 4
 MOST_MATCHES = 12_000
 """Of a stretch, evenly thinned: more cost time and say no more."""
@@ -200,6 +202,25 @@ def _stretches(slam: Slam) -> Iterable[np.ndarray]:
     last = max(len(own) - STRETCH, 0)
     starts = np.linspace(0, last, int(np.ceil(last / (STRETCH / 2))) + 1).astype(int)
     return (own[start : start + STRETCH] for start in starts if len(own) >= LEAST_KEYFRAMES)
+
+
+def short_stretches(slam: Slam) -> list[np.ndarray]:
+    """Places of the keyframes of this run, `SHORT_STRETCH` in a row, at most `MOST_SHORT` of them, evenly spread."""
+    own = np.array([place for place, keyframe in enumerate(slam.keyframes) if keyframe.recorded is None], int)
+    if len(own) < LEAST_KEYFRAMES:
+        return []
+    last = max(len(own) - SHORT_STRETCH, 0)
+    count = min(int(np.ceil(last / SHORT_STRETCH)) + 1, MOST_SHORT)
+    return [own[start : start + SHORT_STRETCH] for start in np.unique(np.linspace(0, last, count).astype(int))]
+
+
+def one_focal_length(keyframes: int) -> np.ndarray:
+    """What makes the 7 unknowns of each keyframe of 6 of each and one focal length of all: float64 [7n, 6n + 1]."""
+    shared = np.zeros((7 * keyframes, 6 * keyframes + 1))
+    for row in range(keyframes):
+        shared[7 * row : 7 * row + 6, 6 * row : 6 * row + 6] = np.eye(6)
+        shared[7 * row + 6, -1] = 1.0
+    return shared
 
 
 def matches_among(slam: Slam, stretch: np.ndarray) -> Matches | None:
