@@ -145,6 +145,8 @@ def _state(folder: Path) -> bytes:
 
 
 def _windows(folder: Path) -> bytes:
+    for row in range(3):
+        (folder / f"{row:07d}.npz").touch()
     return b'{"windows": 3, "version": 1}'
 
 

@@ -27,6 +27,8 @@ _MADE_OF_OTHERS = tuple(map(ord, "PB"))
 _LOOKED_AT_FRAMES = 6
 """Of a video, at its begin: no camera's noise is the same in two."""
 _CONVERT = "`ffmpeg -i FILE -c:v libx264 NEW.mp4` makes one that it does"
+_PACKETS = b"\0\0\1\xba"
+"""The begin of an MPEG program stream, which is a container."""
 _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 """Control characters other than those of text and terminals; no container of videos is without them."""
 
@@ -73,7 +75,7 @@ class VideoFile:
                     "video of whole pictures"
                 )
             )
-        if not stated > 0:
+        if not stated > 0 and _has_no_container(path):  # a browser's recording states no count, but times
             _warn(
                 InputWarning(
                     f"`{path}` is a stream that states neither its times nor how many frames it has; {rate:g} frames a "
@@ -200,6 +202,13 @@ def _alike(capture: Any, first: np.ndarray) -> bool:
         if not readable or image is None or not np.array_equal(image, first):
             return False
     return True
+
+
+def _has_no_container(path: Path) -> bool:
+    """Whether frames of H.264, MPEG or JPEG lie there one behind the other, without their times."""
+    with path.open("rb") as file:
+        head = file.read(4)
+    return head.startswith((b"\xff\xd8\xff", b"\0\0\1", b"\0\0\0\1")) and head != _PACKETS
 
 
 def _codec(capture: Any) -> str:
