@@ -28,9 +28,10 @@ from vggtgeo.slam.trust.zoom import (
 
 MOST_SIGMA = MOST_FOCAL / 2
 """Standard deviation of the logarithm: with more, the focal length may be off by what is told of one that was given, at
-two of them. The loft has 0.12. Right maps whose camera nobody gave have 0.001 to 0.016 where they know it best: eight
-pieces of 40 to 60 frames of redkitchen, building-walk and corridor-office, 50 stills of a fox, three rooms that phones
-filmed. A stretch that knows it holds the others."""
+two of them. The loft has 0.12. Right maps whose camera nobody gave have 0.001 to 0.016 where they know it best:
+thirteen pieces of 30 to 101 frames of four clips, 50 stills of a fox, three rooms that phones filmed. Simulated, a
+camera that goes 1 m into a room 3 to 6 m deep has 0.08 if it turns by one degree, 0.04 by two, 0.002 by thirty. A
+stretch that knows it holds the others."""
 UNKNOWN = 0.5
 """Standard deviation from which on no number is given."""
 
