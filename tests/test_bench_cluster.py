@@ -26,7 +26,9 @@ folder = pathlib.Path(sys.argv[1])
 job = json.loads((folder / "job.json").read_text())
 time.sleep(0.3)
 row = {name: job[name] for name in ("suite", "sequence", "setting", "seed", "fingerprint")}
-(folder / "row.json").write_text(json.dumps({**row, "status": "ok", "ate_se3_m": 0.01 * job["seed"]}))
+row |= {"status": "ok", "ate_se3_m": 0.01 * job["seed"], "frames": 4, "tracked": 4, "verdict": "good"}
+row |= {"protocol": job["spec"]["protocol"]}
+(folder / "row.json").write_text(json.dumps(row))
 """
 
 

@@ -51,8 +51,9 @@ def _check_term(term: PoseTerm | PairTerm | CameraTerm, keyframes: int) -> None:
     weight = getattr(term.weight, "shape", None)
     if weight is None or len(weight) != 1:
         raise InputError(f"`{term.name}.weight` has shape {weight}; it must be [m], a number an observation")
-    named = () if isinstance(term, CameraTerm) else term.touched()
-    for field, value in (*term.data().items(), *(("keyframes", index) for index in named)):
+    fields = ("keyframe",) if isinstance(term, PoseTerm) else ("first", "second") if isinstance(term, PairTerm) else ()
+    named = {field: getattr(term, field) for field in fields}
+    for field, value in (*term.data().items(), *named.items()):
         for leaf in jax.tree.leaves(value):
             shape = getattr(leaf, "shape", ())
             if shape[:1] != weight:
@@ -60,7 +61,7 @@ def _check_term(term: PoseTerm | PairTerm | CameraTerm, keyframes: int) -> None:
                     f"`{term.name}.{field}` has shape {shape}, `{term.name}.weight` {weight}; both must be arrays, "
                     "with a row an observation"
                 )
-    for index in named:
+    for index in named.values():
         if not isinstance(index, jax.core.Tracer) and not isinstance(term.weights, jax.core.Tracer):
             asked = np.asarray(index)[np.asarray(term.weights) > 0]
             if asked.size and not 0 <= asked.min() <= asked.max() < keyframes:
