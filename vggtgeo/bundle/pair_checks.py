@@ -62,8 +62,8 @@ def _check_term(term: PoseTerm | PairTerm | CameraTerm, keyframes: int) -> None:
                     "with a row an observation"
                 )
     for index in named.values():
-        if not isinstance(index, jax.core.Tracer) and not isinstance(term.weights, jax.core.Tracer):
-            asked = np.asarray(index)[np.asarray(term.weights) > 0]
+        if not isinstance(index, jax.core.Tracer) and not isinstance(term.weight, jax.core.Tracer):
+            asked = np.asarray(index)[np.asarray(term.weight) > 0]
             if asked.size and not 0 <= asked.min() <= asked.max() < keyframes:
                 wrong = asked.min() if asked.min() < 0 else asked.max()
                 raise InputError(
