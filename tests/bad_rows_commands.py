@@ -1,8 +1,7 @@
-"""Rows of the table of bad inputs: command lines, settings, outputs, networks, results and environments."""
+"""Rows of the table of bad inputs: command lines, settings, networks and environments."""
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,15 +10,14 @@ from typing import Any
 import bad_files as bad
 import numpy as np
 import pytest
-import tiny_sequences as tiny
 from bad_row import Row, good, line, nothing, rows, run_with
+from bad_rows_outputs import OUTPUT, linked_to_itself
+from bad_rows_results import RESULTS, TRAJECTORIES, folder_of_run, summary_of
 
 from vggtgeo.cli.address_space import check_address_space
 from vggtgeo.export import export
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.jax_environment import cache_folder
-from vggtgeo.results.result import Result
-from vggtgeo.results.run_folder import taken
 
 
 def flags(*words: Any) -> dict[str, Any]:
@@ -37,16 +35,6 @@ def settings(content: str | bytes) -> dict[str, Any]:
     return {"make": make, "argv": lambda made: [*run_with("--settings", made.parent / "run.toml")(made)]}
 
 
-def output(make: Any, name: str) -> dict[str, Any]:
-    """`vggtgeo run` on good images into something that is there already."""
-
-    def both(folder: Path) -> Path:
-        make(folder / name)
-        return good(folder)
-
-    return {"make": both, "argv": lambda made: ["run", made, "-o", made.parent / name]}
-
-
 def network(content: bytes | None, *words: Any) -> dict[str, Any]:
     """`vggtgeo models verify` of a file."""
     make = nothing if content is None else bad.file("net.onnx", content)
@@ -54,27 +42,6 @@ def network(content: bytes | None, *words: Any) -> dict[str, Any]:
         "make": make,
         "argv": lambda made: ["models", "verify", made if content is not None else made / "net.onnx", *words],
     }
-
-
-def evaluated(estimate: Any, reference: Any, *words: Any) -> dict[str, Any]:
-    """`vggtgeo evaluate` of two trajectories."""
-
-    def make(folder: Path) -> Path:
-        estimate(folder / "estimate.txt")
-        reference(folder / "truth.txt")
-        return folder
-
-    return {"make": make, "argv": lambda made: ["evaluate", made / "estimate.txt", made / "truth.txt", *words]}
-
-
-def walk(seed: int = 0, **options: Any) -> Any:
-    """Makes a trajectory file."""
-    return lambda path: bad.walk(path, seed, **options)
-
-
-def write(content: str) -> Any:
-    """Makes a file."""
-    return lambda path: path.write_text(content)
 
 
 def onto(name: str, flag: str) -> Any:
@@ -90,98 +57,14 @@ def onto(name: str, flag: str) -> Any:
     return argv
 
 
-def somebodys_map(folder: Path) -> None:
-    """A folder with a file that a run would replace."""
-    folder.mkdir()
-    (folder / "map.ply").write_text("of the user")
-
-
-def somebodys(name: str, link: bool = False) -> Any:
-    """A folder with a file, or a link to one, where a run puts something of its own."""
-
-    def make(folder: Path) -> None:
-        place = folder / name
-        place.parent.mkdir(parents=True)
-        if link:
-            (folder / "diary.txt").write_text("of the user")
-            place.symlink_to(folder / "diary.txt")
-        else:
-            place.write_text("of the user")
-
-    return make
-
-
 def below_output(flag: str, name: str) -> Callable[[Any], list[Any]]:
     """A run with a file below its own output."""
     return lambda made: [*run_with(flag, made.parent / "out" / name)(made)]
 
 
-def into_garbage(made: Path) -> Any:
-    """A run into the folder of one that was killed, whose state is something else."""
-    (made.parent / "out/unfinished").mkdir(parents=True)
-    (made.parent / "out/unfinished/checkpoint.npz").write_text("no state")
-    return run_with("--resume")(made)
-
-
-def euroc_backwards(path: Path) -> None:
-    """A trajectory of 17 columns, times in nanoseconds, its last line the first."""
-    lines = [f"{10**18 + number * 10**9 // 30},{number % 7},{number % 3},0,1" + ",0" * 12 for number in range(60)]
-    path.write_text("\n".join(reversed(lines)) + "\n")
-
-
 def verify(made: Path) -> Any:
     """`vggtgeo models verify`."""
     return ["models", "verify", made]
-
-
-def result_with_images(folder: Path) -> Path:
-    """A run's folder whose pictures are the input of the next."""
-    bad.frames(folder / "r/images")
-    return folder_of_run("{}")(folder / "r")
-
-
-def folder_of_run(summary: str, unfinished: bool = False) -> Any:
-    """A run's folder with this summary."""
-
-    def make(folder: Path) -> Path:
-        (folder / "summary.json").write_text(summary)
-        if unfinished:
-            (folder / "unfinished").mkdir()
-        return folder
-
-    return make
-
-
-def run_that_counts(poses: int) -> Any:
-    """A run's folder of sixty poses, whose summary counts others."""
-
-    def make(folder: Path) -> Path:
-        counted = json.loads(summary_of("good")) | {"pieces": [{"poses": poses, "keyframes": 60}]}
-        for name in ("trajectory.txt", "keyframes.txt"):
-            bad.walk(folder / name, 0)
-        return folder_of_run(json.dumps(counted))(folder)  # type: ignore[no-any-return]
-
-    return make
-
-
-def to_tum(made: Path) -> Any:
-    """`vggtgeo export` of its poses."""
-    return ["export", made, "--to", "tum", "-o", made / "tum"]
-
-
-def backwards(path: Path) -> None:
-    """A trajectory whose last pose comes first."""
-    path.write_text("\n".join(bad.walk(path, 0).read_text().splitlines()[::-1]))
-
-
-def twice(path: Path) -> None:
-    """A trajectory in which each pose stands twice."""
-    path.write_text("\n".join(line for line in bad.walk(path, 0).read_text().splitlines() for _ in range(2)))
-
-
-def from_a_spreadsheet(path: Path) -> None:
-    """A trajectory as other programs write text."""
-    path.write_bytes(b"\xef\xbb\xbf" + bad.walk(path, 0).read_bytes().replace(b" ", b",").replace(b"\n", b"\r\n"))
 
 
 def simulated(*words: str) -> Any:
@@ -203,12 +86,6 @@ def suite(content: str) -> Any:
     return lambda folder: bad.file("suite.toml", content)(folder).parent
 
 
-def locked(folder: Path) -> None:
-    """A run into a folder that another run holds."""
-    with taken(folder / "out"), taken(folder / "out"):
-        pass
-
-
 def without_home(folder: Path) -> None:
     """No home folder, and one that cannot be written: there is no cache, and that is all."""
     with pytest.MonkeyPatch.context() as patch:
@@ -226,11 +103,6 @@ def limited(gigabytes: float) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("resource.getrlimit", lambda kind: (int(gigabytes * 1e9), -1))
         check_address_space("run")
-
-
-def summary_of(level: str, *reasons: str) -> str:
-    """A run's summary with this verdict."""
-    return json.dumps({"verdict": {"level": level, "reasons": reasons, "segments": []}, "scale": "metric"})
 
 
 def run_without_points(folder: Path) -> Path:
@@ -259,16 +131,6 @@ def exported_over(folder: Path) -> Path:
         bad.walk(folder / f"run/{name}.txt", 0)
     bad.walk(folder / "mine/trajectory.txt", 1)
     return folder
-
-
-def linked_to_itself(name: str) -> Any:
-    """Good images, and beside them a link to itself."""
-
-    def make(folder: Path) -> Path:
-        (folder / name).symlink_to(name)
-        return good(folder)
-
-    return make
 
 
 def run_and_link(folder: Path) -> Path:
@@ -365,6 +227,8 @@ RUN = rows(
         ("the reader of folders on a file", bad.file("clip.mp4", b"no"), flags("--kind", "tum")),
     ],
 )
+
+
 SETTINGS = rows(
     "Settings files",
     [
@@ -388,43 +252,8 @@ SETTINGS = rows(
         ("a date for a number", None, settings("stride = 2024-01-01")),
     ],
 )
-OUTPUT = rows(
-    "The output folder",
-    [
-        ("a file", None, output(write(""), "out")),
-        ("a folder of images", None, output(bad.frames, "pictures")),
-        ("a TUM folder", None, output(tiny.tum, "desk")),
-        ("the folder that is read", good, {"argv": lambda made: ["run", made, "-o", made]}),
-        ("a folder with a `map.ply`, and no run's summary", None, output(somebodys_map, "things")),
-        (
-            "a folder in whose `images` the images that are read lie",
-            result_with_images,
-            {"argv": lambda made: ["run", made / "images", "-o", made]},
-        ),
-        ("a folder that another run writes", nothing, {"call": locked}),
-        ("a folder whose `.lock` is a link to somebody's file", None, output(somebodys(".lock", link=True), "things")),
-        ("a folder whose `.lock` is somebody's file", None, output(somebodys(".lock"), "things")),
-        ("a folder with a state of a killed run that is none", good, {"argv": into_garbage}),
-        ("a folder with a file that is called `unfinished`", None, output(somebodys("unfinished"), "things")),
-        ("a folder with somebody's files in `unfinished`", None, output(somebodys("unfinished/mine.txt"), "things")),
-        ("the root of the file system", good, {"argv": lambda made: ["run", made, "-o", "/"]}),
-        ("a link to itself", linked_to_itself("out"), {"argv": lambda made: ["run", made, "-o", made.parent / "out"]}),
-        (
-            "a folder below a link to itself",
-            linked_to_itself("out"),
-            {"argv": lambda made: ["run", made, "-o", made.parent / "out/deeper"]},
-        ),
-        ("of `solve`: a folder", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made.parent]}),
-        ("of `solve`: a device", bad.problem(), {"argv": lambda made: ["solve", made, "-o", "/dev/full"]}),
-        ("of `solve`: the problem", bad.problem(), {"argv": lambda made: ["solve", made, "-o", made]}),
-        (
-            "of `simulate`: a link that leads nowhere",
-            lambda folder: (folder / "out").symlink_to(folder / "nowhere") or folder / "out",
-            {"argv": lambda made: ["simulate", "room", "-o", made]},
-        ),
-        ("of `simulate`: a folder with files", good, {"argv": lambda made: ["simulate", "room", "-o", made]}),
-    ],
-)
+
+
 OTHERS = rows(
     "Other commands",
     [
@@ -500,35 +329,8 @@ OTHERS = rows(
         ),
     ],
 )
-TRAJECTORIES = rows(
-    "`vggtgeo evaluate`",
-    [
-        ("a file that is not there", nothing, {"argv": line("evaluate", "no.txt", "no.txt")}),
-        ("`--delta inf`", None, evaluated(walk(), walk(), "--delta", "inf")),
-        ("columns in the order t q p", None, evaluated(write("0 1 0 0 0 2.5 1.5 3.5\n"), walk())),
-        ("`--delta 0`", None, evaluated(walk(), walk(), "--delta", "0")),
-        ("`--max-dt -1`", None, evaluated(walk(), walk(), "--max-dt", "-1")),
-        ("times that never meet", None, evaluated(walk(), walk(start=1e6))),
-        ("few times that meet", None, evaluated(walk(), walk(start=1.5))),
-        ("the truth of another sequence", None, evaluated(walk(0), walk(1))),
-        ("EuRoC's columns, out of order", None, evaluated(euroc_backwards, walk(start=1e9))),
-        (
-            "a dataset without truth",
-            good,
-            {"argv": lambda made: ["evaluate", bad.walk(made.parent / "e.txt", 0), made]},
-        ),
-        ("words", None, evaluated(write("a b c d e f g h\n"), walk())),
-        ("seven columns", None, evaluated(write("0 0 0 0 0 0 1\n"), walk())),
-        ("a NaN", None, evaluated(write("0 nan 0 0 0 0 0 1\n"), walk())),
-        ("a quaternion of length zero", None, evaluated(write("0 0 0 0 0 0 0 0\n"), walk())),
-        ("no pose", None, evaluated(write("# nothing\n"), walk())),
-        ("20 GB of zeros", None, evaluated(bad.lengthened, walk())),
-        ("binary data", None, evaluated(lambda path: path.write_bytes(bytes(range(256)) * 9), walk())),
-        ("times out of order", None, evaluated(backwards, walk())),
-        ("each pose twice", None, evaluated(twice, walk())),
-        ("commas, a byte order mark and CR LF", None, evaluated(from_a_spreadsheet, walk())),
-    ],
-)
+
+
 NETWORKS = rows(
     "Network files",
     [
@@ -546,21 +348,8 @@ NETWORKS = rows(
     ],
     slack=3.0,
 )
-RESULTS = rows(
-    "A run's folder that is read",
-    [
-        ("without a summary", nothing, {}),
-        ("a summary that is no JSON", folder_of_run("{"), {}),
-        ("a summary of 20 GB", lambda folder: bad.lengthened(folder / "summary.json").parent, {}),
-        ("a summary that is a list", folder_of_run("[1, 2]"), {}),
-        ("a summary that lacks the intrinsics", folder_of_run(summary_of("good")), {}),
-        ("ten thousand brackets", folder_of_run("[" * 10_000), {}),
-        ("a run that was killed", folder_of_run("{}", unfinished=True), {}),
-        ("a trajectory that lost its last lines", run_that_counts(90), {"argv": to_tum}),
-        ("a trajectory with more poses than the run had", run_that_counts(50), {"argv": to_tum}),
-    ],
-    call=Result.load,
-)
+
+
 ENVIRONMENT = rows(
     "Environment",
     [
@@ -569,4 +358,6 @@ ENVIRONMENT = rows(
         ("`ulimit -v` that is small", nothing, {"call": lambda made: limited(4.0)}),
     ],
 )
+
+
 COMMANDS: list[Row] = [*RUN, *SETTINGS, *OUTPUT, *OTHERS, *TRAJECTORIES, *NETWORKS, *RESULTS, *ENVIRONMENT]

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import ROOT
-from decoders import ANY
+from decoders import ANSWER, ANY
 
 from vggtgeo.datasets import open_sequence, video
 from vggtgeo.datasets.tiff_tags import tiff_tags
@@ -86,7 +86,10 @@ def test_answers_that_lost_some_bytes_are_computed_again(tmp_path: Path) -> None
     header[entry + 16 : entry + 28] = bytes(12)  # its check sum and its sizes
     for content in (*shortened, bytes(header), b"\x93NUMPY\x01\x00\x00\x00", b"\x80\x04.", b""):
         file = put("cached answer", lambda _, content=content: content, tmp_path / "made")
-        ANY["cached answer"].read(file)
+        found = ANY["cached answer"].read(file)
+        assert found.keys() == ANSWER.keys()
+        for name, value in ANSWER.items():
+            np.testing.assert_array_equal(found[name], value)
         shutil.rmtree(tmp_path / "made")
 
 

@@ -13,13 +13,19 @@ from test_keyframe_depth import INTRINSICS, SIZE, keyframe
 from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.frame_poses import frame_poses
 from vggtgeo.slam.keyframe import Slots
 from vggtgeo.slam.state import FramePose, SeenPoints, Slam
+from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.own_points import IN_A_ROW, agreeing_landmarks, check_own_points
 
 FRAMES, POINTS = 24, 120
 FIRST_OFF = 12
+
+
+def _told(slam: Slam) -> list[Finding]:
+    return check_own_points(slam, frame_poses(slam)[1])
 
 
 def _glide(noise: float) -> Slam:
@@ -60,15 +66,15 @@ def _with_wrong_depths(slam: Slam) -> Slam:
 def test_right_map_is_silent_in_any_noise(noise: float) -> None:
     """All but one landmark in ninety, and what a robust fit leaves of that, agree."""
     slam = _glide(noise)
-    rows, shares = agreeing_landmarks(slam)
+    rows, shares = agreeing_landmarks(slam, frame_poses(slam)[1])
     np.testing.assert_array_equal(rows, np.arange(1, FRAMES))
     assert np.median(shares) > 0.95
-    assert check_own_points(slam) == []
+    assert _told(slam) == []
 
 
 def test_map_of_wrong_depths_is_told_where_its_frames_have_moved() -> None:
     """Each frame is placed by the far two thirds, and what is near is elsewhere by more the farther it has moved."""
-    (finding,) = check_own_points(_with_wrong_depths(_glide(0.5)))
+    (finding,) = _told(_with_wrong_depths(_glide(0.5)))
     assert finding.level == "degraded"
     assert not finding.local
     assert finding.end == FRAMES - 1
@@ -79,6 +85,6 @@ def test_map_of_wrong_depths_is_told_where_its_frames_have_moved() -> None:
 
 def test_nothing_is_asked_with_depth_of_few_frames_and_before_the_end() -> None:
     wrong = _with_wrong_depths(_glide(0.5))
-    assert check_own_points(replace(wrong, metric=True)) == []
-    assert check_own_points(replace(wrong, frames=wrong.frames[:IN_A_ROW])) == []
-    assert check_own_points(replace(wrong, pose_sigma=None)) == []
+    assert _told(replace(wrong, metric=True)) == []
+    assert _told(replace(wrong, frames=wrong.frames[:IN_A_ROW])) == []
+    assert _told(replace(wrong, pose_sigma=None)) == []

@@ -181,7 +181,7 @@ class _LazyGroup(TyperGroup):
 def _at_home(word: str) -> str:
     """`~` as the home folder where a shell leaves it as it is: in quotes, and in `--output=~/runs`."""
     option, equals, value = word.partition("=") if word.startswith("-") else ("", "", word)
-    return option + equals + (os.path.expanduser(value) if value.startswith("~") else value)
+    return option + equals + os.path.expanduser(value)
 
 
 def load_command(entry: CommandEntry) -> Any:

@@ -126,11 +126,7 @@ def _checked(
         wanted, accepted = _KINDS.get(types[names[key]], ("text in quotes", (str,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
             raise InputError(f"`{path}`: `{key}` is {_short(value)}; it must be {wanted}")
-    return {names[key]: _at_home(value) for key, value in given.items()}
-
-
-def _at_home(value: Any) -> Any:
-    return os.path.expanduser(value) if isinstance(value, str) and value.startswith("~") else value
+    return {names[key]: os.path.expanduser(value) if isinstance(value, str) else value for key, value in given.items()}
 
 
 def _short(value: Any) -> str:

@@ -53,14 +53,14 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     return times, found
 
 
-def off_landmarks(slam: Slam) -> dict[int, np.ndarray]:
+def off_landmarks(slam: Slam, poses: np.ndarray) -> dict[int, np.ndarray]:
     """How far the finished map is from where frames that points alone placed show it, by row of `slam.frames`: pixels
-    [m], infinite of a landmark behind the camera. Frames that keep too few are left out, and all before the end.
+    [m], infinite of a landmark behind the camera. Frames that keep too few are left out, and all before the end. poses:
+    of `frame_poses`.
     """
     if slam.pose_sigma is None or len(slam.pose_sigma) != len(slam.keyframes):
         return {}
-    poses, motions = frame_poses(slam)[1], _motions(slam)
-    found = {}
+    found, motions = {}, _motions(slam)
     for row in _placed_by_points(slam):
         points, pixels = _sight(slam, row, poses[row], motions)
         if len(points) >= LEAST_POINTS:

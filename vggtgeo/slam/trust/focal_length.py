@@ -32,23 +32,23 @@ two of them. The loft has 0.12. Right maps whose camera nobody gave have 0.001 t
 thirteen pieces of 30 to 101 frames of four clips, 50 stills of a fox, three rooms that phones filmed. Simulated, a
 camera that goes 1 m into a room 3 to 6 m deep has 0.08 if it turns by one degree, 0.04 by two, 0.002 by thirty. A
 stretch that knows it holds the others."""
-UNKNOWN = 0.5
-"""Standard deviation from which on no number is given."""
 
 
 def check_focal_length(slam: Slam) -> list[Finding]:
     """Whether no stretch of the map knows the focal length that the run found."""
     if slam.metric or slam.calibrated:
         return []
-    sigmas = [sigma for stretch in short_stretches(slam) if (sigma := focal_sigma(slam, stretch)) is not None]
-    if not sigmas or min(sigmas) <= MOST_SIGMA:
+    asked = False
+    for stretch in short_stretches(slam):
+        sigma = focal_sigma(slam, stretch)
+        if sigma is not None and sigma <= MOST_SIGMA:
+            return []
+        asked = asked or sigma is not None
+    if not asked:
         return []
-    most = min(sigmas)
-    how = f"to {100 * np.expm1(most):.0f} % only" if most < UNKNOWN else "not at all"
     text = (
-        f"nobody gave the camera, and its focal length, {slam.intrinsics[0]:.0f} px, is known {how} (one standard "
-        "deviation): the camera hardly turned where it moved; the map may be stretched along its view by as much; give "
-        "the intrinsics"
+        f"nobody gave the camera, and the images hardly determine its focal length, {slam.intrinsics[0]:.0f} px: the "
+        "camera hardly turned where it moved; the map may be stretched along its view; give the intrinsics"
     )
     return [Finding("calibration", "degraded", text)]
 

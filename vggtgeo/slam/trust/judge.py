@@ -63,7 +63,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
         found += check_zoom(slam)
         found += check_reversal(slam)
         found += check_focal_length(slam)
-        found += check_own_points(slam)
+        found += check_own_points(slam, estimate.poses)
     for piece in pieces_by_size(slam) if estimate.started else ():
         own = [keyframe for number in piece if (keyframe := slam.keyframes[number]).recorded is None]
         found += check_matches(own, estimate.intrinsics, estimate.pieces == 1, estimate.metric)

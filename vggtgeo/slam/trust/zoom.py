@@ -198,7 +198,7 @@ class Linear:
 
 def _stretches(slam: Slam) -> Iterable[np.ndarray]:
     """Places of the keyframes of this run, in stretches that overlap by half."""
-    own = np.array([place for place, keyframe in enumerate(slam.keyframes) if keyframe.recorded is None], int)
+    own = _own_keyframes(slam)
     last = max(len(own) - STRETCH, 0)
     starts = np.linspace(0, last, int(np.ceil(last / (STRETCH / 2))) + 1).astype(int)
     return (own[start : start + STRETCH] for start in starts if len(own) >= LEAST_KEYFRAMES)
@@ -206,12 +206,17 @@ def _stretches(slam: Slam) -> Iterable[np.ndarray]:
 
 def short_stretches(slam: Slam) -> list[np.ndarray]:
     """Places of the keyframes of this run, `SHORT_STRETCH` in a row, at most `MOST_SHORT` of them, evenly spread."""
-    own = np.array([place for place, keyframe in enumerate(slam.keyframes) if keyframe.recorded is None], int)
+    own = _own_keyframes(slam)
     if len(own) < LEAST_KEYFRAMES:
         return []
     last = max(len(own) - SHORT_STRETCH, 0)
     count = min(int(np.ceil(last / SHORT_STRETCH)) + 1, MOST_SHORT)
     return [own[start : start + SHORT_STRETCH] for start in np.unique(np.linspace(0, last, count).astype(int))]
+
+
+def _own_keyframes(slam: Slam) -> np.ndarray:
+    """Places of those that are not of a known map."""
+    return np.array([place for place, keyframe in enumerate(slam.keyframes) if keyframe.recorded is None], int)
 
 
 def one_focal_length(keyframes: int) -> np.ndarray:
