@@ -75,5 +75,4 @@ def checked_points(name: str, given: Float[np.ndarray, "n 3"]) -> Float[np.ndarr
 
 def _tree(points: np.ndarray) -> cKDTree:
     """Of every place once: a tree cannot part equal points, and each query would look at all of them."""
-    ordered = points[np.lexsort(points.T)]
-    return cKDTree(ordered[np.concatenate([[True], (np.diff(ordered, axis=0) != 0).any(axis=1)])])
+    return cKDTree(np.unique(points, axis=0))
