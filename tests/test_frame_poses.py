@@ -76,6 +76,16 @@ def test_a_frame_goes_to_where_the_finished_map_explains_what_it_shows() -> None
     np.testing.assert_array_equal(times, [0.0, 0.1, 0.2])
 
 
+def test_without_depth_what_tracking_knew_counts_less() -> None:
+    """Tracked 2 cm aside, sure to 2 cm by matches that share the errors of old depths: six times less is left of that
+    than where depths were measured; oracle: the true pose, which the points show without noise.
+    """
+    slam, pose = walked(np.random.default_rng(0))
+    slam = with_second(slam, evidence=Evidence(sigma_translation=0.02, sigma_rotation=0.01))
+    left, measured = off(slam, pose), off(replace(slam, metric=True), pose)
+    assert 4 * left < measured
+
+
 def test_what_the_adjustment_did_to_points_and_keyframe_counts() -> None:
     """The keyframe moved and its points nearer: the frame is placed by them as they are; oracle: the same world, seen
     from where the keyframe is now.

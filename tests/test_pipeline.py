@@ -260,6 +260,9 @@ def test_rgb_recovers_the_shape(room) -> None:
     _, poses = frame_poses(slam)
     for keyframe in slam.keyframes:
         assert np.array_equal(poses[keyframe.frame], keyframe.pose)  # the second one began the map with the first
+    numbers = {keyframe.frame for keyframe in slam.keyframes}
+    between = [record.evidence for record in slam.frames if record.frame not in numbers]
+    assert all(np.isfinite(evidence.sigma_translation) for evidence in between)  # and of those that waited for the map
     assert len(slam.ties) >= len(slam.keyframes) - 2
     adjustment, _ = window_problem(slam, [slam.keyframes[number] for number in slam.window], SETTINGS)
     (motions,) = (term for term in adjustment.problem.terms if isinstance(term, RelativePose))
@@ -314,6 +317,7 @@ def test_a_map_begins_where_depth_does(room) -> None:
     assert all(record.tracked for record in slam.frames)
     assert any("the map begins at frame 3" in note for note in slam.notes), slam.notes
     assert error < 0.015, f"ATE {error:.4f} m"
+    assert all(0 < record.evidence.sigma_translation < 0.05 for record in slam.frames[:3])  # those that waited
 
 
 @pytest.mark.long

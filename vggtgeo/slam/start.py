@@ -9,13 +9,12 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
-from vggtgeo.models.roles import Features, GeometryResult, PointMatches, PoseQuery, StartGuess
+from vggtgeo.models.roles import Features, GeometryResult, PointMatches, StartGuess
 from vggtgeo.slam.description import Description
-from vggtgeo.slam.following import Located
 from vggtgeo.slam.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.settings import Roles, SlamSettings
 from vggtgeo.slam.state import FramePose, Slam, Waiting
-from vggtgeo.slam.tracking import PIXEL_SIGMA
+from vggtgeo.slam.tracking import Sight, track
 from vggtgeo.slam.window import adjust, enter, scale_anchor
 
 NOMINAL_DEPTH = 2.5
@@ -153,18 +152,16 @@ def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
 
 
 def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
-    """Give the frames that waited their poses by the new map."""
+    """Give the frames that waited their poses by the new map, as far as they are to be believed."""
     placed = {}
-    for frame in slam.waiting:
-        matches = roles.points.match(first.features, frame.features)
-        inverse = first.points.inverse_depth[matches.index_i]
-        matches, inverse = matches.select(np.isfinite(inverse)), inverse[np.isfinite(inverse)]
-        points = rigid.unproject(matches.pixels_i, inverse, first.pose, slam.intrinsics)
-        query = PoseQuery(frame.image, slam.intrinsics, points, matches.pixels_j, matches.confidence)
-        guess = roles.geometry.locate(query)
-        if guess.result is GeometryResult.SUCCESS:
-            relative = guess.pose @ rigid.invert(first.pose)
-            located = Located(guess, len(matches), points, PIXEL_SIGMA, matches.index_i, matches.pixels_j)
-            record = FramePose(frame.frame, frame.timestamp, first.number, relative, True, guess.inlier_count)
-            placed[frame.frame] = replace(record, seen=located.seen)
+    for waiting in slam.waiting:
+        frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
+        sight = Sight(frame, Description.of(waiting.features), None)
+        found = track(sight, first, None, None, slam.intrinsics, roles)
+        if found.accepted:
+            evidence = found.evidence
+            record = FramePose(
+                *(frame.index, frame.timestamp, first.number, found.relative, True, evidence.inliers, evidence)
+            )
+            placed[frame.index] = replace(record, seen=found.seen)
     return replace(slam, frames=tuple(placed.get(record.frame, record) for record in slam.frames))
