@@ -12,7 +12,7 @@ from witness import walk
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.trust.edges import EVERY, LEAST_FRAMES, MOST_ELSEWHERE, check_edges, edges_elsewhere
+from vggtgeo.slam.trust.edges import EVERY, IN_A_ROW, LEAST_FRAMES, MOST_ELSEWHERE, check_edges, edges_elsewhere
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 
 SIZE = (240, 320)
@@ -99,6 +99,28 @@ def test_what_is_told() -> None:
         (many, lost),
     ):
         assert check_edges(claim, harmless) == []
+
+
+@pytest.mark.parametrize("wrong", [slice(0, 45), slice(45, 90), slice(75, 120)])
+def test_a_part_of_a_run_is_told(wrong: slice) -> None:
+    """Depth of 45 of 120 frames that is late, of which the mean of the whole run says nothing; oracle: which they are.
+    Frames that the parts share with right ones are told with them.
+    """
+    estimate = walk(count=120).estimate
+    shares = np.full(120, np.nan)
+    shares[::EVERY] = 0.03
+    shares[wrong][::EVERY] = 0.5
+    assert np.nanmean(shares) < MOST_ELSEWHERE
+    (finding,) = check_edges(estimate, shares)
+    assert finding.start is not None
+    assert finding.end is not None
+    part = EVERY * IN_A_ROW
+    assert max(wrong.start - part, 0) <= finding.start <= wrong.start + EVERY
+    assert wrong.stop - 2 * EVERY <= finding.end <= min(wrong.stop + part, 120)
+    assert f"frames {finding.start} to {finding.end}: " in finding.text
+    few = np.where(np.arange(120) < 6 * EVERY, 0.5, 0.03)  # six pictures with edges elsewhere may be chance
+    few[np.isnan(shares)] = np.nan
+    assert check_edges(estimate, few) == []
 
 
 def test_a_rendered_run_is_told_nothing() -> None:
