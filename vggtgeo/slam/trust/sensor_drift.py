@@ -247,13 +247,18 @@ _NOTHING = Factors(_UNKNOWN, _UNKNOWN)
 
 
 def depth_pairs(slam: Slam, stretch: range) -> Iterator[DepthPair]:
-    """Both directions of pairs of keyframes in a stretch, evenly over it: errors of depth pull them apart. Where a
-    rolling shutter was found they are without it: turning up or down, it stretches the picture as a lens does.
+    """Pairs of keyframes in a stretch, evenly over it."""
+    inside = [pair for pair in slam.pairs if pair.first in stretch and pair.second in stretch]
+    rows = np.unique(np.linspace(0, len(inside) - 1, MOST_PAIRS).astype(int)) if inside else ()
+    yield from directed_pairs(slam, [inside[row] for row in rows])
+
+
+def directed_pairs(slam: Slam, pairs: list[Pair]) -> Iterator[DepthPair]:
+    """Both directions of pairs of keyframes: errors of depth pull them apart. Where a rolling shutter was found they
+    are without it: turning up or down, it stretches the picture as a lens does.
     """
     motions = None if slam.readout is None else camera_motions(slam, len(slam.keyframes))
-    inside = [pair for pair in slam.pairs if pair.first in stretch and pair.second in stretch]
-    for row in np.unique(np.linspace(0, len(inside) - 1, MOST_PAIRS).astype(int)) if inside else ():
-        pair = inside[row]
+    for pair in pairs:
         first, second = slam.keyframes[pair.first], slam.keyframes[pair.second]
         for found in (_directed(pair, first, second, False), _directed(pair, second, first, True)):
             if len(found.depth) >= LEAST_MATCHES and np.median(_flow(found)) >= LEAST_FLOW:

@@ -1,0 +1,115 @@
+"""With measured depth: do the lens and the unit of the depth change at once, or within a few keyframes?
+
+A depth camera that starts again in another mode, a phone's app that finds another scale, recordings that were joined:
+from some frame on all depth is a fifth longer, and so is the path. `sensor_drift.py` looks for what changes steadily:
+in a map of thirty keyframes the few pairs across a jump are outliers to its lines. `enlargement.py` looks from picture
+to picture, and has to leave room for steps of the camera.
+
+So the pairs of keyframes across each place between two neighbours are asked, by the factors of `sensor_drift.py`: the
+motion of their own matches explains what they see, whatever the map made of it. The neighbours are asked first, and
+where they speak of a jump, the keyframes next to them, which have to say the same. The sum of the logarithms over up to
+`WITHIN` places is a change; a longer sum adds up what a sensor measures wrongly at a distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from vggtgeo.slam.covisibility import Pair
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.trust.finding import Finding
+from vggtgeo.slam.trust.sensor_drift import MOST_ZOOM, SIGMAS, compare, directed_pairs
+
+MOST_CHANGE = MOST_ZOOM
+"""Of the logarithm of either factor: what is told of a focal length, or a scale, that is off as a whole. Over any 1 to
+20 places right depth has at most 0.024 (64 and 39 keyframes of building-walk and corridor-office, 14 of redkitchen, 6
+of icl-office), 0.053 with 3 % of noise a metre, and right lenses 0.020 to 0.062; depth that is 1.2 times as long from a
+frame on, and at most 0.02 elsewhere, has 0.181 to 0.185 at one place; depth that is two frames late in a part 0.17."""
+LEAST_SIGMA = 0.005
+"""Standard deviation of a logarithm between two neighbours, at least: over 20 places nothing below 0.11 is told. Right
+ones spread by 0.001 to 0.009."""
+WITHIN = 20
+"""Places between keyframes."""
+REACH = 2
+"""Keyframes that a pair is apart at most."""
+LEAST_PAIRS = 2
+"""Across a jump: the matches of one may be those of something that moves."""
+
+
+def check_jumps(slam: Slam) -> Iterator[Finding]:
+    """Whether one lens and one unit hold on both sides of each place between two keyframes."""
+    factors = neighbour_factors(slam)
+    lens = sudden_changes(factors[:, 0])
+    for first, last, _ in lens:  # the motion of one lens is wrong there, and nothing is said of the depth
+        factors[first:last, 1] = np.nan
+    for first, last, value in lens:
+        yield from _told(slam, first, last, f"the focal length changes, by a factor of {np.exp(value):.2f}", False)
+    for first, last, value in sudden_changes(factors[:, 1]):
+        text = f"the unit of the sensor's depth changes, by a factor of {np.exp(value):.2f}"
+        yield from _told(slam, first, last, text, True)
+
+
+def _told(slam: Slam, first: int, last: int, text: str, scale: bool) -> Iterator[Finding]:
+    start, end = (slam.keyframes[place].frame for place in (first, last))
+    if end >= 0:  # not of a known map, which was judged when it was made
+        text = f"frames {max(start, 0)} to {end}: {text}, and one is assumed for all"
+        yield Finding("depth scale" if scale else "calibration", "degraded", text, scale=scale)
+
+
+def sudden_changes(steps: np.ndarray) -> list[tuple[int, int, float]]:
+    """First and last place of each change that is beyond chance, and its logarithm, in order; of those that overlap the
+    surest.
+
+    steps: float64 [n], logarithm of a factor between each keyframe and the next, NaN where nothing speaks.
+    """
+    known = np.abs(steps[np.isfinite(steps)])
+    if not len(known):
+        return []
+    sigma = max(1.48 * float(np.median(known)), LEAST_SIGMA)
+    curve = np.append(0.0, np.cumsum(np.nan_to_num(steps)))
+    beyond: list[tuple[float, int, int, float]] = []
+    for length in range(1, min(WITHIN, len(steps)) + 1):
+        change = curve[length:] - curve[:-length]
+        sigmas = np.abs(change) / (sigma * np.sqrt(length))
+        told = (np.abs(change) > MOST_CHANGE) & (sigmas > SIGMAS)
+        beyond += [(-sigmas[n], n, n + length, float(change[n])) for n in np.flatnonzero(told).tolist()]
+    found: list[tuple[int, int, float]] = []
+    for _, first, last, value in sorted(beyond):
+        if all(last <= start or first >= end for start, end, _ in found):
+            found.append((first, last, value))
+    return sorted(found)
+
+
+def neighbour_factors(slam: Slam) -> np.ndarray:
+    """Logarithms of the factors between each keyframe and the next, of the focal length and of the unit of depth,
+    float64 [n - 1, 2], NaN where nothing speaks.
+    """
+    places = max(len(slam.keyframes) - 1, 0)
+    crossing: list[list[Pair]] = [[] for _ in range(places)]
+    for pair in slam.pairs:
+        if pair.second - pair.first <= REACH:
+            for place in range(pair.first, pair.second):
+                crossing[place].append(pair)
+    found = np.full((places, 2), np.nan)
+    for place, pairs in enumerate(crossing):
+        neighbours = [pair for pair in pairs if pair.second - pair.first == 1]
+        found[place] = _median_factors(slam, neighbours, 1)
+        if not (np.abs(found[place]) <= MOST_CHANGE / 2).all():
+            found[place] = _median_factors(slam, pairs, LEAST_PAIRS)
+    return found
+
+
+def _median_factors(slam: Slam, pairs: list[Pair], least: int) -> np.ndarray:
+    """Of focal length and unit, the later over the earlier keyframe, float64 [2]; NaN where fewer pairs speak."""
+    values: tuple[list[float], list[float]] = [], []
+    spoken: tuple[set[tuple[int, int]], set[tuple[int, int]]] = set(), set()
+    for directed in directed_pairs(slam, pairs):
+        first, second = directed.numbers
+        factors = compare(directed, np.asarray(slam.intrinsics, np.float64))
+        for column, (value, sigma) in enumerate((factors.focal, factors.depth)):
+            if np.isfinite(sigma):
+                values[column].append(value if second > first else -value)
+                spoken[column].add((min(first, second), max(first, second)))
+    return np.array([np.median(v) if len(s) >= least else np.nan for v, s in zip(values, spoken, strict=True)])
