@@ -40,7 +40,7 @@ class Termination(eqx.Enumeration):
     )
     nonfinite_input = (
         "Failed: the energy of the initial state is not finite. Look for NaN or infinite poses, intrinsics, inverse "
-        "depths, targets or weights; the initial state was returned."
+        "depths, targets or weights, and for weights below zero; the initial state was returned."
     )
     other_function = (
         "Failed: the function given to optimistix is not the energy of the problem in `args`, which is what this "

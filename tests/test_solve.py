@@ -108,7 +108,7 @@ def test_held_coordinates_stay(solved: Solve) -> None:
     assert bool(jnp.all(state.intrinsics[:3] != start.intrinsics[:3]))
 
 
-@pytest.mark.parametrize("spoil", ["pose", "pixel", "target", "weight", "depth"])
+@pytest.mark.parametrize("spoil", ["pose", "pixel", "target", "weight", "no weight", "negative weight", "depth"])
 def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
     # Proves that NaN anywhere in use ends at once, with the code that says so and the initial state untouched.
     problem, start, _ = NOISY.pack(**OPTIONS)
@@ -123,7 +123,8 @@ def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
     elif spoil == "target":
         problem = eqx.tree_at(lambda p: p.points.target, problem, replace_fn=lambda leaf: leaf.at[seen].set(jnp.nan))
     else:
-        problem = eqx.tree_at(lambda p: p.points.weight, problem, replace_fn=lambda leaf: leaf.at[seen].set(jnp.inf))
+        value = {"weight": jnp.inf, "no weight": jnp.nan, "negative weight": -1.0}[spoil]
+        problem = eqx.tree_at(lambda p: p.points.weight, problem, replace_fn=lambda leaf: leaf.at[seen].set(value))
     solution = solved(problem, start)
     assert solution.result == "nonfinite_input"
     assert int(solution.iterations) == 0

@@ -51,6 +51,7 @@ def pack_batch(
         ((2, 4), 2)
 
     """
+    check_kind("windows", windows, Sequence, "a list of windows")
     if not windows:
         raise InputError("`windows` is empty; give at least one")
     _check_windows(windows)

@@ -77,7 +77,8 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> Marg
     """
     check_pair(problem, state)
     if not isinstance(leaving, jax.core.Tracer):
-        check_whole("leaving", np.asarray(leaving).item(), 0, problem.num_keyframes - 1)
+        given = np.asarray(leaving)
+        check_whole("leaving", given.item() if given.size == 1 else leaving, 0, problem.num_keyframes - 1)
     prior = _marginal_term(problem)
     point = _linearisation_point(prior, state)
     quadratic, gradient = _quadratic(problem, point, leaving)

@@ -91,12 +91,28 @@ class SlotIndex:
         return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
 
     def gather(self, per_slot: np.ndarray | Array) -> np.ndarray:
-        """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`."""
-        return np.asarray(per_slot)[self.host, self.slot]
+        """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`; InputError for one of another shape."""
+        found = np.asarray(per_slot)
+        keyframes, _, slots = self.shape
+        if found.ndim < 2 or (any(self.shape) and found.shape[:2] != (keyframes, slots)):
+            raise InputError(
+                f"`per_slot` has shape {found.shape}; expected ({keyframes}, {slots}, ...), a value for each slot of "
+                "each keyframe, such as `state.inverse_depth`"
+            )
+        return found[self.host, self.slot]
 
     def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> np.ndarray:
-        """Values of the point matches, `[A, ...]`, as `observations` lists them, from an array `[e, p, ...]`."""
-        return np.asarray(per_match)[self.edge[observations.point_edge], self.slot[observations.point_landmark]]
+        """Values of the point matches, `[A, ...]`, as `observations` lists them, from an array `[e, p, ...]`;
+        InputError for one of another shape.
+        """
+        found = np.asarray(per_match)
+        _, edges, slots = self.shape
+        if found.ndim < 2 or (any(self.shape) and (found.shape[0] != edges or found.shape[1] > slots)):
+            raise InputError(
+                f"`per_match` has shape {found.shape}; expected ({edges}, at most {slots}, ...), a value for each "
+                "point of each edge, such as `problem.points.weight`"
+            )
+        return found[self.edge[observations.point_edge], self.slot[observations.point_landmark]]
 
 
 class Slots(NamedTuple):

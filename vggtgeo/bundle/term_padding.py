@@ -86,4 +86,5 @@ def _lengthened(term: AbstractTerm, count: int) -> AbstractTerm:
 
     touched = {name: getattr(term, name) for name in term.structure - {"weight", "kernel"}}
     changed = term.holding(jax.tree.map(longer, {**term.data(), **touched}))
-    return changed.reweighted(jnp.concatenate([term.weight, jnp.zeros(more, term.weight.dtype)]))
+    weight = jnp.concatenate([term.weight, jnp.zeros(more, term.weight.dtype)])
+    return eqx.tree_at(lambda longer: longer.weight, changed, weight)

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Square
 
 Local = Callable[[Array], Array]
@@ -93,8 +94,20 @@ class AbstractTerm(eqx.Module):
         return self.weight
 
     def reweighted(self, weight: Float[Array, "*observations"]) -> Self:
-        """The same term with other weights."""
-        return eqx.tree_at(lambda term: term.weight, self, weight)
+        """The same term with other weights.
+
+        Raises:
+            InputError: they are no numbers, or have another shape.
+
+        """
+        given: Any = weight
+        if not isinstance(given, jax.Array):
+            given = jnp.asarray(real_numbers("weight", given), self.weight.dtype)
+        if given.shape != self.weight.shape:
+            raise InputError(
+                f"`weight` has shape {given.shape}; expected {self.weight.shape}, that of `{self.name}.weight`"
+            )
+        return eqx.tree_at(lambda term: term.weight, self, given)
 
     def present(self) -> Bool[Array, "*observations"]:
         """Which observations are there."""
@@ -115,7 +128,8 @@ class AbstractTerm(eqx.Module):
     def prepared(self) -> Self:
         """Zero weights and harmless data where nothing was observed, so that padding never makes a NaN.
 
-        Ones, not zeros: they may be divided by, normalised, and taken the logarithm of.
+        Ones, not zeros: they may be divided by, normalised, and taken the logarithm of. A weight that is NaN or below
+        zero is no weight: it becomes NaN, and with it the energy, which a solve under `jit` answers with its result.
         """
         present = self.present()
 
@@ -126,7 +140,7 @@ class AbstractTerm(eqx.Module):
             return jnp.where(mask, leaf, 1.0)
 
         kept = self.holding(jax.tree.map(safe, self.data()))
-        return kept.reweighted(jnp.where(present, self.weight, 0.0))
+        return kept.reweighted(jnp.where(present, self.weight, jnp.where(self.weight == 0, 0.0, jnp.nan)))
 
 
 def squared_norm(residual: Float[Array, "m *b"] | tuple[Array, ...]) -> Float[Array, "*b"]:
