@@ -368,3 +368,30 @@ def test_a_folder_whose_name_is_no_utf8(frames: Path, tmp_path: Path) -> None:
     done = call(odd, out)
     assert done.exit_code == 3, done.output
     check_one_run(out, FRAMES)
+
+
+@pytest.mark.parametrize("becomes", ["nothing", "a file", "another folder"])
+def test_a_folder_that_is_taken_away_while_a_run_writes_is_an_error(becomes: str, tmp_path: Path) -> None:
+    """One sentence with the name, in place of what the system says of a file inside. Oracle: the message."""
+    place = tmp_path / "out"
+
+    def run_while_it_goes() -> None:
+        with taken(place) as run:
+            place.rename(tmp_path / "before")
+            if becomes == "a file":
+                place.write_text("")
+            elif becomes == "another folder":
+                place.mkdir()
+            run.publish()
+
+    with pytest.raises(InputError, match=r"out` was moved, removed or replaced while"):
+        run_while_it_goes()
+
+
+def test_hidden_files_of_a_file_manager_are_no_results(tmp_path: Path) -> None:
+    """A `.DS_Store` beside the results harms nothing, and does not come with them. Oracle: what is there."""
+    with taken(tmp_path / "out") as run:
+        (run.stage / "trajectory.txt").write_text("")
+        (run.stage / ".DS_Store").write_text("")
+        run.publish()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["trajectory.txt"]

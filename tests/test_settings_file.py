@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import bad_files as bad
 import pytest
 import typer
 from conftest import ROOT
@@ -192,9 +193,14 @@ def test_a_name_that_is_wrong_is_told_before_jax_is_loaded(tmp_path: Path) -> No
     # Proves that the commonest mistakes cost no seconds: loading JAX takes two. Oracle: what the process has loaded.
     (tmp_path / "file").write_text("")
     (tmp_path / "frames").mkdir()
+    (tmp_path / "run.toml").write_text("stride = 'two'")
+    bad.frames(tmp_path / "good")
     calls = (
         ["run", "nothere"],
         ["run", "frames", "-o", "file"],
+        ["run", "good", "-o", "/proc/new", "--intrinsics", "1,1,1,1"],
+        ["run", "good", "--intrinsics", "55,55,nan,24"],
+        ["run", "good", "--settings", "run.toml"],
         ["export", "nothere", "--to", "ply"],
         ["view", "nothere"],
     )

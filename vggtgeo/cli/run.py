@@ -16,7 +16,7 @@ from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, Reru
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
-from vggtgeo.results.unfinished import check_may_be_folder
+from vggtgeo.io.warned import collected_warnings
 
 if TYPE_CHECKING:
     from vggtgeo.datasets import Sequence
@@ -73,24 +73,29 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
+    from vggtgeo.datasets.frame import check_selection
     from vggtgeo.datasets.opening import check_there
+    from vggtgeo.results.output_checks import check_can_be_written, check_output
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
     check_flags(memory_limit_gb, fps)
-    check_may_be_folder(output)
     if kind != "camera":
         check_there(path)
+    if save_map is not None:
+        check_map_place(save_map, output)
+    if rerun:
+        check_recording_file(rerun, output)
+    check_output(output, Path(path))
+    check_can_be_written(output)
+    with collected_warnings() as warned:
+        sequence = open_input(path, kind, intrinsics, rgb_only, fps, depth_scale)
+    if len(sequence):  # a camera has no end
+        check_selection(sequence.name, len(sequence), start, end, stride)
     from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.cli.run_sequence import Output, run_and_write
-    from vggtgeo.io.warned import collected_warnings
-    from vggtgeo.slam.known_map import load_map
-    from vggtgeo.slam.run import default_roles
     from vggtgeo.slam.setting_groups import DepthSettings
     from vggtgeo.slam.settings_table import Tables
 
-    if rerun:
-        check_recording_file(rerun, output)
     check_provider(provider)
     if save_depth and dense == "none":
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
@@ -104,11 +109,13 @@ def run(
     }
     if localise_only:
         switches["localise_only"] = {"keyframes": {"localise_only": True}}
-    if save_map is not None:
-        check_map_file(save_map, output)
     slam_settings = pipeline_settings(settings, assignments or (), switches)
-    with collected_warnings() as warned:
-        sequence = open_input(path, kind, intrinsics, rgb_only, fps, depth_scale)
+    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.slam.known_map import load_map
+    from vggtgeo.slam.run import default_roles
+
+    if save_map is not None:
+        check_map_file(save_map)
     classical = default_roles(sequence.has_depth)
     named = {
         **{"points": points, "lines": lines, "line_matches": line_matcher},
@@ -136,19 +143,19 @@ def run(
     )
 
 
-def check_map_file(file: Path, output: Path) -> None:
-    """InputError for a map's file that would replace something else, or that results of the run would replace."""
+def check_map_place(file: Path, output: Path) -> None:
+    """InputError for a map's file that cannot be written, or that results of the run would replace."""
     if file.is_dir():
         raise InputError(f"`--save-map` is `{file}`, which is a folder; give the name of a file")
-    from vggtgeo.results.run_folder import is_result
+    from vggtgeo.io.files import whole_path
+    from vggtgeo.results.output_checks import is_result
 
     if file.exists() and not file.is_file():
         raise InputError(f"`--save-map` is `{file}`, which is a device, a pipe or a socket; give the name of a file")
-    if file.is_file() and file.stat().st_size and not _is_map(file):
-        raise InputError(f"`--save-map` is `{file}`, which is there and is no map; give the name of a new file")
-    if is_result(output, file):
+    if is_result(output, file) or whole_path(file) == whole_path(output):
         raise InputError(
-            f"`--save-map` is `{file}`, the name of a result of the run itself; give another, such as `{output}.map`"
+            f"`--save-map` is `{file}`, the name of a result of the run itself, or its folder; give another, such as "
+            f"`{output}.map`"
         )
     there = next(folder for folder in file.absolute().parents if folder.exists())
     try:
@@ -157,9 +164,15 @@ def check_map_file(file: Path, output: Path) -> None:
         raise InputError(f"`--save-map` is `{file}`, which cannot be written: {error.strerror or error}") from None
 
 
+def check_map_file(file: Path) -> None:
+    """InputError for a map's file that would replace something that is no map."""
+    if file.is_file() and file.stat().st_size and not _is_map(file):
+        raise InputError(f"`--save-map` is `{file}`, which is there and is no map; give the name of a new file")
+
+
 def check_recording_file(target: str, output: Path) -> None:
     """InputError for a recording where the run's results would take it away."""
-    from vggtgeo.results.run_folder import is_in_results
+    from vggtgeo.results.output_checks import is_in_results
 
     if target not in ("spawn", "serve") and is_in_results(output, Path(target)):
         raise InputError(

@@ -12,7 +12,7 @@ import difflib
 import os
 import tomllib
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,18 +56,22 @@ def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
     if path is None or context.resilient_parsing:
         return SettingsInUse(context)
     given = _read(path)
-    tables: dict[str, dict[str, Any]] = {}
-    settings: dict[str, list[str]] = {}
-    if any(parameter.name == "assignments" for parameter in context.command.params):
-        from vggtgeo.slam.settings_table import names  # slow: it brings JAX
-
-        for name in names():
-            group, _, setting = name.partition(".")
-            settings.setdefault(group, []).append(setting)
-        tables = {key: value for key, value in given.items() if isinstance(value, dict)}
+    piped = any(parameter.name == "assignments" for parameter in context.command.params)
+    tables = {key: value for key, value in given.items() if piped and isinstance(value, dict)}
     flags = {key: value for key, value in given.items() if key not in tables}
-    context.default_map = _checked(path, _affirmed(path, flags, context), _keys(context), _types(context), settings)
+    context.default_map = _checked(path, _affirmed(path, flags, context), _keys(context), _types(context), piped)
     return SettingsInUse(context, tables)
+
+
+def _settings_by_group() -> dict[str, list[str]]:
+    """The pipeline's settings."""
+    from vggtgeo.slam.settings_table import names  # slow: it brings JAX
+
+    settings: dict[str, list[str]] = {}
+    for name in names():
+        group, _, setting = name.partition(".")
+        settings.setdefault(group, []).append(setting)
+    return settings
 
 
 SettingsOption = Annotated[
@@ -106,16 +110,17 @@ def _checked(
     given: dict[str, Any],
     names: dict[str, str],
     types: dict[str, Any],
-    settings: Mapping[str, Sequence[str]],
+    piped: bool,
 ) -> dict[str, Any]:
-    """The values by the names of their parameters. settings: the pipeline's, names of fields by group."""
+    """The values by the names of their parameters. piped: whether the command takes the pipeline's settings, too."""
     for key, value in given.items():
-        if key in settings:
-            raise InputError(
-                f"`{path}`: `{key}` is {_short(value)}; it must be a table of settings: a line `[{key}]`, and below it "
-                "lines `name = value`"
-            )
         if key not in names:
+            settings = _settings_by_group() if piped else {}
+            if key in settings:
+                raise InputError(
+                    f"`{path}`: `{key}` is {_short(value)}; it must be a table of settings: a line `[{key}]`, and "
+                    "below it lines `name = value`"
+                )
             group = next((group for group, fields in settings.items() if key in fields), None)
             if group is not None:
                 raise InputError(f"`{path}`: `{key}` is a setting of `{group}`: write it below a line `[{group}]`")
@@ -123,6 +128,8 @@ def _checked(
             raise InputError(f"`{path}`: `{key}` is no setting of this command; the nearest is `{near}`")
         if value == "":
             raise InputError(f"`{path}`: `{key}` is empty; give a value, or leave the line out")
+        if isinstance(value, str) and "\0" in value:
+            raise InputError(f"`{path}`: `{key}` is {_short(value)}, which has a zero byte in it; leave that out")
         wanted, accepted = _KINDS.get(types[names[key]], ("text in quotes", (str,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
             raise InputError(f"`{path}`: `{key}` is {_short(value)}; it must be {wanted}")

@@ -57,12 +57,12 @@ def locked(path: Path) -> Iterator[None]:
         handle.flush()
         yield
     finally:
+        ours = _is_at(handle, path)  # the folder may have been moved meanwhile, and another be in its place
         if sys.platform == "win32":
             handle.close()  # an open file cannot be removed there
+        if ours:
             path.unlink(missing_ok=True)
-        else:
-            path.unlink(missing_ok=True)
-            handle.close()
+        handle.close()
 
 
 @contextmanager
@@ -101,7 +101,7 @@ def _said(handle: IO[str]) -> str:
 def _is_at(handle: IO[str], path: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(handle.fileno()), path.stat())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-import os
 import re
 import time
 from collections import Counter
@@ -29,6 +28,7 @@ from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.record_file import AGAIN, Layout
 from vggtgeo.io.records import by_name
 from vggtgeo.models.onnx.bounds import Refusals
+from vggtgeo.results.output_checks import check_place
 from vggtgeo.results.summary import versions
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings import Roles, SlamSettings
@@ -174,14 +174,6 @@ def resumed(asked: Checkpoints | None, wanted: Mapping[str, str]) -> RunSoFar | 
     except InputError as error:
         raise InputError(f"{error}; begin anew with `--no-resume`") from None
     return found
-
-
-def check_place(path: Path) -> None:
-    """InputError for a path at which something lies that is no file: no state could be kept there."""
-    if os.path.lexists(path) and not path.is_file():
-        found = "a link that leads nowhere" if path.is_symlink() and not path.exists() else "no file"
-        found = "a folder" if path.is_dir() else "a pipe" if path.is_fifo() else found
-        raise InputError(f"`{path}` is {found}, and a run keeps its state there, in a file: take it away")
 
 
 def _facts(path: Path) -> dict[str, Any]:

@@ -20,48 +20,23 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import whole_path, write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.io.text_files import whole_text
-from vggtgeo.results.checkpoints import check_place, frames_kept
-from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED, check_may_be_folder
+from vggtgeo.results.checkpoints import frames_kept
+from vggtgeo.results.output_checks import NAMES, NOTE, check_output, is_known
+from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED
 
-NAMES = (
-    SUMMARY,
-    "settings.toml",
-    "trajectory.txt",
-    "trajectory-[0-9]*.txt",
-    "keyframes.txt",
-    "keyframes-[0-9]*.txt",
-    "uncertainty.txt",
-    "uncertainty-[0-9]*.txt",
-    "map-times.txt",
-    "map.ply",
-    "mesh.ply",
-    "scene.npz",
-    "images",
-    "image-mask.png",
-    "trajectory.png",
-    "report.html",
-    "depth",
-    "run.rrd",
-    "view.rrd",
-)
-"""All that a run may leave, as patterns, in the order in which what is old is taken away."""
 RESERVE = 96 * 2**20
 """Bytes that must be free before the first frame, and are held until the results are written: a map of 500,000 points
 (14 MB), a mesh of a million faces (30 MB), 200 pictures (20 MB), page and trajectories of 10,000 frames (10 MB)."""
 
 _LOCK = ".lock"
-_NOTE = "README.txt"
 _RESERVED = ".reserve"
-_MARKS = ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "camera-intrinsics.txt")
 
 
 @dataclass(frozen=True)
@@ -93,10 +68,12 @@ class RunFolder:
         with interruption():
             self.release_reserve()
             if not self.keeps:
-                (self.stage / _NOTE).unlink(missing_ok=True)
-            written = (path for path in self.stage.iterdir() if path.name not in (CHECKPOINT, _NOTE))
+                (self.stage / NOTE).unlink(missing_ok=True)
+            # A file manager leaves hidden files where somebody looks on, and so does a network's file system.
+            ours = (path for path in self.stage.iterdir() if not path.name.startswith("."))
+            written = (path for path in ours if path.name not in (CHECKPOINT, NOTE))
             new = sorted(written, key=lambda path: path.name == SUMMARY)
-            strange = [path.name for path in new if not _is_known(path.name)]
+            strange = [path.name for path in new if not is_known(path.name)]
             if strange:
                 raise ValueError(
                     f"`NAMES` lacks {strange}: what a run leaves must be known, to be replaced by the next"
@@ -150,8 +127,7 @@ def taken(
 
     """
     place = Path(folder)
-    _refuse_input(place, source)
-    _refuse_strange(RunFolder(place).stage)
+    check_output(place, source)
     made = _missing(place)
     try:
         with locked_folder(place, _LOCK, "run"):
@@ -161,6 +137,13 @@ def taken(
                 yield _begun(RunFolder(place), reserve, bool(resume))
             finally:
                 _end(place / UNFINISHED)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        if (place / UNFINISHED).is_dir():
+            raise
+        raise InputError(
+            f"`{place}` was moved, removed or replaced while a run wrote into it ({error.strerror}): its results lie "
+            f"in `{UNFINISHED}` of the folder that it was, if that is still there"
+        ) from error
     finally:
         for path in made:
             _remove_if_empty(path)
@@ -180,7 +163,7 @@ def _begun(run: RunFolder, reserve: int, resume: bool) -> RunFolder:
         _empty(run.stage, CHECKPOINT if resume else None)
         run.stage.mkdir(exist_ok=True)
         write_text(
-            run.stage / _NOTE,
+            run.stage / NOTE,
             "A run that goes on, or that was killed. The files in the folder above, if any, are of the run before.\n",
         )
         if reserve and hasattr(os, "posix_fallocate"):
@@ -219,78 +202,6 @@ def _end(stage: Path) -> None:
         _remove(stage)
 
 
-def _refuse_input(place: Path, source: Path | None) -> None:
-    check_may_be_folder(place)
-    if source is not None and place.exists() and source.is_dir() and place.samefile(source):
-        raise InputError(f"`{place}` is the folder that is read; give another folder for the results with `-o`")
-    if not place.is_dir():
-        return
-    if source is not None:
-        inside = _inside(place, source)
-        if inside is not None and _is_known(inside):
-            raise InputError(
-                f"`{source}` is read, and a run into `{place}` replaces `{place / inside}`; give another folder for "
-                "the results with `-o`"
-            )
-    if (place / SUMMARY).is_file():
-        return
-    for path in place.iterdir():
-        if path.name in _MARKS or (path.suffix.lower() in IMAGE_SUFFIXES and not _is_known(path.name)):
-            raise InputError(
-                f"`{place}` holds images or a sequence (`{path.name}`); give another folder for the results with `-o`"
-            )
-    if not (place / UNFINISHED).is_dir():  # a run that was killed while its files were moved has no summary, either
-        for path in sorted(place.iterdir()):
-            if any(fnmatchcase(path.name, pattern) for pattern in NAMES):
-                raise InputError(
-                    f"`{place}` holds `{path.name}`, which a run replaces, and no `{SUMMARY}`: it is not of a run; "
-                    "give another folder for the results with `-o`"
-                )
-
-
-def _refuse_strange(stage: Path) -> None:
-    """InputError for an `unfinished` that no run left there: a run takes away what it finds in its place. The root of
-    the file system is nobody's folder for results.
-    """
-    if whole_path(stage.parent) == Path(whole_path(stage).anchor):
-        raise InputError(f"`{stage.parent}` is the root of the file system; give a folder for the results with `-o`")
-    if stage.is_symlink() or not stage.exists():
-        return
-    if not stage.is_dir():
-        raise InputError(f"`{stage}` is a file, and a run makes a folder of this name; give another folder with `-o`")
-    check_place(stage / CHECKPOINT)
-    for path in sorted(stage.iterdir()):
-        if not (_is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, _NOTE)):
-            raise InputError(
-                f"`{stage}` holds `{path.name}`, which no run left there, and a run would take it away; give another "
-                "folder with `-o`"
-            )
-
-
-def _inside(place: Path, source: Path) -> str | None:
-    """The first part of the way from `place` to `source`; None where it does not lie in it."""
-    try:
-        parts = whole_path(source).relative_to(whole_path(place)).parts
-    except ValueError:
-        return None
-    return parts[0] if parts else None
-
-
-def is_result(folder: Path, file: Path) -> bool:
-    """Whether `file` has the name and place of a result of a run into `folder`, or lies in a folder of them."""
-    part = _inside(folder, file)
-    return part is not None and (_is_known(part) or part == UNFINISHED)
-
-
-def is_in_results(folder: Path, file: Path) -> bool:
-    """Whether `file` lies in a folder that a run into `folder` replaces: `images`, `depth`, `unfinished`."""
-    return is_result(folder, file) and whole_path(file).parent != whole_path(folder)
-
-
-def _is_known(name: str) -> bool:
-    return name.endswith(".rrd") or any(fnmatchcase(name, pattern) for pattern in NAMES)
-
-
 def _old_recording(folder: Path) -> list[str]:
     """The recording that an earlier run into `folder` made there, by its settings."""
     try:
@@ -308,7 +219,7 @@ def _missing(place: Path) -> list[Path]:
 
 
 def _remove_if_empty(path: Path) -> None:
-    if path.is_dir() and not any(path.iterdir()):
+    if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
         path.rmdir()
 
 
