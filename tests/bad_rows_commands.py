@@ -211,9 +211,16 @@ RUN = rows(
         ("`--start 0x1`", good, flags("--start", "0x1")),
         ("`--stride 1e0`", good, flags("--stride", "1e0")),
         ("`--intrinsics` with 1e400", good, flags("--intrinsics", "1e400,55,31.5,23.5")),
+        ("`--depth-scale 1e-300`", bad.rgbd(lambda folder: None), flags("--depth-scale", "1e-300")),
+        ("a path of 100,000 letters", nothing, {"argv": line("run", 100_000 * "x")}),
         ("`--depth-scale 1e400`", good, flags("--depth-scale", "1e400")),
         ("`--save-map` onto a device", good, flags("--save-map", "/dev/full")),
         ("`--save-map` where nothing can be written", good, flags("--save-map", "/proc/x.map")),
+        (
+            "`--save-map` in the place of the run's folder",
+            good,
+            {"argv": lambda made: [*run_with("--save-map", made.parent / "out")(made)]},
+        ),
         ("`--save-map` among the run's pictures", good, {"argv": below_output("--save-map", "images/x.map")}),
         ("`--rerun` among the run's pictures", good, {"argv": below_output("--rerun", "images/x.rrd")}),
         ("`--set` of two lines", good, flags("--set", "tracking.least_inliers=5\nkeyframes.keyframe_distance=1")),
@@ -249,6 +256,8 @@ SETTINGS = rows(
         ("a kernel of infinite width", None, settings("window.kernel = 'cauchy 1e400'")),
         ("empty text for the output folder", None, settings("output = ''")),
         ("a key twice", None, settings("stride = 1\nstride = 2")),
+        ("a zero byte in a name", None, settings('output = "a\\u0000b"')),
+        ("two byte order marks", None, settings(2 * b"\xef\xbb\xbf" + b"stride = 2")),
         ("a date for a number", None, settings("stride = 2024-01-01")),
     ],
 )
@@ -321,6 +330,11 @@ OTHERS = rows(
             "`bench` of a suite that is no TOML",
             suite("sequences: 2"),
             {"argv": benched("{}/suite.toml"), "slack": IMPORTS},
+        ),
+        (
+            "`bench --sequences` of one that is none",
+            nothing,
+            {"argv": lambda made: ["bench", "quick", "-o", made / "new", "--sequences", "x"], "slack": IMPORTS},
         ),
         (
             "`bench` of a suite without sequences",

@@ -19,11 +19,13 @@ from typing import Any
 import bad_files as bad
 import jax
 import numpy as np
+import tiny_sequences
 from bad_row import Row, nothing
 from test_problem_file import SCENE
 
 import vggtgeo as vg
 from vggtgeo import evaluation
+from vggtgeo.datasets import open_sequence, with_depth_scale
 from vggtgeo.datasets.in_memory import frame_stream
 from vggtgeo.export import export
 from vggtgeo.geometry.mesh import Mesh
@@ -206,6 +208,18 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     (
         "`marginalise`: a keyframe that is not there",
         with_pair(lambda p, s: vg.marginalise(p, s, 3)),
+    ),
+    ("`marginalise` of two keyframes", with_pair(lambda p, s: vg.marginalise(p, s, [0, 1]))),
+    ("`reweighted` by weights of another shape", with_pair(lambda p, s: p.points.reweighted(np.ones(3)))),
+    ("`reweighted` by a text", with_pair(lambda p, s: p.points.reweighted("all"))),
+    ("`gather` of one value a keyframe", lambda _: SCENE.pack()[2].gather(np.ones(3))),
+    ("`plot` of a number", lambda _: vg.plot(5)),
+    ("`frame_trajectory` of nothing", lambda _: vg.frame_trajectory(None)),
+    ("`SurfaceFusion.update` of nothing", lambda _: vg.SurfaceFusion([50.0, 50.0, 32.0, 24.0]).update(None)),
+    ("`SurfaceFusion`: three intrinsics", lambda _: vg.SurfaceFusion([50.0, 50.0, 32.0])),
+    (
+        "`with_depth_scale` of a text",
+        lambda made: with_depth_scale(open_sequence(tiny_sequences.tum(made)), "5000"),
     ),
     ("`reorder`: a keyframe twice", lambda _: vg.reorder(vg.no_prior(3), [0, 0, 1])),
     ("`pack_batch` of no windows", lambda _: vg.pack_batch([None])),

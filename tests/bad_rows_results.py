@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import bad_files as bad
+import numpy as np
 from bad_row import good, line, nothing, rows
 
 from vggtgeo.results.result import Result
@@ -31,6 +32,12 @@ def walk(seed: int = 0, **options: Any) -> Any:
 def write(content: str) -> Any:
     """Makes a file."""
     return lambda path: path.write_text(content)
+
+
+def scalar_first(path: Path) -> None:
+    """The same walk, the real part of its quaternions before the others."""
+    rows = np.loadtxt(bad.walk(path, 0))
+    np.savetxt(path, rows[:, [0, 1, 2, 3, 7, 4, 5, 6]])
 
 
 def euroc_backwards(path: Path) -> None:
@@ -93,6 +100,7 @@ TRAJECTORIES = rows(
     [
         ("a file that is not there", nothing, {"argv": line("evaluate", "no.txt", "no.txt")}),
         ("`--delta inf`", None, evaluated(walk(), walk(), "--delta", "inf")),
+        ("quaternions in the order w x y z", None, evaluated(scalar_first, walk())),
         ("columns in the order t q p", None, evaluated(write("0 1 0 0 0 2.5 1.5 3.5\n"), walk())),
         ("`--delta 0`", None, evaluated(walk(), walk(), "--delta", "0")),
         ("`--max-dt -1`", None, evaluated(walk(), walk(), "--max-dt", "-1")),

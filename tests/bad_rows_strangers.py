@@ -216,9 +216,29 @@ def calibrated(content: str | bytes) -> Callable[[Path], Path]:
 
 METRES = np.full((tiny.HEIGHT, tiny.WIDTH), 1.5, np.float32)
 NEGATIVE = np.full((tiny.HEIGHT, tiny.WIDTH), -5, np.int16)
+
+
+def two_cameras(folder: Path) -> None:
+    """Images of two cameras, by their names."""
+    for number in range(3):
+        (folder / f"{number}.png").rename(folder / f"left_{number}.png")
+        shutil.copy(folder / f"left_{number}.png", folder / f"right_{number}.png")
+
+
+def deep_jpeg() -> bytes:
+    """A JPEG whose header says 12 bits."""
+    whole = bytearray(bad.encoded(".jpg"))
+    whole[whole.index(b"\xff\xc0") + 4] = 12
+    return bytes(whole)
+
+
 IMAGES = rows(
     "Images",
     [
+        ("images of two cameras, `left_0.png` and `right_0.png`", beside(two_cameras)),
+        ("a JPEG of 12 bits", image(deep_jpeg(), ".jpg")),
+        ("a JPEG-LS that is called .jpg", image(b"\xff\xd8\xff\xf7" + bytes(99), ".jpg")),
+        ("a QOI that is called .png", image(b"qoif" + bytes(99))),
         ("interlaced PNG", image(bytes_of.interlaced_png(PICTURE))),
         ("palette PNG with transparency", image(bytes_of.palette_png(SIZE))),
         ("PNG of one bit a pixel", image(bytes_of.two_colours_png(SIZE))),
@@ -292,6 +312,8 @@ DEPTH = rows(
     ],
     call=read_frames,
 )
+
+
 DOUBLES = rows(
     "Images",
     [
@@ -382,11 +404,11 @@ def calibrated(path: Path) -> Path:
     return path
 
 
-def still_video(path: Path) -> Path:
-    """A video of one picture."""
+def still_video(path: Path, moving: int = 0) -> Path:
+    """A video of one picture, after so many others."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (bad.WIDTH, bad.HEIGHT))
-    for _ in range(12):
-        writer.write(bad.picture(0))
+    for number in range(24):
+        writer.write(bad.picture(min(number, moving)))
     writer.release()
     return calibrated(path)
 
@@ -394,6 +416,14 @@ def still_video(path: Path) -> Path:
 def jpegs(path: Path) -> Path:
     """A stream that tells nothing of its times."""
     path.write_bytes(b"".join(bad.encoded(".jpg", bad.picture(number)) for number in range(12)))
+    return calibrated(path)
+
+
+def resized_jpegs(path: Path, size: tuple[int, int]) -> Path:
+    """A stream whose second half has another size."""
+    pictures = [bad.picture(number) for number in range(12)]
+    later = [cv2.resize(picture, size) for picture in pictures[6:]]
+    path.write_bytes(b"".join(bad.encoded(".jpg", picture) for picture in [*pictures[:6], *later]))
     return calibrated(path)
 
 
@@ -419,7 +449,10 @@ VIDEOS = rows(
             "one picture again and again, as of an interlaced one",
             lambda folder: still_video(folder / "still.mp4"),
         ),
+        ("one picture again and again from its tenth on", lambda folder: still_video(folder / "still.mp4", 9)),
         ("JPEGs one behind the other, without a container", lambda folder: jpegs(folder / "clip.mjpg")),
+        ("pictures of other proportions in its second half", lambda folder: resized_jpegs(folder / "c.mjpg", (48, 48))),
+        ("pictures of half the size in its second half", lambda folder: resized_jpegs(folder / "c.mjpg", (32, 24))),
         ("two recordings that were joined (.ts)", lambda folder: joined_video(folder / "clip.ts")),
         ("a picture of a phone (.heic)", bad.file("a.heic", b"\0\0\0\x18ftypheic" + bytes(40))),
         ("a zip archive", bad.file("clip.mp4", b"PK\x03\x04" + b"\0" * 999)),

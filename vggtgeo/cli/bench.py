@@ -102,11 +102,15 @@ class _Bar:
         self._task = self._progress.add_task("runs", total=None)
 
     def __enter__(self) -> _Bar:
-        self._progress.start()
+        if self._progress.console.is_terminal:  # elsewhere the lines of the runs say all
+            self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._progress.stop()
+        if not self._progress.tasks[0].completed:  # it ends in an error, which is one line
+            self._progress.live.transient = True
+        if self._progress.live.is_started:
+            self._progress.stop()
 
     def advance(self, done: int, total: int, row: Row) -> None:
         """A run has ended."""

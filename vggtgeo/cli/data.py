@@ -10,7 +10,9 @@ import typer
 
 from vggtgeo.cli.options import JsonOption
 
-data = typer.Typer(help="Where to get recordings, and what is wrong with one.", no_args_is_help=True)
+data = typer.Typer(
+    help="Where to get recordings, and what is wrong with one.", no_args_is_help=True, add_completion=False
+)
 
 
 @data.command("list")

@@ -175,7 +175,7 @@ class _LazyGroup(TyperGroup):
         except (Exception, KeyboardInterrupt) as error:
             if ctx.params.get("debug") or _is_call_for_help(error):
                 raise
-            _leave(error)
+            _leave(error, " ".join(filter(None, (ctx.command_path, ctx.invoked_subcommand))))
 
 
 def _at_home(word: str) -> str:
@@ -211,8 +211,8 @@ def _is_usage_error(error: BaseException) -> bool:
     return callable(getattr(error, "format_message", None)) and not _is_call_for_help(error)
 
 
-def _leave(error: BaseException) -> NoReturn:
-    """End the program with one line on stderr."""
+def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
+    """End the program with one line on stderr. command: whose help says more."""
     if isinstance(error, KeyboardInterrupt):
         message, code = "interrupted", EXIT_INTERRUPTED
     elif isinstance(error, OSError) and error.filename is not None:
@@ -228,7 +228,7 @@ def _leave(error: BaseException) -> NoReturn:
         message = f"error: there is not enough memory ({error}); give fewer or smaller images, or smaller settings"
         code = EXIT_INPUT
     elif _is_usage_error(error):
-        message, code = f"error: {_usage_message(error)}", EXIT_INPUT
+        message, code = f"error: {_usage_message(error, command)}", EXIT_INPUT
     elif (wrong := _wrong_switch(error)) is not None:
         message, code = f"error: {wrong}", EXIT_INPUT
     elif _lacks_platform():
@@ -288,10 +288,12 @@ def _lacks_platform() -> bool:
         return True
 
 
-def _usage_message(error: Any) -> str:
-    """What is wrong with the command line, and where to read how it should be."""
+def _usage_message(error: Any, command: str) -> str:
+    """What is wrong with the command line, and where to read how it should be: the help of `command`, or of the one
+    that the error itself knows.
+    """
     message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
-    command = error.ctx.command_path if error.ctx is not None else "vggtgeo"
+    command = error.ctx.command_path if error.ctx is not None else command
     return f"{message} (see `{command} --help`)"
 
 

@@ -39,9 +39,9 @@ class Frame:
     name: str
 
     def __repr__(self) -> str:
-        height, width = self.image.shape[:2]
+        size = " x ".join(map(str, np.shape(self.image)[1::-1])) or "no image"
         depth = "no depth" if self.depth is None else "depth"
-        return f"Frame({self.index}, {self.timestamp:.3f} s, {width} x {height}, {depth}, {self.name!r})"
+        return f"Frame({self.index}, {self.timestamp:.3f} s, {size}, {depth}, {self.name!r})"
 
 
 @runtime_checkable

@@ -18,6 +18,7 @@ _OTHER_FORMATS = (b"GIF8", b"\xff\x4f\xff\x51", b"\xff\x0a")
 _OTHER_BOXES = (b"jP  ", b"ftyp", b"JXL ")
 """OpenCV takes them by their content. Some hundred bytes of them may declare gigabytes of pixels, at places of the file
 that nobody here reads, and their own kind of turning is applied without a word."""
+_RARE_FORMATS = {b"qoif": "QOI", b"II\xbc": "JPEG XR", b"\xff\xd8\xff\xf7": "JPEG-LS"}
 _LFS_POINTER = b"version https://git-lfs"
 _LEFT_OVER = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MOST_LEFT_OVER = 4
@@ -31,6 +32,12 @@ def defect(content: bytes) -> str:
         return "is cut off: the PNG has no end"
     if content.startswith(b"\x89PNG") and not _chunks_fit(content):
         return "is damaged: a part of the PNG declares more bytes than the file has"
+    rare = next((name for begin, name in _RARE_FORMATS.items() if content.startswith(begin)), "")
+    if rare:
+        return f"is a {rare}, which is not read: convert it to PNG or JPEG"
+    bits = _jpeg_bits(content)
+    if bits not in (0, 8):
+        return f"is a JPEG of {bits} bits; those of 8 are read: convert it to PNG"
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9") < _start_of_scan(content):
         return "is cut off: the JPEG has no end"
     if _lacks_scans(content):
@@ -55,6 +62,12 @@ def decoding_defect(message: str) -> str:
     if message.startswith(("Corrupt JPEG data", "Premature end")):
         return f"is damaged, or cut off: a part of it would be grey or in a wrong place ({message})"
     return ""
+
+
+def _jpeg_bits(content: bytes) -> int:
+    """Bits of a JPEG's values by its header; 0 of what is none."""
+    frames = (part for marker, part in jpeg_segments(content) if marker in (0xC0, 0xC1, 0xC2) and part)
+    return next(frames, b"\0")[0]
 
 
 def declared_size(content: bytes) -> tuple[int, int]:

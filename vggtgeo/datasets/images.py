@@ -20,6 +20,7 @@ _SECONDS = re.compile(r"\d+\.\d+")
 _NANOSECONDS = re.compile(r"\d{18,19}")
 _PREFERRED = (".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp", ".jpg", ".jpeg")
 """Of two formats of the same pictures: what loses nothing first."""
+_DIGITS = re.compile(r"[0-9]+")
 _SMALL = (64, 64)
 _ALIKE = 0.95
 """Correlation of two files of one picture; a colour image and its depth or mask have less."""
@@ -46,6 +47,7 @@ class ImageFolder(FolderSequence):
         if not images:
             raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
         images = _without_doubles(folder, images)
+        _tell_of_series(folder, images)
         _tell_of_more(folder, len(images))
         times = times_by_name(images)
         files = tuple(
@@ -91,6 +93,21 @@ def _show_the_same(one: Path, other: Path) -> bool:
         return False
     first, second = (picture.astype(float).ravel() - picture.mean() for picture in small)
     return bool(first @ second >= _ALIKE * np.sqrt((first @ first) * (second @ second)))
+
+
+def _tell_of_series(folder: Path, images: list[Path]) -> None:
+    """Names that differ in words and share their numbers are of two cameras, or of two recordings."""
+    series: dict[str, set[str]] = {}
+    for image in images:
+        series.setdefault(_DIGITS.sub("*", image.stem), set()).add("-".join(_DIGITS.findall(image.stem)))
+    several = [name for name, numbers in series.items() if name != "*" and len(numbers) > 1]
+    if len(several) > 1 and series[several[0]] & series[several[1]]:
+        warnings.warn(
+            f"`{folder}` holds {len(several)} series, `{several[0]}` and `{several[1]}`, of the same numbers: are "
+            "these two cameras, or pictures and masks? They are read as one recording; give a folder for each",
+            InputWarning,
+            stacklevel=4,
+        )
 
 
 def _tell_of_more(folder: Path, count: int) -> None:

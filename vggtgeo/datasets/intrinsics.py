@@ -226,6 +226,11 @@ def _read_calibration(file: Path, width: int, height: int) -> Camera:
     fisheye = words[-1:] == [FISHEYE]
     expected = "fx fy cx cy k1 k2 k3 k4 fisheye" if fisheye else "fx fy cx cy [k1 k2 p1 p2]"
     numbers = _numbers(f"`{file}`", " ".join(words[:-1]) if fisheye else text, expected)
+    if len(numbers) in (9, 12, 16) and numbers[1] == 0:
+        raise InputError(
+            f"`{file}` holds {len(numbers)} numbers, which look like a matrix; expected {expected}: a 3 x 3 matrix "
+            f"belongs into `{MATRIX}`"
+        )
     try:
         return Camera(check_intrinsics(numbers[:4]), width, height, check_distortion(numbers[4:]), fisheye=fisheye)
     except InputError as error:

@@ -119,7 +119,7 @@ def check_there(path: str | os.PathLike[str]) -> None:
 
 
 def _check_place(place: Path) -> None:
-    if not place.exists():
+    if not is_there(place):
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
     if not os.access(place, os.R_OK | os.X_OK if place.is_dir() else os.R_OK):
         raise InputError(

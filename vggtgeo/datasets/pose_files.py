@@ -62,7 +62,7 @@ def trajectory_of(
     for lost, why, kind in (
         (~known, "a NaN or an infinity", NoteWarning),
         (known & ~near, "a number that is no time or place", InputWarning),
-        (near & ~turned, "no rotation (all zeros, say)", InputWarning),
+        (near & ~turned, "no rotation (all zeros, mirrored or scaled, say)", InputWarning),
     ):
         if lost.any():
             text = f"`{where}`: {int(lost.sum())} of {len(poses)} poses have {why}; left out of the {of}"

@@ -64,6 +64,11 @@ class RgbdFolders(FolderSequence):
                 f"`{file}`: its first column is no time, it falls while the files are numbered on; frames are taken in "
                 "the order of their numbers, depth in millimetres"
             )
+        if (folder / "depth.txt").is_file() and list_of(folder) is None:
+            _warn(
+                f"`{folder}` has a `depth.txt`, as TUM RGB-D has it, and no `rgb.txt`: read as two folders, depth in "
+                "millimetres; TUM's has 5000 units a metre (`--depth-scale 5000`), and its images come from the list"
+            )
         loose = [file for file in image_files(folder) if file not in {*images, *depths}]
         if loose:
             beside = f" beside `{colour.name}`" if colour != folder else ""

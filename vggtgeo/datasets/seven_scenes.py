@@ -20,6 +20,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, tell_of_no_depth
 from vggtgeo.datasets.image_files import MILLIMETRES
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.pose_files import trajectory_of
 from vggtgeo.datasets.registration import registered_depth
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -93,7 +94,7 @@ class SevenScenes(FolderSequence):
             if pose_file.is_file() and (pose := _read_pose(pose_file)) is not None:
                 times.append(file.timestamp)
                 poses.append(pose @ np.linalg.inv(_TO_COLOUR) if self.as_published else pose)
-        return Trajectory(np.array(times), np.array(poses)) if poses else None
+        return trajectory_of(times, np.array(poses), self.folder) if poses else None
 
 
 def _colour_files(folder: Path) -> dict[int, Path]:

@@ -33,6 +33,7 @@ MOST_LETTERS = 200
 LEAST_FALLING, LEAST_LINES = 0.1, 10
 """Share of the lines at which the first column of a list falls, and lines, for it to be no time: lists that two
 processes wrote have a line out of order now and then, and what frames took to come falls at every second line."""
+_DECIMAL_COMMA = re.compile(r"-?\d+,\d+\s")
 _TRUTH = "groundtruth.txt"
 _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")
 MOST_FRAMES = 1e6
@@ -87,6 +88,8 @@ def lists_no_times(file: Path) -> bool:
         lines = [line.split("#", 1)[0].split() for line in whole_text(file).splitlines()]
         times, names = zip(*((float(words[0]), words[1]) for words in lines if words), strict=True)
     except (InputError, ValueError, IndexError):  # told where it is read
+        return False
+    if not np.isfinite(times).all():
         return False
     falling = np.count_nonzero(np.diff(times) < 0)
     if len(times) < LEAST_LINES or falling < LEAST_FALLING * len(times) or max(map(len, names)) > MOST_LETTERS:
@@ -172,6 +175,8 @@ def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
 
 
 def _parse_entry(file: Path, number: int, text: str) -> _Entry:
+    if _DECIMAL_COMMA.match(text):
+        raise InputError(f"`{file}`, line {number}: found {text!r}; write decimals with a point: `timestamp file`")
     time, _, name = text.replace("\t", " ").replace(",", " ", 1).partition(" ")
     try:
         seconds = float(time)
@@ -192,6 +197,9 @@ def _in_order(file: Path, entries: list[_Entry], frames: bool) -> list[_Entry]:
     if len(unique) < len(ordered):
         text = f"`{file}`: {len(ordered) - len(unique)} lines repeat the time of another; the first was kept"
         _warn(LeftOutWarning(text, len(ordered) - len(unique)) if frames else text)
+    again = len(unique) - len({path for _, path in unique})
+    if again:
+        _warn(f"`{file}`: {again} of {len(unique)} lines name a file that another names, too")
     return unique
 
 

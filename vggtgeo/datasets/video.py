@@ -15,6 +15,7 @@ import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.intrinsics import MOST_ASPECT, camera_from_folder, guess_with_warning
+from vggtgeo.datasets.picture_sizes import PictureSizes
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
@@ -24,8 +25,8 @@ _LOOKED_AT = 4096
 _MOST_MISSED = 1000
 """Frames in a row that are tried: a damaged header may declare 10^9 where the file ends."""
 _MADE_OF_OTHERS = tuple(map(ord, "PB"))
-_LOOKED_AT_FRAMES = 6
-"""Of a video, at its begin: no camera's noise is the same in two."""
+_MOST_ALIKE = 6
+"""Frames that are the same to the bit, one behind the other."""
 _CONVERT = "`ffmpeg -i FILE -c:v libx264 NEW.mp4` makes one that it does"
 _PACKETS = b"\0\0\1\xba"
 """The begin of an MPEG program stream, which is a container."""
@@ -63,18 +64,9 @@ class VideoFile:
             stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
             count = int(stated) if math.isfinite(stated) else 1
             aspect = _pixel_aspect(capture)
-            alike = _alike(capture, image)
         height, width = image.shape[:2]
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
         known_rate = math.isfinite(rate) and 0 < rate < 1000
-        if alike:
-            _warn(
-                InputWarning(
-                    f"`{path}`: its first {_LOOKED_AT_FRAMES} frames are one picture, bit by bit: nothing moves there, "
-                    "or it is interlaced, which OpenCV does not decode; `ffmpeg -i FILE -vf yadif NEW.mp4` makes a "
-                    "video of whole pictures"
-                )
-            )
         if not stated > 0 and _has_no_container(path):  # a browser's recording states no count, but times
             _warn(
                 InputWarning(
@@ -101,7 +93,8 @@ class VideoFile:
     def _decode(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
         time, index, jumped = -math.inf, 0, False
         damaged: int | None = None  # the first frame of those that cannot be decoded, while they last
-        with _capture(self.path) as capture:
+        still = _Still(self.name)
+        with _capture(self.path) as capture, self._sizes(capture) as sizes:
             while end is None or index < end:
                 missed = self._missed(capture, self.count - index - 1)
                 if missed is None:
@@ -114,13 +107,15 @@ class VideoFile:
                     self._tell_damaged(damaged, index, _chosen(start, end, stride, damaged, index))
                     damaged = None
                 chosen = index >= start and (end is None or index < end) and (index - start) % stride == 0
-                if chosen and damaged is None:
+                fits = sizes.fits(index, capture.get(cv2.CAP_PROP_PTS), chosen)
+                if chosen and fits and damaged is None:
                     readable, image = _decoded(capture.retrieve)
                     wrong = self._wrong(image if readable else None)
                     if wrong:
                         _warn(LeftOutWarning(f"`{self.name}`: frame {index} {wrong}; it is skipped"))
                     else:
                         colour = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+                        still.see(index, colour)
                         yield Frame(index, time, colour, None, f"{self.name}, frame {index}")
                 index += 1
         if damaged is not None:
@@ -130,6 +125,17 @@ class VideoFile:
             counts = f"ends after {index} frames; its header says {self.count}"
             text = f"`{self.name}` {counts}: is the file cut off, or damaged?"
             _warn(InputWarning(text))  # not as left out: where the rate varies, the header of an MKV only guesses
+
+    @contextmanager
+    def _sizes(self, capture: Any) -> Iterator[PictureSizes]:
+        """The sizes of the pictures before OpenCV scaled them; tells of those that are others than the first's."""
+        sizes = PictureSizes(_ffmpeg_name(self.path), _letters(capture))
+        try:
+            yield sizes
+        finally:
+            sizes.close()
+        for warning in sizes.warnings(self.name):
+            _warn(warning)
 
     def _missed(self, capture: Any, more: int) -> int | None:
         """Frames that cannot be decoded before the next one, which is grabbed; None at the end.
@@ -182,6 +188,30 @@ class VideoFile:
         return back
 
 
+class _Still:
+    """Tells of frames that are the same to the bit, which no camera's noise is: where OpenCV 5 cannot convert a frame,
+    it answers with what was in its memory, and says that all is well.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name, self._last, self._alike, self._told = name, np.zeros((0, 0, 3), np.uint8), [0], False
+
+    def see(self, index: int, image: np.ndarray) -> None:
+        """index, image: of the next frame that is used."""
+        same = np.array_equal(image[::16], self._last[::16]) and np.array_equal(image, self._last)
+        self._alike = [*self._alike, index] if same and not self._told else [index]
+        self._last = image
+        if len(self._alike) == _MOST_ALIKE:
+            self._told = True
+            _warn(
+                InputWarning(
+                    f"`{self._name}`: its frames {self._alike[0]} to {index} are one picture, bit by bit: nothing "
+                    "moves there, or they are interlaced, which OpenCV does not decode; `ffmpeg -i FILE -vf yadif "
+                    "NEW.mp4` makes a video of whole pictures"
+                )
+            )
+
+
 def _pixel_aspect(capture: Any) -> float:
     """Width of a pixel over its height, as the container says (1440 x 1080 are shown as 16:9); 1 where it says none, or
     what is none.
@@ -193,17 +223,6 @@ def _pixel_aspect(capture: Any) -> float:
     return across / down if known else 1.0
 
 
-def _alike(capture: Any, first: np.ndarray) -> bool:
-    """Whether the frames behind the first are the same to the bit: where OpenCV 5 cannot convert a frame, it answers
-    with what was in its memory, and says that all is well.
-    """
-    for _ in range(_LOOKED_AT_FRAMES - 1):
-        readable, image = _decoded(capture.read)
-        if not readable or image is None or not np.array_equal(image, first):
-            return False
-    return True
-
-
 def _has_no_container(path: Path) -> bool:
     """Whether frames of H.264, MPEG or JPEG lie there one behind the other, without their times."""
     with path.open("rb") as file:
@@ -213,9 +232,12 @@ def _has_no_container(path: Path) -> bool:
 
 def _codec(capture: Any) -> str:
     """The four letters of a codec."""
-    code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
-    letters = code.to_bytes(4, "little").decode("ascii", "replace")
-    return letters if letters.isprintable() and code else "not known"
+    letters = _letters(capture).decode("ascii", "replace")
+    return letters if letters.isprintable() else "not known"
+
+
+def _letters(capture: Any) -> bytes:
+    return (int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little")
 
 
 def _stands_alone(capture: Any) -> bool:
@@ -258,11 +280,7 @@ def _capture(path: Path) -> Iterator[Any]:
     if _is_text(path):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
     try:
-        name = os.path.abspath(path).encode().decode()  # FFmpeg takes what is before a `:` for a protocol
-    except UnicodeError:  # OpenCV 5 ends the process over such a name
-        raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
-    try:
-        capture = cv2.VideoCapture(name)
+        capture = cv2.VideoCapture(_ffmpeg_name(path))
     except cv2.error as error:
         raise InputError(f"`{path}` cannot be opened as a video: {error.err}") from None
     try:
@@ -274,6 +292,14 @@ def _capture(path: Path) -> Iterator[Any]:
         yield capture
     finally:
         capture.release()
+
+
+def _ffmpeg_name(path: Path) -> str:
+    """FFmpeg takes what is before a `:` for a protocol, where a path does not begin with `/`."""
+    try:
+        return os.path.abspath(path).encode().decode()
+    except UnicodeError:  # OpenCV 5 ends the process over such a name
+        raise InputError(f"the name of `{path}` is no UTF-8, which OpenCV needs; rename the video") from None
 
 
 def _warn(warning: InputWarning) -> None:

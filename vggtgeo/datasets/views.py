@@ -14,6 +14,10 @@ from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_real
+
+LEAST_UNITS, MOST_UNITS = 1e-3, 1e6
+"""Units a metre of depth files."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +76,17 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
     """The sequence whose depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
 
     Raises:
-        InputError: it is no positive number, or the depth comes from no such files.
+        InputError: it is no positive number, no scale of a depth, or the depth comes from no such files.
 
     """
-    if not (math.isfinite(units_per_metre) and units_per_metre > 0):
+    check_real("units_per_metre", units_per_metre, "a positive number of units a metre")
+    if not 0 < units_per_metre < math.inf:
         raise InputError(f"the depth's scale is {units_per_metre:g}; it must be a positive number of units a metre")
+    if not LEAST_UNITS <= units_per_metre <= MOST_UNITS:
+        raise InputError(
+            f"the depth's scale is {float(units_per_metre):g} units a metre, and depth files have {LEAST_UNITS:g} "
+            f"(kilometres) to {MOST_UNITS:g} (micrometres): 1000 is millimetres, 5000 TUM's"
+        )
     plain = isinstance(sequence, FolderSequence) and type(sequence).load_depth is FolderSequence.load_depth
     if not plain or not sequence.has_depth:
         raise InputError(f"`{sequence.name}` has no depth files whose unit could be another")

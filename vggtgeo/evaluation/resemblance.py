@@ -27,6 +27,13 @@ WORST_SHARE = 0.4
 """Of that spread. The truths of corridor-office, building-walk, icl-office and redkitchen, one against another from
 their first poses on, are 0.43 to 0.85 of it apart after Sim(3)."""
 
+AGREEING = 0.1
+"""Of that spread: places that are the same."""
+WIDE = 0.05
+"""Of the path's spread along its main direction, across it: a straight one may be turned about itself."""
+MOST_TURNED = np.radians(30.0)
+"""Between orientations where places agree. An estimate that follows the path is not so far off."""
+
 
 def warn_of_strangers(
     estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE, metric: bool = False
@@ -55,6 +62,12 @@ def warn_of_strangers(
             f"the estimate explains the true path hardly better than a camera that stands still (error after Sim(3) "
             f"{share:.2f} of the path's spread): it is of another sequence, or it failed"
         )
+    apart = orientation_gap(matched, reference) if share is not None and share < AGREEING else None
+    if apart is not None and apart > MOST_TURNED:
+        _warn(
+            f"places agree, and orientations are {np.degrees(apart):.0f} deg apart: are the quaternions of both files "
+            "`qx qy qz qw`, and their poses those of the same camera? RPE says nothing here"
+        )
     scale = absolute_error(matched, reference, "sim3").alignment.scale if len(matched) >= FEW_MATCHES else 1.0
     resized = metric and not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE
     if resized:
@@ -76,6 +89,17 @@ def place_misfit(matched: Trajectory, reference: Trajectory) -> float | None:
     if spread < LEAST_SPREAD or len(matched) < FEW_MATCHES:
         return None
     return absolute_error(matched, reference, "sim3").statistics.rmse / spread
+
+
+def orientation_gap(matched: Trajectory, reference: Trajectory) -> float | None:
+    """Median angle between orientations after the Sim(3) alignment of the places, radians; None where these lie on a
+    line, and leave the turn about it open.
+    """
+    along, across, _ = np.linalg.svd(reference.positions - reference.positions.mean(axis=0), compute_uv=False)
+    if across <= WIDE * along:
+        return None
+    aligned = absolute_error(matched, reference, "sim3").alignment.trajectory(matched)
+    return float(np.median(rotation_angle(aligned.rotations.swapaxes(1, 2) @ reference.rotations)))
 
 
 def rotation_misfit(matched: Trajectory, reference: Trajectory) -> float | None:

@@ -16,6 +16,7 @@ from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.figures.plots import NotebookFigure, energy_figure, errors_figure, trajectory_figure
 from vggtgeo.figures.uncertainty import covariance_figure, observability_figure
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
 
@@ -39,7 +40,7 @@ def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
         options: of the value's kind.
 
     Raises:
-        TypeError: there is no picture of such a value.
+        InputError: there is no picture of such a value.
 
     Example (of `solve`'s):
         >>> vg.plot(solution).axes[0].get_ylabel()
@@ -47,7 +48,7 @@ def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
 
     """
     known = sorted(kind.__name__ for kind in plot.registry if kind is not object)
-    raise TypeError(f"`plot` has no picture of a `{type(value).__name__}`; it draws {', '.join(known)}")
+    raise InputError(f"`plot` has no picture of a `{type(value).__name__}`; it draws {', '.join(known)}")
 
 
 @plot.register(Trajectory)

@@ -1,5 +1,7 @@
 """What the library says about input that it cannot use: one exception, one warning."""
 
+from vggtgeo.io.one_line import shortened
+
 
 class InputError(ValueError):
     """Something the user gave (a path, a file, a number) is wrong; the message says what, and what to do.
@@ -13,9 +15,15 @@ class InputError(ValueError):
 
     """
 
+    def __str__(self) -> str:
+        return shortened(super().__str__())
+
 
 class InputWarning(UserWarning):
     """Something the user gave was left out or assumed, and the work goes on; the message names it."""
+
+    def __str__(self) -> str:
+        return shortened(super().__str__())
 
 
 class NoteWarning(InputWarning):

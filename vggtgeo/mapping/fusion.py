@@ -11,6 +11,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind, check_positive, check_real, check_whole, real_array
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.tsdf import (
     BATCH,
@@ -84,7 +85,7 @@ class SurfaceFusion:
         bound: how far a view's surface may move before it is fused again, voxels; at the far end of what it sees.
 
     Raises:
-        InputError: `voxel` or `bound` is no such number.
+        InputError: one of them is no such number.
 
     Example:
         >>> import numpy as np, vggtgeo as vg
@@ -96,11 +97,12 @@ class SurfaceFusion:
     """
 
     def __init__(self, intrinsics: np.ndarray, voxel: float = 0.02, least_views: int = 2, bound: float = 0.5):
-        if not voxel > 0:
-            raise InputError(f"`voxel` is {voxel}; it must be positive metres")
+        check_positive("voxel", voxel, "metres")
+        check_real("bound", bound, "voxels, 0 or more")
         if not bound >= 0:
             raise InputError(f"`bound` is {bound}; it must be voxels, 0 or more")
-        self._intrinsics = np.asarray(intrinsics, np.float64)
+        check_whole("least_views", least_views, 1)
+        self._intrinsics = real_array("intrinsics", intrinsics, (4,)).astype(np.float64)
         self._voxel, self._least_views, self._bound = voxel, least_views, bound
         self._fused: dict[int, _Fused] = {}
         self._touched: dict[Block, set[int]] = defaultdict(set)
@@ -112,7 +114,16 @@ class SurfaceFusion:
 
         keyframes: all of the map, poses world -> camera. depth_maps: one each, None where there is none; by default the
         depth that each measured.
+
+        Raises:
+            InputError: they are no keyframes, or the maps are not one each.
+
         """
+        check_kind("keyframes", keyframes, Sequence, "a sequence of keyframes, such as `state.adjusted_keyframes`")
+        for keyframe in keyframes:
+            check_kind("keyframes", keyframe, Keyframe, "a sequence of keyframes, such as `state.adjusted_keyframes`")
+        if depth_maps is not None and len(depth_maps) != len(keyframes):
+            raise InputError(f"`depth_maps` has {len(depth_maps)} entries; expected {len(keyframes)}, one a keyframe")
         maps = [None] * len(keyframes) if depth_maps is None else depth_maps
         stale: set[Block] = set()
         for number in self._fused.keys() - {keyframe.number for keyframe in keyframes}:

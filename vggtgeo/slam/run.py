@@ -19,7 +19,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import LeftOutWarning
-from vggtgeo.io.given import check_kind
+from vggtgeo.io.given import check_kind, check_whole
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
@@ -166,7 +166,12 @@ def frame_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
         >>> vg.frame_trajectory(next(vg.run(vg.simulate("room", 3, size=(160, 120)))))
         Trajectory(1 pose, 0.00 s, path 0.00 m)
 
+    Raises:
+        InputError: `slam` is no state of a run, or has no such piece.
+
     """
+    check_kind("slam", slam, Slam, "a state of a run, as `vggtgeo.run` yields it")
+    check_whole("piece", piece, most=max(len(pieces_by_size(slam)) - 1, 0) if slam.keyframes else 0)
     times, poses = frame_poses(slam)
     own: set[int] = set(pieces_by_size(slam)[piece]) if slam.keyframes else set()
     chosen = np.array([record.tracked and record.reference in own for record in slam.frames], bool)
