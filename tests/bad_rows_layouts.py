@@ -42,6 +42,8 @@ TIMES = rows(
     "Lists and poses",
     [
         ("KITTI's `times.txt` with 1e300", recorded(layouts.kitti, bad.write("times.txt", "0\n1\n1e300\n"))),
+        ("KITTI's `times.txt` without a line", recorded(layouts.kitti, bad.write("times.txt", ""))),
+        ("Replica's `traj.txt` without a line", recorded(layouts.replica, bad.write("traj.txt", ""))),
         (
             "Record3D's times, one of 1e300",
             recorded(layouts.record3d, other_numbers("metadata", frameTimestamps=[0.0, 1.0, 1e300])),

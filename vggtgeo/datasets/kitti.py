@@ -80,11 +80,16 @@ class Kitti(FolderSequence):
 
 def _times(folder: Path, place: Path) -> list[float]:
     """Of every line of the drive; none where no list is there."""
-    seconds = folder / "times.txt"
-    if seconds.is_file():
-        return read_matrices(seconds, 1)[:, 0].tolist()
-    stamps = place.parent / "timestamps.txt"
-    return _moments(stamps) if stamps.is_file() else []
+    seconds, stamps = folder / "times.txt", place.parent / "timestamps.txt"
+    file = next((file for file in (seconds, stamps) if file.is_file()), None)
+    if file is None:
+        return []
+    times = read_matrices(file, 1)[:, 0].tolist() if file == seconds else _moments(file)
+    if not times:
+        raise InputError(
+            f"`{file}` has no time; give that of the drive, or take the file away (then {RATE:g} frames a second)"
+        )
+    return times
 
 
 def _moments(file: Path) -> list[float]:

@@ -67,6 +67,8 @@ def trajectory_of(
         if lost.any():
             text = f"`{where}`: {int(lost.sum())} of {len(poses)} poses have {why}; left out of the {of}"
             warnings.warn(text, kind, stacklevel=3)
+    if not len(poses) and where.is_file():
+        warnings.warn(f"`{where}` has no pose: there is no {of}", InputWarning, stacklevel=3)
     if not turned.any():
         return None
     rows = np.flatnonzero(turned)
