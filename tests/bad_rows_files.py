@@ -50,11 +50,11 @@ def calibrated(content: str | bytes) -> Any:
     return lambda folder: bad.frames(folder / "frames", calibration=content)
 
 
-def phone(folder: Path) -> Path:
-    """Images and depth in folders, the depth of half their sides."""
+def phone(folder: Path, size: tuple[int, int] = (20, 15)) -> Path:
+    """Images and depth in folders, the depth of half their sides, or of another size."""
     made = layouts.rgbd(folder / "phone")
     for file in sorted((made / "depth").iterdir()):
-        tiny.write_image(file, tiny.depth_codes(0, 20, 15))
+        tiny.write_image(file, np.full(size[::-1], 2000, np.uint16))
     return made
 
 
@@ -191,6 +191,8 @@ SMALL = rows(
 DEPTH = rows(
     "Depth images",
     [
+        ("16 bits in metres", bad.every_depth(lambda: np.full((tiny.HEIGHT, tiny.WIDTH), 2, np.uint16))),
+        ("one pixel for a whole image", lambda folder: phone(folder, (1, 1))),
         ("8 bits", bad.every_depth(lambda: tiny.image(1)[..., 0])),
         ("three channels", bad.every_depth(lambda: tiny.image(1))),
         ("all zero", bad.every_depth(lambda: np.zeros((tiny.HEIGHT, tiny.WIDTH), np.uint16))),

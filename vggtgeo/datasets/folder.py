@@ -190,6 +190,12 @@ def common_size(
     return Counter(sizes).most_common(1)[0][0]
 
 
+NEAREST = 0.01
+"""Metres: no camera of depth measures what is nearer."""
+MOST_ENLARGED = 32
+"""Pixels of an image to one of its depth, along a side; phones have 8."""
+
+
 def depth_is_usable(
     name: str, files: Sequence[FrameFile], coding: DepthFormat, width: int, height: int, of_fewer_pixels: bool = False
 ) -> bool:
@@ -216,6 +222,11 @@ def depth_is_usable(
                 "with --rgb-only"
             )
         if np.isfinite(depth).any():
+            if (middle := float(np.nanmedian(depth))) < NEAREST:
+                _warn(
+                    f"`{file.depth}`: half of its depths are below {middle:.2g} m: is its unit another? "
+                    "`--depth-scale` says how many there are in a metre: 1000 are millimetres"
+                )
             if of_fewer:
                 _warn(
                     _other_size(file.depth, depth, width, height) + ": taken for the same view, and enlarged to them",
@@ -246,7 +257,7 @@ def enlarged(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def _is_of_fewer_pixels(depth: np.ndarray, width: int, height: int) -> bool:
     """Whether depth [h, w] has the shape of images of this size, to a pixel, in fewer: that of a phone's LiDAR."""
     rows, columns = depth.shape
-    return columns < width and abs(columns * height / width - rows) < 1
+    return width / MOST_ENLARGED <= columns < width and abs(columns * height / width - rows) < 1
 
 
 def _spread(files: Sequence[FrameFile]) -> list[FrameFile]:
