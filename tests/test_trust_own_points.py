@@ -72,6 +72,25 @@ def test_right_map_is_silent_in_any_noise(noise: float) -> None:
     assert _told(slam) == []
 
 
+@pytest.mark.parametrize("again", [True, False])
+def test_picture_that_stands_still_is_one_witness(again: bool) -> None:
+    """Ten frames of which each has a quarter of its landmarks elsewhere are told, unless they are one picture, shown
+    again and again; oracle: which it is.
+    """
+    rng, slam = np.random.default_rng(1), _glide(0.5)
+    records = list(slam.frames)
+    for row in range(FIRST_OFF, FIRST_OFF + 10):
+        seen = records[FIRST_OFF if again else row].seen
+        assert seen is not None
+        if not again or row == FIRST_OFF:
+            elsewhere = rng.normal(0, 20, seen.pixels.shape) * (rng.random((POINTS, 1)) < 0.25)
+            seen = replace(seen, pixels=(seen.pixels + elsewhere).astype(np.float32))
+        records[row] = replace(records[row], relative=records[FIRST_OFF if again else row].relative, seen=seen)
+    changed = replace(slam, frames=tuple(records))
+    assert len(agreeing_landmarks(changed, frame_poses(changed)[1])[0]) == FRAMES - (10 if again else 1)
+    assert len(_told(changed)) == (not again)
+
+
 def test_map_of_wrong_depths_is_told_where_its_frames_have_moved() -> None:
     """Each frame is placed by the far two thirds, and what is near is elsewhere by more the farther it has moved."""
     (finding,) = _told(_with_wrong_depths(_glide(0.5)))

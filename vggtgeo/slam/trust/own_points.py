@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from vggtgeo.slam.frame_poses import off_landmarks
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state import FramePose, Slam
 from vggtgeo.slam.trust.finding import Finding, spans
 
 OFF = 3.0
@@ -25,6 +25,9 @@ MEDIAN = float(np.sqrt(2 * np.log(2)))
 """Of the distance of a point whose coordinates have a standard deviation of one."""
 IN_A_ROW = 9
 """Frames whose median counts: one may be blurred."""
+MOVED = 1.0
+"""Pixels, the median of the landmarks that two frames share: less, a standard deviation of a key point, is the same
+view again, and no other witness. A film whose picture stood still for seven frames was called wrong for that view."""
 LEAST_AGREEING = 0.83
 """Of the landmarks of the median frame. In the worst nine frames of right maps 0.88 to 0.99 agree (four clips in pieces
 of 40 to 102 frames, with and without calibration, noise and blur; six films of strangers), in two wrong ones 0.78 and
@@ -51,10 +54,24 @@ def check_own_points(slam: Slam, poses: np.ndarray) -> list[Finding]:
 
 
 def agreeing_landmarks(slam: Slam, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of `slam.frames`, int [n], of frames that points alone placed, and the share of the landmarks of each that
-    agree with it, float64 [n].
+    """Rows of `slam.frames`, int [n], of frames that points alone placed, each with a view of its own, and the share of
+    the landmarks of each that agree with it, float64 [n].
     """
     off = off_landmarks(slam, poses)
     usual = np.median([np.median(values) for values in off.values()]) if off else 0.0
     gate = OFF * max(float(usual) / MEDIAN, 1.0)
-    return np.array([*off], int), np.array([np.mean(values < gate) for values in off.values()], np.float64)
+    rows: list[int] = []
+    for row in off:
+        if not rows or _moved(slam.frames[rows[-1]], slam.frames[row]):
+            rows.append(row)
+    return np.array(rows, int), np.array([np.mean(off[row] < gate) for row in rows], np.float64)
+
+
+def _moved(before: FramePose, after: FramePose) -> bool:
+    """Whether two frames see what both have kept at different places, or not the same."""
+    if before.seen is None or after.seen is None or before.reference != after.reference:
+        return True
+    _, first, second = np.intersect1d(before.seen.slots, after.seen.slots, assume_unique=True, return_indices=True)
+    if not len(first):
+        return True
+    return bool(np.median(np.linalg.norm(after.seen.pixels[second] - before.seen.pixels[first], axis=1)) > MOVED)
