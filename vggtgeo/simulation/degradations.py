@@ -125,6 +125,13 @@ def growing_depth(recording: Recording, rng: np.random.Generator) -> Recording:
     return with_depths(recording, lambda depth, row: depth * (1 + 0.4 * row / count))
 
 
+def jumping_depth(recording: Recording, rng: np.random.Generator) -> Recording:
+    """A depth camera that starts again in another mode: from the middle on its depth is a fifth longer."""
+    del rng
+    middle = len(recording.frames) // 2
+    return with_depths(recording, lambda depth, row: depth * (1.2 if row >= middle else 1.0))
+
+
 def other_depth(recording: Recording, rng: np.random.Generator) -> Recording:
     """The depth images in reverse order."""
     del rng
@@ -202,7 +209,7 @@ def without_depth(recording: Recording, rng: np.random.Generator) -> Recording:
 DEGRADATIONS: dict[str, Degradation] = {
     "base": as_it_is,
     **{change.__name__: change for change in (dirty_lens, bars, text, board, person, dark, centimetres)},
-    **{change.__name__: change for change in (growing_depth, other_depth, shuffled, barrel)},
+    **{change.__name__: change for change in (growing_depth, jumping_depth, other_depth, shuffled, barrel)},
     **{change.__name__: change for change in (zooming, changed_lens, rolling_shutter, wrong_focal)},
     **{change.__name__: change for change in (covered, without_depth)},
 }
