@@ -24,9 +24,9 @@ from vggtgeo.slam.trust.sensor_drift import MOST_ZOOM, SIGMAS, compare, directed
 
 MOST_CHANGE = MOST_ZOOM
 """Of the logarithm of either factor: what is told of a focal length, or a scale, that is off as a whole. Over any 1 to
-20 places right depth has at most 0.024 (64 and 39 keyframes of building-walk and corridor-office, 14 of redkitchen, 6
-of icl-office), 0.053 with 3 % of noise a metre, and right lenses 0.020 to 0.062; depth that is 1.2 times as long from a
-frame on, and at most 0.02 elsewhere, has 0.181 to 0.185 at one place; depth that is two frames late in a part 0.17."""
+20 places right depth has at most 0.030 (64 and 77 keyframes of building-walk and corridor-office, 15 of redkitchen, 6
+of icl-office), 0.064 over 20 of all of redkitchen, 0.053 with 3 % of noise a metre, and right lenses 0.020 to 0.062;
+depth that is 1.2 times as long from a frame on has 0.181 to 0.185 at one place, depth that is late in a part 0.17."""
 LEAST_SIGMA = 0.005
 """Standard deviation of a logarithm between two neighbours, at least: over 20 places nothing below 0.11 is told. Right
 ones spread by 0.001 to 0.009."""
@@ -86,30 +86,38 @@ def neighbour_factors(slam: Slam) -> np.ndarray:
     """Logarithms of the factors between each keyframe and the next, of the focal length and of the unit of depth,
     float64 [n - 1, 2], NaN where nothing speaks.
     """
-    places = max(len(slam.keyframes) - 1, 0)
-    crossing: list[list[Pair]] = [[] for _ in range(places)]
-    for pair in slam.pairs:
-        if pair.second - pair.first <= REACH:
-            for place in range(pair.first, pair.second):
-                crossing[place].append(pair)
-    found = np.full((places, 2), np.nan)
-    for place, pairs in enumerate(crossing):
-        neighbours = [pair for pair in pairs if pair.second - pair.first == 1]
-        found[place] = _median_factors(slam, neighbours, 1)
-        if not (np.abs(found[place]) <= MOST_CHANGE / 2).all():
-            found[place] = _median_factors(slam, pairs, LEAST_PAIRS)
+    places = range(len(slam.keyframes) - 1)
+    near = [pair for pair in slam.pairs if pair.second - pair.first <= REACH]
+    said = _compared(slam, [pair for pair in near if pair.second - pair.first == 1])
+    found = np.array([_medians([said.get((n, n + 1), [])], 1) for n in places]).reshape(-1, 2)
+    doubtful = {n for n in places if not (np.abs(found[n]) <= MOST_CHANGE / 2).all()}
+    crossing = {n: [pair for pair in near if pair.first <= n < pair.second] for n in doubtful}
+    wider = {pair.key: pair for pairs in crossing.values() for pair in pairs if pair.key not in said}
+    said |= _compared(slam, list(wider.values()))
+    for place, pairs in crossing.items():
+        found[place] = _medians([said.get(pair.key, []) for pair in pairs], LEAST_PAIRS)
     return found
 
 
-def _median_factors(slam: Slam, pairs: list[Pair], least: int) -> np.ndarray:
-    """Of focal length and unit, the later over the earlier keyframe, float64 [2]; NaN where fewer pairs speak."""
-    values: tuple[list[float], list[float]] = [], []
-    spoken: tuple[set[tuple[int, int]], set[tuple[int, int]]] = set(), set()
+def _compared(slam: Slam, pairs: list[Pair]) -> dict[tuple[int, int], list[np.ndarray]]:
+    """What both directions of each pair say, by its keyframes: float64 [2] each, focal length and unit, the later over
+    the earlier keyframe, NaN where unknown.
+    """
+    said: dict[tuple[int, int], list[np.ndarray]] = {}
     for directed in directed_pairs(slam, pairs):
         first, second = directed.numbers
         factors = compare(directed, np.asarray(slam.intrinsics, np.float64))
-        for column, (value, sigma) in enumerate((factors.focal, factors.depth)):
-            if np.isfinite(sigma):
-                values[column].append(value if second > first else -value)
-                spoken[column].add((min(first, second), max(first, second)))
-    return np.array([np.median(v) if len(s) >= least else np.nan for v, s in zip(values, spoken, strict=True)])
+        values = [value if np.isfinite(sigma) else np.nan for value, sigma in (factors.focal, factors.depth)]
+        key = min(first, second), max(first, second)
+        said.setdefault(key, []).append(np.array(values) if second > first else -np.array(values))
+    return said
+
+
+def _medians(said: list[list[np.ndarray]], least: int) -> np.ndarray:
+    """Over what some pairs say, float64 [2]; NaN where fewer than `least` of them speak."""
+    found = np.full(2, np.nan)
+    for column in range(2):
+        known = [[value[column] for value in pair if np.isfinite(value[column])] for pair in said]
+        if sum(bool(values) for values in known) >= least:
+            found[column] = np.median(np.concatenate(known))
+    return found
