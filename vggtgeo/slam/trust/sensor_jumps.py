@@ -31,9 +31,9 @@ LEAST_SIGMA = 0.005
 """Standard deviation of a logarithm between two neighbours, at least: over 20 places nothing below 0.11 is told. Right
 ones spread by 0.001 to 0.009."""
 MOST_SIGMA = MOST_CHANGE / SIGMAS
-"""Of a logarithm by its own pair: one that knows it worse says nothing. Before a white wall a camera that moves straight
-on leaves the lens open: in building-walk, frames 43 to 49, by 0.03 to 0.05, and the six values there, which agreed
-on -0.12, were taken for a zoom."""
+"""Of a logarithm by its own pair: one that knows it worse says nothing. Straight on before a white wall the lens is
+left open: in building-walk, frames 43 to 49, by 0.03 to 0.05, and the six values there, -0.12 in their median, were
+taken for a zoom."""
 WITHIN = 20
 """Places between keyframes."""
 REACH = 2
