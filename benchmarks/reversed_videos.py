@@ -17,8 +17,7 @@ Both may be wrong alike (mirrored depths of a distant scene, a focal length that
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -27,41 +26,12 @@ from scipy.spatial.transform import Rotation
 
 import vggtgeo as vg
 from vggtgeo.datasets import Frame, open_sequence
-from vggtgeo.evaluation.alignment import umeyama
+from vggtgeo.evaluation.absolute import absolute_error
 from vggtgeo.evaluation.association import associate
-from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 
 APART = 5.0
 """Percent of the diameter: paths of right runs are 0.1 to 2 % apart."""
-
-
-@dataclass(frozen=True)
-class Frames:
-    """Some frames of a video, in either order."""
-
-    name: str
-    camera: Camera
-    has_depth: bool
-    some: tuple[Frame, ...]
-
-    def __len__(self) -> int:
-        return len(self.some)
-
-    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`."""
-        return islice(iter(self.some), start, end, stride)
-
-    def ground_truth(self) -> None:
-        """Nobody knows it."""
-
-    def backwards(self) -> Frames:
-        """The last frame first; times grow from 0 as they did."""
-        last = self.some[-1].timestamp
-        turned = [
-            replace(frame, index=row, timestamp=last - frame.timestamp) for row, frame in enumerate(reversed(self.some))
-        ]
-        return replace(self, some=tuple(turned))
 
 
 def main() -> None:
@@ -71,10 +41,17 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for path in options.videos:
         sequence = open_sequence(path)
-        selected = islice(sequence.frames(options.start, None, options.stride), options.frames)
-        there = Frames(path.name, sequence.camera, sequence.has_depth, tuple(selected))
-        first, second = (vg.reconstruct(frames, dense="none") for frames in (there, there.backwards()))
-        print(f"| {path.name} | {len(there)} | {compared(first, second, there.some[-1].timestamp)} |", flush=True)
+        there = list(islice(sequence.frames(options.start, None, options.stride), options.frames))
+        first, second = (
+            vg.reconstruct(frames, camera=sequence.camera, dense="none") for frames in (there, backwards(there))
+        )
+        print(f"| {path.name} | {len(there)} | {compared(first, second, there[-1].timestamp)} |", flush=True)
+
+
+def backwards(frames: list[Frame]) -> list[Frame]:
+    """The last frame first; times grow from 0 as they did."""
+    last = frames[-1].timestamp
+    return [replace(frame, index=row, timestamp=last - frame.timestamp) for row, frame in enumerate(reversed(frames))]
 
 
 def compared(first: vg.Result, second: vg.Result, last: float) -> str:
@@ -93,14 +70,13 @@ def differences(first: Trajectory, second: Trajectory, free: bool) -> tuple[floa
     since the first common frame, degrees. NaN of paths with fewer than three common frames.
     """
     one, other = associate(first, second)
-    if len(one.timestamps) < 3:
+    if len(one) < 3:
         return float("nan"), float("nan")
-    fit = umeyama(other.positions, one.positions, with_scale=free)
-    off = np.linalg.norm(fit.points(other.positions) - one.positions, axis=1)
+    off = absolute_error(other, one, "sim3" if free else "se3").statistics.rmse
     diameter = np.linalg.norm(one.positions[:, None] - one.positions[None], axis=2).max()
-    turns = [path.poses[0, :3, :3].T @ path.poses[:, :3, :3] for path in (one, other)]
+    turns = [path.rotations[0].T @ path.rotations for path in (one, other)]
     angles = Rotation.from_matrix(turns[0].mT @ turns[1]).magnitude()
-    return 100 * float(np.sqrt(np.mean(off**2)) / max(diameter, 1e-12)), float(np.rad2deg(angles.max()))
+    return 100 * off / max(float(diameter), 1e-12), float(np.rad2deg(angles.max()))
 
 
 def _options() -> argparse.Namespace:

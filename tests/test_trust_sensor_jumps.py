@@ -10,10 +10,12 @@ from matched_slam import matched_slam
 from scipy.spatial.transform import Rotation
 from test_trust_sensor_drift import K
 
+from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.sensor_drift import check_sensors
+from vggtgeo.slam.trust.sensor_drift import check_sensors, compare, directed_pairs
 from vggtgeo.slam.trust.sensor_jumps import (
     MOST_CHANGE,
+    MOST_SIGMA,
     REACH,
     WITHIN,
     check_jumps,
@@ -46,12 +48,17 @@ def _walk(focal: float = 1.0, unit: float = 1.0, noise: float = 0.01, poses_off:
         pose = keyframe.pose.copy()
         pose[:3, 3] *= metres if poses_off else 1.0
         changed.append(replace(keyframe, points=points, pose=pose))
+    return _seen(slam, changed)
+
+
+def _seen(slam: Slam, keyframes: list[Keyframe]) -> Slam:
+    """The state with these keyframes, whose neighbours match at the pixels that they have now."""
     near = [pair for pair in slam.pairs if pair.second - pair.first <= REACH]
-    pixels_of = lambda number: changed[number].points.pixels
+    pixels_of = lambda number: keyframes[number].points.pixels
     pairs = tuple(
         replace(p, points=replace(p.points, pixels_i=pixels_of(p.first), pixels_j=pixels_of(p.second))) for p in near
     )
-    return replace(slam, intrinsics=K, metric=True, keyframes=tuple(changed), pairs=pairs)
+    return replace(slam, intrinsics=K, metric=True, keyframes=tuple(keyframes), pairs=pairs)
 
 
 def test_a_sensor_that_stays_is_told_nothing() -> None:
@@ -104,6 +111,30 @@ def test_changes_within_some_keyframes_are_told_and_steady_ones_are_not() -> Non
     assert sudden_changes(np.zeros(0)) == []
     noisy = [sudden_changes(rng.normal(0, 0.03, 200)) for _ in range(20)]
     assert sum(map(len, noisy)) <= 1, "what a run's own spread explains"
+
+
+def test_a_way_straight_to_a_wall_says_nothing_of_the_lens() -> None:
+    """The wall grows alike by a longer lens and by coming nearer: by their own deviation pairs do not know the lens,
+    whose values are as large as a zoom's, and are not asked; the unit of depth they know.
+    """
+    rng = np.random.default_rng(0)
+    wall = rng.uniform((-2, -2, 5.95), (2, 2, 6.05), (POINTS, 3))
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, 2, 3] = -0.15 * np.arange(12)
+    slam = matched_slam(wall, poses)
+    seen = []
+    for keyframe in slam.keyframes:
+        pixels = keyframe.points.pixels + rng.normal(0, 0.3, (POINTS, 2))
+        prior = keyframe.points.inverse_depth * (1 + rng.normal(0, 0.01, POINTS))
+        seen.append(replace(keyframe, points=replace(keyframe.points, pixels=pixels, prior=prior)))
+    slam = _seen(slam, seen)
+    found = [compare(pair, K).focal for pair in directed_pairs(slam, list(slam.pairs))]
+    assert min(sigma for _, sigma in found) > MOST_SIGMA
+    assert max(abs(value) for value, _ in found) > MOST_CHANGE
+    factors = neighbour_factors(slam)
+    assert np.isnan(factors[:, 0]).all()
+    assert np.isfinite(factors[:, 1]).all()
+    assert list(check_jumps(slam)) == []
 
 
 def test_what_is_below_the_bar_and_what_one_pair_says_is_not_told() -> None:
