@@ -30,6 +30,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 FINDINGS = ROOT / ".cache" / "fuzz" / "findings"
+MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # where the files lie: not on a disk, which is slower
 SECONDS, MEGABYTES = 20, 1500
 REPORTED = 20
 """Files between two writings of the counts."""
@@ -128,7 +129,7 @@ def in_processes(name: str, file: str, seed: int, seconds: float, count: int | N
     row: dict[str, Any] = {"executions": 0, "refused": 0, "findings": {}, "worst": 0.0, "ended": 0}
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        place = Path(tempfile.mkdtemp())
+        place = Path(tempfile.mkdtemp(dir=MEMORY))
         left = end - time.monotonic()
         limit = [] if count is None else ["--count", str(count)]
         command = [sys.executable, __file__, name, "--child", str(place), "--seed", str(seed), "--seconds", str(left)]
