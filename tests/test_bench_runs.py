@@ -163,6 +163,7 @@ def test_two_hundred_runs_with_ten_kills_end_as_undisturbed(tmp_path: Path) -> N
     assert len(list((tmp_path / "wild" / "runs").iterdir())) == 200
 
 
+@pytest.mark.long
 def test_a_driver_that_dies_goes_on_where_it_was(tmp_path: Path) -> None:
     # Proves that after SIGKILL of the driver a second call does the rest only, and that no run is lost or done twice
     # but the one that was going on. Oracle: the list of starts.

@@ -115,6 +115,7 @@ def test_the_sensor_s_own_depth_counts_and_holes_are_filled(run: RecordedRun) ->
     np.testing.assert_array_equal(found[slam.keyframes[1].frame].depth, maps[1].depth)
 
 
+@pytest.mark.long
 def test_a_folder_has_the_depth_of_every_frame(run: RecordedRun, tmp_path: Path) -> None:
     """`depth="every"` writes a file for each frame, keyframes' as `depth=True` does; frames of another size are
     refused. Oracle: the folder of keyframes.

@@ -152,6 +152,7 @@ def test_the_mesh_opens_elsewhere(folder: Path, tmp_path: Path) -> None:
     assert found.visual.material.metallicFactor == 0
 
 
+@pytest.mark.long
 def test_every_frame_with_its_picture(tmp_path: Path) -> None:
     # Proves that frames which are no keyframes are in the exports, with their poses, pictures and depth, once the run
     # kept them. Oracle: the run's trajectory and frames; pycolmap, whose reprojection error stays the stated one.

@@ -30,7 +30,10 @@ main()
 
 @pytest.mark.parametrize(
     ("room", "said"),
-    [(20_000, "which cannot be written: File too large"), (2_000_000, "is cut short: ")],
+    [
+        (20_000, "which cannot be written: File too large"),
+        pytest.param(2_000_000, "is cut short: ", marks=pytest.mark.long),
+    ],
 )
 def test_view_ends_where_the_disk_is_full(room: int, said: str, tmp_path: Path) -> None:
     """With room for `room` bytes of 2.4 million, `view` ends by itself with code 2, and its last line names the file

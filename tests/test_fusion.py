@@ -88,6 +88,7 @@ def away(keyframe: Keyframe, number: int) -> Keyframe:
     return replace(keyframe, number=number, pose=pose)
 
 
+@pytest.mark.long
 def test_what_moved_is_fused_again_and_nothing_else() -> None:
     """A map with one view two voxels off, which dents the sphere before it, is brought back when that view is put
     right, by making anew only some of its blocks; a view that moves by less than the bound costs nothing, and one that

@@ -103,6 +103,7 @@ def test_a_map_comes_back_to_the_bit(known: Slam) -> None:
         assert list(differences(moved, after)) == []
 
 
+@pytest.mark.long
 def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: Path) -> None:
     """The time stamps of two runs in one map are those of their clocks, through two files and in the run's folder,
     where each line belongs to one keyframe; oracle: the time stamps of the runs. A map of version 1 has none.

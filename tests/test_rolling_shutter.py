@@ -106,7 +106,9 @@ def with_readout(motions: np.ndarray, seconds: float, columns: bool = False) -> 
     return replace(WINDOW, observations=observations)
 
 
-@pytest.mark.parametrize(("seconds", "columns"), [(0.02, False), (-0.012, False), (0.02, True)])
+@pytest.mark.parametrize(
+    ("seconds", "columns"), [(0.02, False), pytest.param(-0.012, False, marks=pytest.mark.long), (0.02, True)]
+)
 def test_a_rolling_shutter_is_found_and_taken_out(seconds: float, columns: bool) -> None:
     """A window whose rows (or columns, as of a phone that is held upright) were seen one after the other, either end
     first; oracles: the readout and the poses that it was made with.

@@ -26,6 +26,7 @@ def walk() -> SyntheticSequence:
     return room(40, SIZE)
 
 
+@pytest.mark.long
 def test_everything_follows_from_the_seed(walk: SyntheticSequence) -> None:
     # The same seed gives the same bytes, another seed other ones, and more frames do not change the first ones.
     again = replace(simulate("room", frames=90, seed=1, size=SIZE), scene=build_room(1))  # not the one that is kept
@@ -76,7 +77,7 @@ SLOW_WORLDS = [
 ]
 
 
-@pytest.mark.parametrize("world", ["staircase", *SLOW_WORLDS])
+@pytest.mark.parametrize("world", [pytest.param("staircase", marks=pytest.mark.long), *SLOW_WORLDS])
 def test_worlds_have_no_holes_and_walks_keep_clear(world: str) -> None:
     # Along one round: a surface in every pixel, nothing nearer than 25 cm, and a well-exposed image.
     _, walk = WORLDS[world]

@@ -185,6 +185,7 @@ def test_the_depth_of_another_view_confirms_or_drops() -> None:
     np.testing.assert_allclose(found.confidence[6:, 11:], 0.5)
 
 
+@pytest.mark.long
 def test_pictures_fill_the_holes_of_measured_depth() -> None:
     # Proves that `mvs` leaves measured depth as it is and fills its holes to 5 %, and that `auto` does not. Oracle: the
     # renderer's depth.

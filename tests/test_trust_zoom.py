@@ -121,6 +121,7 @@ def test_few_keyframes_or_matches_say_nothing() -> None:
     assert focal_lengths(replace(slam, keyframes=tuple(blind)), np.arange(KEYFRAMES)) is None
 
 
+@pytest.mark.long
 def test_every_keyframe_is_in_a_stretch() -> None:
     """A zoom in a long run is told where it is, once, and keyframes of a known map are not asked; oracle: counting."""
     late = lambda share: 1.0 if share < 0.8 else 1.15
