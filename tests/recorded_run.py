@@ -45,9 +45,15 @@ class RecordedRun:
 
 
 @cache
+def walk() -> SyntheticSequence:
+    """What the run is of."""
+    return simulate("room", FRAMES, 0, (320, 240), rate=10.0)
+
+
+@cache
 def recorded_run() -> RecordedRun:
     """The run, made once a process."""
-    sequence = simulate("room", FRAMES, 0, (320, 240), rate=10.0)
+    sequence = walk()
     frames, states, recorder = list(sequence.frames()), [], WindowRecorder()
     for slam in run_frames(iter(frames), sequence.camera, ROLES, SETTINGS, Clock()):
         recorder.on_frame(slam, frames[slam.frames[-1].frame])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded_run import FRAMES, ROLES, SETTINGS, recorded_run
+from recorded_run import FRAMES, ROLES, SETTINGS, recorded_run, walk
 from test_resume import Killed, KilledAfter
 from vggtgeo.models.onnx.bounds import Refusals
 
@@ -30,8 +30,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.window import _camera_sigma
 
-SEQUENCE = recorded_run().sequence
-GUESS = Camera.guess(SEQUENCE.camera.width, SEQUENCE.camera.height)
+GUESS = Camera.guess(320, 240)
 LENS = Camera((280.0, 280.0, 158.0, 121.0), 320, 240, (-0.1, 0.01, 0.0, 0.0), known=False)
 
 
@@ -127,8 +126,8 @@ def test_how_free_a_guess_is() -> None:
 def test_windows_hold_a_found_camera() -> None:
     # Proves that a camera of a first pass stays where it is while frames are tracked, and that a guess does not: a
     # focal length that is 10 % too long. Oracle: the number that it began with.
-    wrong = np.array(SEQUENCE.camera.intrinsics) * [1.1, 1.1, 1.0, 1.0]
-    guess = replace(SEQUENCE.camera, intrinsics=tuple(wrong.tolist()), known=False)
+    wrong = np.array(walk().camera.intrinsics) * [1.1, 1.1, 1.0, 1.0]
+    guess = replace(walk().camera, intrinsics=tuple(wrong.tolist()), known=False)
     ends = []
     for camera_found in (True, False):
         first = replace(begin(guess, ROLES, SETTINGS), camera_found=camera_found)
@@ -166,7 +165,7 @@ def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **
     monkeypatch.setattr(reconstruction, "finish", lambda slam, *_: slam)
     monkeypatch.setattr(reconstruction, "CompileAhead", lambda _: vg.Callback())
     given = {"roles": ROLES, "settings": settings(), "dense": "none", **options}
-    return vg.reconstruct(SequenceView(SEQUENCE, GUESS, has_depth=True) if frames is None else frames, **given)
+    return vg.reconstruct(SequenceView(walk(), GUESS, has_depth=True) if frames is None else frames, **given)
 
 
 @pytest.mark.long
@@ -185,7 +184,7 @@ def test_a_guessed_camera_is_sought_first(monkeypatch: pytest.MonkeyPatch) -> No
 def test_where_there_is_no_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that a known camera, frames that come once, and the setting 0 need none.
     passes = _Passes()
-    run(monkeypatch, passes, SEQUENCE, end=3)
+    run(monkeypatch, passes, walk(), end=3)
     run(monkeypatch, passes, iter(recorded_run().frames[:3]))
     run(monkeypatch, passes, settings=settings(0), end=3)
     assert passes.counts == []
@@ -220,7 +219,7 @@ def test_what_a_first_pass_meets_is_told_once(monkeypatch: pytest.MonkeyPatch) -
 
     roles = Perception(ROLES, {}, {"depth": counts})
     with pytest.warns(InputWarning, match="odd") as told:
-        result = run(monkeypatch, Refused(), Warns(SEQUENCE, GUESS, has_depth=True), roles=roles, end=3)
+        result = run(monkeypatch, Refused(), Warns(walk(), GUESS, has_depth=True), roles=roles, end=3)
     assert [str(warning.message) for warning in told].count("frame 1 is odd") == 1
     assert result.record.warnings.count("frame 1 is odd") == 1
     assert counts == Refusals(asked=1)
