@@ -68,6 +68,7 @@ def long_chunk(whole: bytes) -> bytes:
 
 
 DEEP = b"[" * 20_000
+MANY = r"it declares 2000000\d\d elements, and has"
 REFUSED: tuple[tuple[str, Change, str], ...] = (
     ("PNG", long_chunk, r"i.png` is damaged: a part of the PNG declares more bytes than the file has"),
     ("depth", long_chunk, r"d.png` is damaged: a part of the PNG declares more bytes"),
@@ -124,6 +125,14 @@ REFUSED: tuple[tuple[str, Change, str], ...] = (
     ("Replica camera", put(b"6553.5", b"NaN"), r"cam_params.json`: `scale` is nan"),
     ("trajectory", lambda _: b"0 1 0 0 0 2.5 1.5 3.5\n", r"the quaternion has length 4.56; expected about 1"),
     ("KITTI camera", put(b"P2: ", b"P2: word "), r"calib.txt`: `P2` is 'word .*; expected numbers"),
+    *(
+        (
+            name,
+            put(b"element vertex ", b"element ce 00000000000200000000\nproperty list uchar int a\nelement vertex "),
+            MANY,
+        )
+        for name in ("mesh", "point cloud")
+    ),
 )
 
 

@@ -165,7 +165,9 @@ def _size_of(element: PlyElement) -> int:
 
 
 def check_head(path: str | os.PathLike[str]) -> bytes:
-    """The header of a PLY file; ValueError for a long file without one, which would be read to its end as one line."""
+    """The header of a PLY file; ValueError for a long file without one, which would be read to its end as one line, and
+    where it declares more than a byte each could hold: space for lists is taken before they are read.
+    """
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe has no end
         raise ValueError("it is no regular file")
     with open(path, "rb") as handle:
@@ -173,4 +175,9 @@ def check_head(path: str | os.PathLike[str]) -> bytes:
     end = re.search(rb"^end_header\s", start, re.MULTILINE)
     if end is None and os.path.getsize(path) > LONGEST_HEAD:
         raise ValueError(f"its first {LONGEST_HEAD} bytes have no `end_header`")
-    return start if end is None else start[: end.start()]
+    head = start if end is None else start[: end.start()]
+    declared = sum(int(count) for count in re.findall(rb"^element\s+\S+\s+(\d+)\s*$", head, re.MULTILINE))
+    size = os.path.getsize(path)
+    if declared > size:
+        raise ValueError(f"it declares {declared} elements, and has {size} bytes")
+    return head
