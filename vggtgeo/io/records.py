@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any
@@ -262,10 +263,9 @@ def _done(value: Any) -> Future[Any]:
 
 
 def _element_type(name: Any) -> np.dtype[Any]:
-    dtype = np.dtype(str(name))
-    if dtype.kind not in KINDS:
-        raise InputError(f"it holds an array of {dtype}; expected numbers")
-    return dtype
+    if not re.fullmatch(rf"[<>|][{KINDS}]\d+", str(name)):  # NumPy also evaluates names of records, of any text
+        raise InputError(f"it holds an array of {name!r:.60}; expected numbers")
+    return np.dtype(name)
 
 
 def _laid_out(values: np.ndarray, strides: Sequence[int]) -> np.ndarray:
