@@ -27,6 +27,16 @@ def test_labels_of_any_length_leave_room_for_the_drawing() -> None:
         drawn.canvas.draw()
 
 
+def test_errors_that_hardly_differ_are_drawn_beside_each_other() -> None:
+    # Proves that two errors a thousandth apart, which would fill the axis, do not, and that it has a number. Oracle:
+    # the axis.
+    rows = [{**one, "ate_se3_m": 0.00873 * (1 + 0.001 * number)} for number, one in enumerate(ROWS)]
+    axes = ablation_figure(tiny.suite(), rows).axes[0]
+    low, high = axes.get_xlim()
+    assert high / low >= 2.4
+    assert any(low <= tick <= high for tick in axes.get_xticks())
+
+
 def test_the_path_that_is_drawn_is_one_that_can_be(tmp_path: Path) -> None:
     # Proves that of a setting whose first seed lost track at once the next seed is drawn. Oracle: the number of errors.
     poses = np.tile(np.eye(4), (5, 1, 1))

@@ -28,6 +28,9 @@ _ROW, _LINE, _MARGIN = 0.3, 0.15, 0.9
 """Inches."""
 _LABEL, _TITLE, _ENTRY = 30, 60, 44
 """Letters of a line of a label beside an axis, of a title, of an entry of a legend: with longer ones axes collapse."""
+_LEAST_SPAN = 2.5
+"""Factor between the ends of an axis of errors: a difference of a thousandth is not drawn as others are, and one of the
+ticks at 1, 2 and 5 lies within."""
 _MOST_LINES = 8
 LEAST_POSES = 3
 """Of a path that is drawn: fewer cannot be aligned."""
@@ -90,6 +93,9 @@ def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Seq
         if key == suite.base:
             axes.axvline(summary.mean, color=_FULL, lw=0.8, ls=":")
     axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    wider = max(np.sqrt(_LEAST_SPAN * low / high), 1.0)
+    axes.set_xlim(low / wider, high * wider)
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
