@@ -51,6 +51,27 @@ def with_image(content: Callable[[], bytes], suffix: str = ".png") -> Callable[[
     return make
 
 
+def beside(change: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """Good images, and something that `change` does in their folder."""
+
+    def make(folder: Path) -> Path:
+        change(frames(folder / "frames"))
+        return folder / "frames"
+
+    return make
+
+
+def recorded(make: Callable[[Path], Path], change: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """A recording in the layout of a benchmark or an app, in which `change` has changed something."""
+
+    def both(folder: Path) -> Path:
+        place = make(folder / "scan")
+        change(place)
+        return place
+
+    return both
+
+
 def encoded(suffix: str, image: np.ndarray | None = None, *options: int) -> bytes:
     """A whole file of an image."""
     return cv2.imencode(suffix, picture(1) if image is None else image, list(options))[1].tobytes()

@@ -12,8 +12,9 @@ import bad_files as bad
 import numpy as np
 import pytest
 import tiny_layouts as layouts
+from bad_files import recorded
 from bad_row import Row, nothing, read_frames, rows, solve_with
-from bad_rows_strangers import other_numbers, recorded
+from bad_rows_lists import other_numbers
 
 from vggtgeo.cli.jax_flags import check_cache
 from vggtgeo.datasets import open_sequence

@@ -63,6 +63,15 @@ def locked(folder: Path) -> None:
         pass
 
 
+def laid_in(folder: Path) -> None:
+    """A run in whose `unfinished` somebody lays a file; it is still there behind it."""
+    with taken(folder / "out") as run:
+        (run.stage / "trajectory.txt").write_text("")
+        (run.stage / "mine.txt").write_text("of the user")
+        run.publish()
+    assert (folder / "out/mine.txt").read_text() == "of the user"
+
+
 def linked_to_itself(name: str) -> Any:
     """Good images, and beside them a link to itself."""
 
@@ -92,6 +101,7 @@ OUTPUT = rows(
         ("a folder with a state of a killed run that is none", good, {"argv": into_garbage}),
         ("a folder with a file that is called `unfinished`", None, output(somebodys("unfinished"), "things")),
         ("a folder with somebody's files in `unfinished`", None, output(somebodys("unfinished/mine.txt"), "things")),
+        ("somebody's file in `unfinished`, laid there while a run goes on", nothing, {"call": laid_in}),
         ("the root of the file system", good, {"argv": lambda made: ["run", made, "-o", "/"]}),
         ("a link to itself", linked_to_itself("out"), {"argv": lambda made: ["run", made, "-o", made.parent / "out"]}),
         (

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import bad_files as bad
 import numpy as np
+import tiny_sequences as tiny
 from bad_row import good, line, nothing, rows
 
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.results.result import Result
 
 
@@ -68,6 +72,55 @@ def run_that_counts(poses: int) -> Any:
         return folder_of_run(json.dumps(counted))(folder)  # type: ignore[no-any-return]
 
     return make
+
+
+def run_with_views(change: Callable[[Path], Any]) -> Any:
+    """A run's folder of two views of one point, with depth, in which `change` has changed something."""
+
+    def make(folder: Path) -> Path:
+        folder_of_run(summary_of("good"))(folder)
+        path = Trajectory(np.arange(2.0), np.stack([tiny.pose(0), tiny.pose(1)]))
+        for name in ("trajectory.txt", "keyframes.txt"):
+            path.save_tum(folder / name)
+        np.savez(
+            folder / "scene.npz",
+            version=1,
+            frames=np.arange(2),
+            timestamps=path.timestamps,
+            poses=np.linalg.inv(path.poses),
+            intrinsics=np.array(tiny.INTRINSICS),
+            size=np.array([tiny.WIDTH, tiny.HEIGHT]),
+            metric=True,
+            track_points=np.array([[0.0, 0.0, 2.0]]),
+            track_colours=np.zeros((1, 3), np.uint8),
+            track_point=np.zeros(2, int),
+            track_view=np.arange(2),
+            track_pixel=np.full((2, 2), 15.0),
+        )
+        for number in range(2):
+            tiny.write_image(folder / f"images/{number:06d}.jpg", tiny.image(number))
+            tiny.write_image(folder / f"depth/{number:06d}.depth.png", tiny.depth_codes(number))
+        PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8)).save_ply(folder / "map.ply")
+        change(folder)
+        return folder
+
+    return make
+
+
+def to_nerfstudio(made: Path) -> Any:
+    """`vggtgeo export` of its pictures and depth."""
+    return ["export", made, "--to", "nerfstudio", "-o", made / "nerfstudio"]
+
+
+def cut(path: Path) -> None:
+    """The first half of a file."""
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def moved(folder: Path) -> None:
+    """The poses of another run."""
+    for name in ("trajectory.txt", "keyframes.txt"):
+        Trajectory(np.arange(2.0), np.stack([tiny.pose(0), tiny.pose(3)])).save_tum(folder / name)
 
 
 def to_tum(made: Path) -> Any:
@@ -139,6 +192,23 @@ RESULTS = rows(
         ("a run that was killed", folder_of_run("{}", unfinished=True), {}),
         ("a trajectory that lost its last lines", run_that_counts(90), {"argv": to_tum}),
         ("a trajectory with more poses than the run had", run_that_counts(50), {"argv": to_tum}),
+        ("poses of another run than its views", run_with_views(moved), {"argv": to_nerfstudio}),
+        (
+            "a picture that is cut off",
+            run_with_views(lambda made: cut(made / "images/000001.jpg")),
+            {"argv": to_nerfstudio},
+        ),
+        (
+            "depth of another size than its pictures",
+            run_with_views(lambda made: tiny.write_image(made / "depth/000001.depth.png", tiny.depth_codes(1)[:9])),
+            {"argv": to_nerfstudio},
+        ),
+        (
+            "depth that declares 60000 x 60000 pixels",
+            run_with_views(lambda made: (made / "depth/000001.depth.png").write_bytes(bad.huge_png())),
+            {"argv": to_nerfstudio},
+        ),
+        ("whole, with views, depth and poses", run_with_views(lambda made: None), {"argv": to_nerfstudio}),
     ],
     call=Result.load,
 )

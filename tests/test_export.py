@@ -260,7 +260,7 @@ def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) ->
     depth, picture = next((copy / "depth").glob("*.depth.png")), sorted((copy / "images").iterdir())[-1]
     whole = depth.read_bytes()
     cv2.imwrite(str(depth), np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(vg.InputError, match=r"depth.png` is uint8 \(4, 4, 3\); expected 16-bit depth"):
+    with pytest.raises(vg.InputError, match=r"depth.png` is uint8 of shape \(4, 4, 3\); expected depth"):
         export(copy, "nerfstudio", target)
     depth.write_bytes(whole)
     for content, message in ((b"", "found 0 x 0"), (None, "is not there; run again")):

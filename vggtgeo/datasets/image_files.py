@@ -7,6 +7,8 @@ as they are stored.
 """
 
 import io
+import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -129,7 +131,31 @@ def read_codes(path: Path) -> np.ndarray:
         return _array(path)
     if path.suffix.lower() == ".exr":
         return exr_depth(path)
-    return decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
+    content = file_content(path)
+    if content.startswith(b"Pf"):
+        _check_pfm(content, path)
+    return decoded(content, path, cv2.IMREAD_UNCHANGED)
+
+
+def _check_pfm(content: bytes, path: Path) -> None:
+    """InputError for a PFM whose header is none, or states another scale than 1: OpenCV divides by it, other programs
+    multiply with it, or leave it alone.
+    """
+    head = re.match(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,40})\s", content)
+    try:
+        scale = abs(float(head[3])) if head else math.nan
+    except ValueError:
+        scale = math.nan
+    if head is None or not 0 < scale < math.inf:
+        raise InputError(f"`{path}` has no header of a PFM: `Pf`, width and height, -1.0 or 1.0")
+    width, height = int(head[1]), int(head[2])
+    if len(content) - head.end() < 4 * width * height:
+        raise InputError(f"`{path}` is cut off: it declares {width} x {height} pixels and has {len(content)} bytes")
+    if scale != 1:
+        raise InputError(
+            f"`{path}` states a scale of {scale:g}, which programs read in different ways: write it with -1.0 (or 1.0 "
+            "where the highest byte is the first), in metres"
+        )
 
 
 def _array(path: Path) -> np.ndarray:

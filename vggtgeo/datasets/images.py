@@ -16,7 +16,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 
 FRAMES_PER_SECOND = 30.0
-_SECONDS = re.compile(r"\d+\.\d+")
+_SECONDS = re.compile(r"-?\d+\.\d+")
 _NANOSECONDS = re.compile(r"\d{18,19}")
 _PREFERRED = (".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp", ".jpg", ".jpeg")
 """Of two formats of the same pictures: what loses nothing first."""
@@ -24,6 +24,10 @@ _DIGITS = re.compile(r"[0-9]+")
 _SMALL = (64, 64)
 _ALIKE = 0.95
 """Correlation of two files of one picture; a colour image and its depth or mask have less."""
+_NUMBERS = re.compile(r"((?:^-)?\d+)")
+_CAMERAS = re.compile(r"(.*(?:cam|camera|view|sensor|lens|eye)[ ._-]*\d+)(?!\d)(.*)", re.IGNORECASE)
+"""Names that say which camera a picture is of, `cam0_17`."""
+_COUNTED = re.compile(r"-?\d+\.\d+0")
 _NUMBERED = re.compile(r"[^0-9]*([0-9]{1,15})")
 
 
@@ -99,7 +103,11 @@ def _tell_of_series(folder: Path, images: list[Path]) -> None:
     """Names that differ in words and share their numbers are of two cameras, or of two recordings."""
     series: dict[str, set[str]] = {}
     for image in images:
-        series.setdefault(_DIGITS.sub("*", image.stem), set()).add("-".join(_DIGITS.findall(image.stem)))
+        camera = _CAMERAS.fullmatch(image.stem)
+        first, rest = (camera[1], camera[2]) if camera and _DIGITS.search(camera[2]) else ("", image.stem)
+        name = first + _DIGITS.sub("*", rest)
+        name = name[1:] if name.startswith("-*") else name  # below zero
+        series.setdefault(name, set()).add("-".join(_DIGITS.findall(rest)))
     several = [name for name, numbers in series.items() if name != "*" and len(numbers) > 1]
     if len(several) > 1 and series[several[0]] & series[several[1]]:
         warnings.warn(
@@ -128,13 +136,13 @@ def files_like(folder: Path, pattern: str) -> list[Path]:
     macOS puts a hidden one beside each file that it copies to another disk (`._0.txt` beside `0.txt`).
     """
     found = (path for path in folder.glob(pattern) if path.name[0] != "." and path.is_file())
-    return sorted(found, key=lambda path: (natural_key(path.name), path.name))
+    return sorted(found, key=lambda path: (natural_key(path.stem), path.name))
 
 
 def natural_key(name: str) -> list[int | str]:
-    """Sorts digits in `name` as numbers: `a2` before `a10`."""
+    """Sorts digits in `name` as numbers: `a2` before `a10`, and `-2` before `-1`; a minus behind a word is a dash."""
     # The groups of the pattern are every second part; `isdigit` also holds of signs that are no numbers, as in `m²`.
-    return [int(part) if row % 2 else part.lower() for row, part in enumerate(re.split(r"([0-9]+)", name))]
+    return [int(part) if row % 2 else part.lower() for row, part in enumerate(_NUMBERS.split(name))]
 
 
 def image_files(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[Path]:
@@ -146,11 +154,19 @@ def times_by_name(images: list[Path]) -> list[float]:
     """Seconds by the names where all are times, else position / 30 s."""
     stems = [image.stem for image in images]
     for pattern, unit in ((_SECONDS, 1.0), (_NANOSECONDS, 1e-9)):
-        if all(pattern.fullmatch(stem) for stem in stems):
+        if all(pattern.fullmatch(stem) for stem in stems) and not (unit == 1.0 and _are_counted(stems)):
             times = [float(stem) * unit for stem in stems]
             if len(set(times)) == len(times):
                 return times
     return [index / FRAMES_PER_SECOND for index in range(len(images))]
+
+
+def _are_counted(stems: list[str]) -> bool:
+    """Whether names like 1.9, 1.10 count: a time is written with as many decimals each time, or without zeros at its
+    end.
+    """
+    decimals = {len(stem.partition(".")[2]) for stem in stems}
+    return len(decimals) > 1 and any(_COUNTED.fullmatch(stem) for stem in stems)
 
 
 def rows_of(images: list[Path], lines: int | None) -> tuple[int, ...]:

@@ -6,7 +6,7 @@ import itertools
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,7 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: floa
 
     Args:
         frames: of `Frame`; or images, uint8 [H, W, 3] RGB; or pairs of an image and depth, float [H, W] metres with NaN
-            for none.
+            for none. They are copied: a camera may hand out one array, filled anew for each.
         camera: of all frames; None guesses from the size of the first image (then the intrinsics are estimated).
         rate: frames a second, for images without a time of their own.
 
@@ -56,10 +56,6 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: floa
     if first is None:
         raise InputError("`frames` is empty; give at least one frame")
     height, width = first.image.shape[:2]
-    if width * height > MOST_PIXELS:
-        raise InputError(
-            f"`{first.name}` is {width} x {height} pixels, more than {MOST_PIXELS // 10**6} million; reduce the images"
-        )
     source = _of_one_kind(first, counted)
     return FrameStream(camera or Camera.guess(width, height), first.depth is not None, source)
 
@@ -110,7 +106,7 @@ def _frame(item: Any, index: int, rate: float) -> Frame:
         given: Any = item.image
         if not isinstance(given, np.ndarray) or given.ndim != 3:
             raise InputError(f"`frames[{index}]` has an image {described(given)}; it must be uint8 [H, W, 3], RGB")
-        return item
+        return replace(item, image=_own(item.name, given), depth=_own(item.name, item.depth))
     image, depth = item if isinstance(item, tuple) and len(item) == 2 else (item, None)
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(
@@ -119,4 +115,16 @@ def _frame(item: Any, index: int, rate: float) -> Frame:
     if depth is not None:
         check_depth(f"the depth of `frames[{index}]`", depth, image)
         depth = depth.astype(np.float32)
-    return Frame(index, index / rate, image, depth, f"frame {index}")
+    return Frame(index, index / rate, _own(f"frame {index}", image), depth, f"frame {index}")
+
+
+def _own(name: str, given: Any) -> Any:
+    """A copy of an image or of depth; InputError for one that is too large."""
+    if not isinstance(given, np.ndarray) or given.ndim < 2:
+        return given
+    height, width = given.shape[:2]
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"`{name}` is {width} x {height} pixels, more than {MOST_PIXELS // 10**6} million; reduce the images"
+        )
+    return given.copy()

@@ -23,6 +23,8 @@ from vggtgeo.io.errors import InputError, InputWarning
 
 COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
 DEPTH = ("depth", "depths")
+INVERSE = {"inv", "inverse", "disp", "disparity", "disparities"}
+"""In a name: that what it holds is no depth, though it may be called `inverse_depth`."""
 _SAYS_NOTHING = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
 """Endings of the names of folders: `rgb_png`, `depth_images`."""
 MOST_LOOSE, MOST_LOOSE_BESIDE_DEPTH = 0.1, 0.5
@@ -107,16 +109,33 @@ def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
         found = f"holds {', '.join(f'`{name}`' for name in suffixes[:4])}" if suffixes else "is empty"
         known = ", ".join(sorted(DEPTH_SUFFIXES))
         _warn(f"`{other}` {found}, and depth is read from files {known}; reading the images only")
+    elif depth is None and (other := next(filter(_is_inverse, _folders(folder)), None)):
+        _warn(
+            f"`{other}` holds inverse depth or disparity, by its name, which is not read: make depth of it (1 / "
+            "inverse depth, focal length * baseline / disparity); reading the images only"
+        )
     return colour, (image_files(colour), [] if depth is None else image_files(depth, DEPTH_SUFFIXES))
 
 
 def _told_apart(folder: Path) -> tuple[list[Path], list[Path]] | None:
     """Images and depths of one folder, by the words of their names; None where hardly any name says depth."""
-    words = lambda path: set(re.findall(r"[a-z]+", path.stem.lower()))
-    depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if words(path) & set(DEPTH)]
-    others = [path for path in image_files(folder) if not words(path) & set(DEPTH)]
-    images = [path for path in others if words(path) & set(COLOUR)] or others
+    inverse = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_inverse(path)]
+    depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _words(path) & set(DEPTH) and path not in inverse]
+    others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *INVERSE}]
+    images = [path for path in others if _words(path) & set(COLOUR)] or others
     return (images, depths) if images and len(depths) >= LEAST_WITH_DEPTH * len(images) else None
+
+
+def _words(path: Path) -> set[str]:
+    return set(re.findall(r"[a-z]+", path.stem.lower()))
+
+
+def _is_inverse(path: Path) -> bool:
+    return bool(_words(path) & INVERSE)
+
+
+def _folders(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir())
 
 
 def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str] = IMAGE_SUFFIXES) -> Path | None:
@@ -128,12 +147,13 @@ def _there(folder: Path, names: Sequence[str]) -> Path | None:
     """The first of the folders `names`, in small or capital letters, that is there; `rgb_png` is `rgb`, too, and depth
     is what says so: `aligned_depth_to_color`.
     """
-    folders = sorted(path for path in folder.iterdir() if path.is_dir())
+    folders = _folders(folder)
     there = {_SAYS_NOTHING.sub("", path.name.lower()): path for path in folders}
     there |= {path.name.lower(): path for path in folders}
     for path in folders:
         for word in set(re.findall(r"[a-z]+", path.name.lower())) & set(DEPTH):
-            there.setdefault(word, path)
+            if not _is_inverse(path):
+                there.setdefault(word, path)
     return next((there[name] for name in names if name in there), None)
 
 

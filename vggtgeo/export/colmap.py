@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.export.contents import EmptyRunError
+from vggtgeo.export.contents import EmptyRunError, scene_of
 from vggtgeo.export.pictures import copy_pictures, picture_mask
 from vggtgeo.geometry import rigid
 from vggtgeo.io.files import atomic_open
@@ -30,7 +30,7 @@ def write_colmap(source: Path, target: Path) -> dict[str, float]:
     Returns what was written: counts, and the mean over the points of each one's mean reprojection error, pixels.
     EmptyRunError where no point was seen from two keyframes.
     """
-    scene = Scene.load(source)
+    scene = scene_of(source)
     if not len(scene.tracks):
         raise EmptyRunError(f"`{source / 'scene.npz'}` has no point that two keyframes saw: there is nothing to export")
     copy_pictures(scene, source, target)

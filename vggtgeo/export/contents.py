@@ -2,15 +2,40 @@
 
 from __future__ import annotations
 
+import warnings
+from contextlib import suppress
 from pathlib import Path
+
+import numpy as np
 
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.io.errors import InputError
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.results.scene import Scene
+from vggtgeo.results.summary_file import POSES
 
 
 class EmptyRunError(InputError):
     """The run has nothing of what a format is made of."""
+
+
+def scene_of(source: Path) -> Scene:
+    """The views of the run in `source`; an InputWarning where they are not those of its files of poses."""
+    scene = Scene.load(source)
+    known = []
+    for name in POSES:
+        with suppress(InputError), warnings.catch_warnings():  # a file that is not there, or damaged, is not asked for
+            warnings.simplefilter("ignore", InputWarning)
+            known.append(Trajectory.load_tum(source / name))
+    if not known:
+        return scene
+    times = np.concatenate([poses.timestamps for poses in known])
+    differs = scene.differs(times, np.concatenate([poses.positions for poses in known]))
+    if differs:
+        text = f"`{source / 'scene.npz'}` and the poses beside it are not of one run, or were changed since: {differs}"
+        warnings.warn(f"{text}; those of `scene.npz` are exported", InputWarning, stacklevel=4)
+    return scene
 
 
 def cloud_of(source: Path) -> PointCloud:

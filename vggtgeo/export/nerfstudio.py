@@ -13,14 +13,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.export.contents import cloud_of
+from vggtgeo.export.contents import cloud_of, scene_of
 from vggtgeo.export.pictures import copy_pictures, picture_mask
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.results.files import DEPTH_UNIT
-from vggtgeo.results.scene import Scene
 
 MILLI = 1000.0
 
@@ -30,7 +30,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     where undistorted pictures have borders that no pixel fills: what is black is not trained on. Depth that is not
     known is 0, and needs no mask.
     """
-    scene, cloud = Scene.load(source), cloud_of(source)
+    scene, cloud = scene_of(source), cloud_of(source)
     poses = rigid.invert(scene.poses) @ FROM_OPENGL
     copy_pictures(scene, source, target)
     mask = picture_mask(scene, source)
@@ -44,7 +44,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
         frame |= {} if mask is None else {"mask_path": "mask.png"}
         depth = source / "depth" / f"{scene.frames[view]:06d}.depth.png"
         if depth.is_file():
-            frame["depth_file_path"] = _depth(depth, target, f"depth/{scene.frames[view]:06d}.png")
+            frame["depth_file_path"] = _depth(depth, scene.size, target, f"depth/{scene.frames[view]:06d}.png")
             deep += 1
         frames.append(frame)
     if not deep:
@@ -58,12 +58,14 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     return {"images": len(frames), "depth_images": deep}
 
 
-def _depth(file: Path, target: Path, name: str) -> str:
-    """Writes the depth of one picture in nerfstudio's units, and returns its name."""
-    counts = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
-        found = "no image" if counts is None else f"{counts.dtype} {counts.shape}"
-        raise InputError(f"`{file}` is {found}; expected 16-bit depth as `vggtgeo run --save-depth` writes it")
+def _depth(file: Path, size: tuple[int, int], target: Path, name: str) -> str:
+    """Writes the depth of one picture of `size` (width, height) in nerfstudio's units, and returns its name."""
+    counts = read_codes(file)
+    if counts.shape != size[::-1] or counts.dtype != np.uint16:
+        raise InputError(
+            f"`{file}` is {counts.dtype} of shape {counts.shape}; expected depth of {size[0]} x {size[1]} pixels in 16 "
+            "bits, as `vggtgeo run --save-depth` writes it"
+        )
     with atomic_path(target / name) as temporary:
         cv2.imwrite(str(temporary), np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16))
     return name

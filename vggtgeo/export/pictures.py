@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vggtgeo.datasets.image_defects import declared_size
+from vggtgeo.datasets.image_defects import declared_size, defect
 from vggtgeo.io.errors import InputError
 from vggtgeo.results.scene import MASK, Scene
 
@@ -29,6 +29,8 @@ def copy_pictures(scene: Scene, source: Path, target: Path) -> None:
             raise InputError(f"`{file}` is not there; run again, with `-o {source}`")
         content = file.read_bytes()
         width, height = declared_size(content)
+        if content and (wrong := defect(content)):
+            raise InputError(f"`{file}` {wrong}; run again, with `-o {source}`")
         if (width, height) != scene.size:
             raise InputError(
                 f"`{file}` is no picture of {scene.size[0]} x {scene.size[1]} pixels (found {width} x {height}); run "

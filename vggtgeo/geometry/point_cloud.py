@@ -40,7 +40,7 @@ class PointCloud:
 
     def __post_init__(self) -> None:
         for name in ("points", "colours", "confidence", "normals"):
-            if getattr(self, name) is not None:
+            if getattr(self, name) is not None or name in ("points", "colours"):
                 object.__setattr__(self, name, real_numbers(name, getattr(self, name)))
         count = len(self.points) if self.points.ndim else 0
         if self.points.shape != (count, 3) or self.colours.shape != (count, 3) or self.colours.dtype != np.uint8:

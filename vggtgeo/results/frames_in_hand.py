@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.state import FramePose
@@ -31,3 +32,14 @@ class FramesInHand:
             frame = self._read.popleft()
             if (frame.index, frame.timestamp) == (record.frame, record.timestamp):
                 return frame
+
+
+def read_only(frame: Frame) -> Frame:
+    """The frame for others to look at: the map holds its arrays, and who draws into them would change it."""
+    views = [None if array is None else array.view() for array in (frame.image, frame.depth)]
+    for view in views:
+        if view is not None:
+            view.setflags(write=False)
+    image, depth = views
+    assert image is not None
+    return replace(frame, image=image, depth=depth)

@@ -69,15 +69,11 @@ class RunFolder:
             self.release_reserve()
             if not self.keeps:
                 (self.stage / NOTE).unlink(missing_ok=True)
+            _hand_back(self.stage)
             # A file manager leaves hidden files where somebody looks on, and so does a network's file system.
             ours = (path for path in self.stage.iterdir() if not path.name.startswith("."))
             written = (path for path in ours if path.name not in (CHECKPOINT, NOTE))
             new = sorted(written, key=lambda path: path.name == SUMMARY)
-            strange = [path.name for path in new if not is_known(path.name)]
-            if strange:
-                raise ValueError(
-                    f"`NAMES` lacks {strange}: what a run leaves must be known, to be replaced by the next"
-                )
             for pattern in (*NAMES, *map(glob.escape, _old_recording(self.folder))):
                 for path in sorted(self.folder.glob(pattern)):
                     _remove(path)
@@ -199,7 +195,26 @@ def _end(stage: Path) -> None:
     if (stage / "trajectory.txt").is_file() or (stage / CHECKPOINT).is_file():
         (stage / _RESERVED).unlink(missing_ok=True)
     else:
+        _hand_back(stage)
         _remove(stage)
+
+
+def _hand_back(stage: Path) -> None:
+    """Moves what somebody else laid into `unfinished/` while the run went on beside it, with a warning: it would be
+    taken away with the folder. What a run writes itself must be in `NAMES`, to be replaced by the next.
+    """
+    inside = sorted(stage.iterdir()) if stage.is_dir() and not stage.is_symlink() else []
+    for path in inside:
+        if is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, NOTE):
+            continue
+        names = (path.name, *(f"{UNFINISHED}-{count}-{path.name}" for count in range(1, 1000)))
+        free = next(stage.parent / name for name in names if not os.path.lexists(stage.parent / name))
+        os.replace(path, free)
+        warnings.warn(
+            f"`{path}` is nothing that the run wrote, and `{UNFINISHED}` is the run's own: it is now `{free}`",
+            InputWarning,
+            stacklevel=2,
+        )
 
 
 def _old_recording(folder: Path) -> list[str]:

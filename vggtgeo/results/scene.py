@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets import Sequence as Frames
+from vggtgeo.geometry import rigid
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
@@ -46,6 +47,8 @@ _LAYOUT: dict[str, tuple[int | str, ...]] = {
 _FAR, _FAR_PIXELS = 1e10, 1e7
 _LARGEST, _RIGID = 100_000, 1e-3
 """Pixels of a side; how far a rotation's product with its transpose may be from the unit matrix."""
+_SAME_TIME, _SAME_PLACE = 1e-5, 1e-4
+"""Seconds, and lengths for one of 1: files of poses have so many digits."""
 _WHOLE = ("frames", "size", "track_point", "track_view")
 
 
@@ -93,6 +96,22 @@ class Scene:
     def image_name(self, view: int) -> str:
         """The picture of a view, in `images/`."""
         return picture_name(int(self.frames[view]))
+
+    def differs(self, times: np.ndarray, centres: np.ndarray) -> str:
+        """What tells that the views are of another run than the poses beside them, whose times, s [n], and places,
+        [n, 3], these are; empty where each view is one of them.
+        """
+        order = np.argsort(times, kind="stable")
+        times, centres = times[order], centres[order]
+        own = rigid.invert(self.poses)[:, :3, 3]
+        first, behind = (np.searchsorted(times, self.timestamps + span) for span in (-_SAME_TIME, _SAME_TIME))
+        for view, (low, high) in enumerate(zip(first, behind, strict=True)):
+            if low == high:
+                return f"no pose is of the time of frame {self.frames[view]}"
+            off = np.linalg.norm(centres[low:high] - own[view], axis=1).min()
+            if off > _SAME_PLACE * (1.0 + np.linalg.norm(own[view])):
+                return f"frame {self.frames[view]} is {off:.3g} from where its picture was taken"
+        return ""
 
     def with_frames(self, others: Sequence[tuple[int, float, np.ndarray]]) -> Scene:
         """The same with views of other frames, which see no points: number, time and pose, world -> camera, of each;

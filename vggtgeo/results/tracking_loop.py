@@ -11,7 +11,7 @@ from vggtgeo.datasets import Frame
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.interruption import Interruption
 from vggtgeo.results.checkpoints import Checkpoints, Keeper, Notice, RunSoFar, check_same_frame
-from vggtgeo.results.frames_in_hand import FramesInHand
+from vggtgeo.results.frames_in_hand import FramesInHand, read_only
 from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source
 from vggtgeo.slam.pending_window import settled
@@ -70,7 +70,7 @@ class TrackingLoop:
             frames = FramesInHand(self._frames(keeper))
             roles, clock = self.perception.roles, self.hooks.clock
             for slam in run_frames(frames, self.source.camera, roles, self.settings, clock, known):
-                frame = frames.take(slam.frames[-1])
+                frame = read_only(frames.take(slam.frames[-1]))
                 self.hooks.each("on_frame", slam, frame)
                 if keeper is not None:
                     keeper.on_frame(slam, frame)

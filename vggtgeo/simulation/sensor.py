@@ -7,7 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_real, check_whole, real_numbers
 from vggtgeo.simulation.shade import encode
+
+MOST_SAMPLES = 1000
+"""Renderings for one image."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +37,12 @@ class Sensor:
 
     def __post_init__(self) -> None:
         for name in ("noise", "exposure_swing", "exposure_time", "readout_time", "depth_noise"):
+            check_real(name, getattr(self, name), "zero or a positive number")
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be zero or a positive number")
-        if self.blur_samples < 1:
-            raise InputError(f"`blur_samples` is {self.blur_samples}; it must be at least 1")
-        if not 0 <= self.depth_range[0] < self.depth_range[1]:
+        check_whole("blur_samples", self.blur_samples, 1, MOST_SAMPLES)
+        given = real_numbers("depth_range", self.depth_range)
+        if given.shape != (2,) or not 0 <= given[0] < given[1]:
             raise InputError(f"`depth_range` is {self.depth_range}; it must be (near, far) with 0 <= near < far")
 
     def gain(self, time: float) -> float:

@@ -135,6 +135,7 @@ def simulate(
     """
     check_walk(scene, frames, size, rate, speed)
     check_kind("sensor", sensor, Sensor | None, "a `vggtgeo.simulation.Sensor`")
+    check_within_frame(sensor or Sensor(), rate)
     check_whole("seed", seed)
     build, walk = WORLDS[scene]
     motion = HandheldMotion.along(walk, seed)
@@ -165,6 +166,16 @@ def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, spee
             raise InputError(f"`{name}` is {value}; it must be positive")
         if not _LEAST <= value <= _MOST:  # times or places that are the same, or none
             raise InputError(f"`{name}` is {value}; it must be from {_LEAST:g} to {_MOST:g}")
+
+
+def check_within_frame(sensor: Sensor, rate: float) -> None:
+    """InputError for an image that no camera of this rate takes: the next one would have begun before it is done."""
+    for name in ("exposure_time", "readout_time"):
+        if getattr(sensor, name) * rate > 1 + 1e-9:
+            raise InputError(
+                f"`{name}` is {getattr(sensor, name):g} s, and a frame lasts {1 / rate:.3g} s at {rate:g} a second: "
+                "give at most that"
+            )
 
 
 def camera_of(size: tuple[int, int]) -> Camera:

@@ -1,7 +1,8 @@
 """Writes a synthetic sequence as a TUM RGB-D folder, so that any SLAM system can run it.
 
 `rgb/`, `depth/` (16-bit PNG, metres x 5000, 0 = none), `rgb.txt`, `depth.txt`, `groundtruth.txt`, and
-`calibration.txt` (fx fy cx cy). The lists are written last: a folder without them was interrupted.
+`calibration.txt` (fx fy cx cy). The lists are written first: of a walk that was interrupted they name files that are
+not there, which a reader tells.
 """
 
 import os

@@ -15,9 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind, check_positive, path_of
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.io.network_files import networks_folder
 from vggtgeo.models.classical import ConstantVelocity, OrbMatcher
@@ -174,6 +175,15 @@ def perception(
         True
 
     """
+    check_kind("mixed", mixed, Mapping | None, "a dictionary of names by role, or None")
+    check_kind("classical", classical, Roles | None, "`vggtgeo.Roles`, or None")
+    folder, cache = (
+        None if given is None else path_of(name, given) for name, given in (("folder", folder), ("cache", cache))
+    )
+    if memory_limit_gb is not None:
+        check_positive("memory_limit_gb", memory_limit_gb, "gigabytes")
+    if provider not in get_args(Provider):
+        raise InputError(f"`provider` is {provider!r:.60}; it must be one of {', '.join(get_args(Provider))}")
     chosen = _parts(preset, mixed or {})
     classical = _with_others(classical or Roles(), chosen)
     parts = {role: name for role, name in chosen.items() if name not in ("classical", *_OTHERS.get(role, ()))}
@@ -201,7 +211,7 @@ def perception(
 
 def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
     """Who plays each role that the preset or the caller names; InputError for a name that is not there."""
-    if preset not in PRESETS:
+    if preset not in tuple(PRESETS):  # a list has no hash
         raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(PRESETS)}")
     for role, name in mixed.items():
         if name not in CHOICES.get(role, ()):

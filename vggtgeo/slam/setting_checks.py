@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -63,7 +64,7 @@ class CheckedSettings:
         for entry in dataclasses.fields(self):
             expected, value = entry.metadata["expected"], getattr(self, entry.name)
             if not expected.holds(value):
-                raise InputError(f"`{self.group}.{entry.name}` is {value!r}; it must be {expected.words}")
+                raise InputError(f"`{self.group}.{entry.name}` is {value!r:.60}; it must be {expected.words}")
 
 
 def _field(default: Any, expected: Expected) -> Any:
@@ -76,4 +77,4 @@ def _is_whole(value: Any) -> bool:
 
 def _is_finite(value: Any) -> bool:
     is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    return is_number and math.isfinite(value)
+    return is_number and -sys.float_info.max <= value <= sys.float_info.max  # whole numbers may be beyond all floats

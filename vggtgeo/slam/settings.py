@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind
 from vggtgeo.models.classical import (
     BandLineMatcher,
     LsdDetector,
@@ -83,6 +84,8 @@ class Roles:
                     f"`{role}` is {given!r:.60}; expected an object with the methods {', '.join(methods)}, such as "
                     f"`vggtgeo.Roles().{role}`"
                 )
+        for role, kind in (("alignment", RgbdAlignment), ("flow", PatchFlow), ("still_parts", StillParts)):
+            check_kind(role, getattr(self, role), kind | None, f"a `{kind.__name__}`, or None")
 
     def seeded(self, seed: int) -> Roles:
         """The same roles, whose robust estimators draw other samples; 0: as they draw them by themselves."""

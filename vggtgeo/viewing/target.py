@@ -52,6 +52,10 @@ def check_target(target: str) -> str:
         raise InputError(
             f"`--rerun` is {target!r}; it must be `spawn` (a window), `serve` (a browser) or a file ending with `.rrd`"
         )
+    if "://" in target:
+        raise InputError(
+            f"`--rerun` is `{target}`, an address; give a file, or `serve`, which says where a viewer can connect"
+        )
     if Path(target).is_dir():
         raise InputError(f"`--rerun` is `{target}`, which is a folder; give a new file ending with `.rrd`")
     if whole_path(Path(target)).is_symlink():  # Rerun would tell it in words of its own, after a second

@@ -1,0 +1,127 @@
+"""Rows of the table of bad inputs: what a script may give to the bundle adjustment; `bad_rows_python.py` makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from test_problem_file import SCENE
+
+import vggtgeo as vg
+
+
+def pack(seen: dict[str, Any] | None = None, **changes: Any) -> Callable[[Path], Any]:
+    """`vg.pack` of a good problem with some arguments, or observations, of another kind."""
+
+    def call(_: Path) -> Any:
+        given = {"poses": SCENE.start_poses, "intrinsics": SCENE.start_intrinsics, "inverse_depth": SCENE.inverse_depth}
+        observations = replace(SCENE.observations, **(seen or {}))
+        return vg.pack(**{"observations": observations, **given, **changes})
+
+    return call
+
+
+def with_pair(call: Callable[[Any, Any], Any]) -> Callable[[Path], Any]:
+    """A call with a good problem and its state."""
+    return lambda _: call(*SCENE.pack()[:2])
+
+
+def state_of(dtype: type) -> Callable[[Any], Any]:
+    """The state with all its numbers in another precision."""
+    return lambda state: jax.tree.map(lambda leaf: np.asarray(leaf, dtype), state)
+
+
+def not_finite(state: Any) -> Any:
+    """What a solve leaves that failed."""
+    return jax.tree.map(lambda leaf: leaf * np.nan, state)
+
+
+class Fix(vg.PoseTerm):
+    """Where a camera stands."""
+
+    position: jax.Array
+
+    def residual(self, pose: Any, camera: Any) -> Any:
+        return pose.inverse().translation() - self.position
+
+
+def fix(rows: int = 1, **other: Any) -> Fix:
+    """One observation of the first keyframe."""
+    return Fix(**({"keyframe": [0], "position": jax.numpy.zeros((rows, 3)), "weight": jax.numpy.ones(1)} | other))
+
+
+SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
+    ("`pack`: poses of complex numbers", pack(poses=SCENE.start_poses.astype(complex))),
+    ("`pack`: poses with a mask", pack(poses=np.ma.masked_less(SCENE.start_poses, 0.5))),
+    ("`pack`: poses that are dates", pack(poses=np.zeros((3, 7), "M8[s]"))),
+    ("`pack`: observations in a dictionary", pack(observations={"edges": [[0, 1]]})),
+    ("`pack`: `alpha` that is an array", pack(seen={"alpha": np.ones(3)})),
+    ("`pack`: `alpha` that is a text", pack(seen={"alpha": "1"})),
+    ("`pack`: a deviation that is a text", pack(intrinsics_sigma="5")),
+    ("`pack`: a term that is in no list", pack(terms=vg.no_prior(3))),
+    ("`pack`: a size that is a tuple", pack(size=(3, 4))),
+    ("`pack`: complex numbers as `dtype`", pack(dtype=complex)),
+    ("`pack`: half precision as `dtype`", pack(dtype="float16")),
+    ("`pack`: a `dtype` that is none", pack(dtype="float65")),
+    ("`solve`: problem and state swapped", with_pair(lambda p, s: vg.solve(s, p))),
+    ("`solve`: all that `pack` gives", lambda _: vg.solve(SCENE.pack(), None)),
+    (
+        "`solve`: a state of another precision",
+        with_pair(lambda p, s: vg.solve(p, state_of(np.float32)(s))),
+    ),
+    (
+        "`solve`: a state of another problem",
+        with_pair(lambda p, s: vg.solve(p, jax.tree.map(lambda leaf: leaf[:1], s))),
+    ),
+    ("`solve`: a solver's name", with_pair(lambda p, s: vg.solve(p, s, solver="lm"))),
+    ("`energy` of nothing", with_pair(lambda p, s: vg.energy(p, None))),
+    (
+        "`covariances` where a solve failed",
+        with_pair(lambda p, s: vg.covariances(p, not_finite(s))),
+    ),
+    (
+        "`observability` where a solve failed",
+        with_pair(lambda p, s: vg.observability(p, not_finite(s))),
+    ),
+    (
+        "`covariances` of a keyframe that is not there",
+        with_pair(lambda p, s: vg.covariances(p, s, keyframes=[0, 3])),
+    ),
+    (
+        "`marginalise`: a keyframe that is not there",
+        with_pair(lambda p, s: vg.marginalise(p, s, 3)),
+    ),
+    ("`marginalise` of two keyframes", with_pair(lambda p, s: vg.marginalise(p, s, [0, 1]))),
+    ("`reweighted` by weights of another shape", with_pair(lambda p, s: p.points.reweighted(np.ones(3)))),
+    ("`reweighted` by a text", with_pair(lambda p, s: p.points.reweighted("all"))),
+    ("`gather` of one value a keyframe", lambda _: SCENE.pack()[2].gather(np.ones(3))),
+    ("`reorder`: a keyframe twice", lambda _: vg.reorder(vg.no_prior(3), [0, 0, 1])),
+    ("`solve_batch` of one window", with_pair(vg.solve_batch)),
+    ("`load_problem` of an empty name", lambda _: vg.load_problem("")),
+    ("`save_problem` to a number", lambda _: vg.save_problem(1, *SCENE.pack())),
+    ("`with_term` of nothing", with_pair(lambda p, s: p.with_term(None))),
+    ("`with_terms` of a list", with_pair(lambda p, s: p.with_terms([p.points]))),
+    ("`residuals_at` of nothing", with_pair(lambda p, s: vg.residuals_at(None, s))),
+    ("`choose_reduced_solver` of a name", lambda _: vg.choose_reduced_solver("window")),
+    ("`solve`: an adjoint's name", with_pair(lambda p, s: vg.solve(p, s, adjoint="arrow"))),
+    ("`simulate_window`: noise that is NaN", lambda _: vg.simulate_window(noise=np.nan)),
+    ("`simulate_window`: more outliers than matches", lambda _: vg.simulate_window(outliers=2)),
+    ("a term with a kernel of width 0", with_pair(lambda p, s: replace(p.points, kernel=vg.Huber(0.0)))),
+    ("a term with a kernel's name", with_pair(lambda p, s: replace(p.points, kernel="huber"))),
+    ("`Graduation`: a width below zero", lambda _: vg.Graduation((4.0, -2.0))),
+    ("a term of a keyframe that is not there", with_pair(lambda p, s: vg.energy(p.with_term(fix(keyframe=[3])), s))),
+    ("a term of keyframe -1", with_pair(lambda p, s: vg.energy(p.with_term(fix(keyframe=[-1])), s))),
+    ("a term of keyframe one and a half", lambda _: fix(keyframe=[1.5])),
+    ("a term with two rows of data and one weight", with_pair(lambda p, s: vg.energy(p.with_term(fix(rows=2)), s))),
+    ("a term with a list as data", with_pair(lambda p, s: vg.solve(p.with_term(fix(position=[[0, 0, 0]])), s))),
+    ("`no_prior` of -1 keyframes", lambda _: vg.no_prior(-1)),
+    ("`no_prior` of 10^9 keyframes", lambda _: vg.no_prior(10**9)),
+    ("`reorder` by a text", lambda _: vg.reorder(vg.no_prior(3), "210")),
+    ("`residual_sizes` of nothing", with_pair(lambda p, s: vg.residual_sizes(None, s))),
+    ("`simulate_window` of 10^9 keyframes", lambda _: vg.simulate_window(10**9)),
+    ("`Graduation`: a number in place of widths", lambda _: vg.Graduation(-1)),
+)

@@ -1,0 +1,87 @@
+"""Rows of the table of bad inputs: videos, and what is called one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bad_files as bad
+import cv2
+from bad_row import read_frames, rows
+
+
+def named(name: str | bytes, make: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """Something under this name."""
+
+    def both(folder: Path) -> Path:
+        make(folder / "clip.mp4")
+        place = Path(os.fsdecode(os.fsencode(folder) + b"/" + os.fsencode(name)))
+        (folder / "clip.mp4").rename(place)
+        return place
+
+    return both
+
+
+def calibrated(path: Path) -> Path:
+    """The same, beside its camera."""
+    (path.parent / "calibration.txt").write_text("55 55 31.5 23.5")
+    return path
+
+
+def still_video(path: Path, moving: int = 0) -> Path:
+    """A video of one picture, after so many others."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (bad.WIDTH, bad.HEIGHT))
+    for number in range(24):
+        writer.write(bad.picture(min(number, moving)))
+    writer.release()
+    return calibrated(path)
+
+
+def jpegs(path: Path) -> Path:
+    """A stream that tells nothing of its times."""
+    path.write_bytes(b"".join(bad.encoded(".jpg", bad.picture(number)) for number in range(12)))
+    return calibrated(path)
+
+
+def resized_jpegs(path: Path, size: tuple[int, int]) -> Path:
+    """A stream whose second half has another size."""
+    pictures = [bad.picture(number) for number in range(12)]
+    later = [cv2.resize(picture, size) for picture in pictures[6:]]
+    path.write_bytes(b"".join(bad.encoded(".jpg", picture) for picture in [*pictures[:6], *later]))
+    return calibrated(path)
+
+
+def joined_video(path: Path) -> Path:
+    """Two streams, each of which begins at its time 0."""
+    path.write_bytes(2 * bad.video(path, 20).read_bytes())
+    return calibrated(path)
+
+
+VIDEOS = rows(
+    "Videos",
+    [
+        ("a name that is no UTF-8", named(b"clip\xff.mp4", bad.video)),
+        ("no frame", named("c.mp4", lambda path: bad.video(path, 0))),
+        ("a pipe", named("c.mp4", os.mkfifo)),
+        ("a bag of ROS that is a pipe", named("c.bag", os.mkfifo)),
+        ("a bag of ROS of 20 GB of zeros", lambda folder: bad.lengthened(folder / "c.bag")),
+        ("a video that is called .png", named("c.png", bad.video)),
+        ("a GIF that is called .mp4", bad.file("clip.mp4", bad.encoded(".gif"))),
+        ("a PNG that is called .mp4", bad.file("clip.mp4", bad.encoded(".png"))),
+        ("a JPEG that is called .mov", bad.file("clip.mov", bad.encoded(".jpg"))),
+        (
+            "one picture again and again, as of an interlaced one",
+            lambda folder: still_video(folder / "still.mp4"),
+        ),
+        ("one picture again and again from its tenth on", lambda folder: still_video(folder / "still.mp4", 9)),
+        ("JPEGs one behind the other, without a container", lambda folder: jpegs(folder / "clip.mjpg")),
+        ("pictures of other proportions in its second half", lambda folder: resized_jpegs(folder / "c.mjpg", (48, 48))),
+        ("pictures of half the size in its second half", lambda folder: resized_jpegs(folder / "c.mjpg", (32, 24))),
+        ("two recordings that were joined (.ts)", lambda folder: joined_video(folder / "clip.ts")),
+        ("a picture of a phone (.heic)", bad.file("a.heic", b"\0\0\0\x18ftypheic" + bytes(40))),
+        ("a zip archive", bad.file("clip.mp4", b"PK\x03\x04" + b"\0" * 999)),
+    ],
+    call=read_frames,
+)
