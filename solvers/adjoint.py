@@ -26,6 +26,7 @@ A landmark on its bound that the energy presses against it is held: its multipli
 
 from __future__ import annotations
 
+import numbers
 from typing import Any, Literal
 
 import equinox as eqx
@@ -79,6 +80,9 @@ class ArrowAdjoint(optx.AbstractAdjoint):
     differentiate the iterations themselves take `optimistix.RecursiveCheckpointAdjoint()` instead of this class."""
 
     def __check_init__(self) -> None:
+        given: Any = self.polish
+        if not isinstance(given, numbers.Integral) or given < 0:
+            raise ValueError(f"`polish` is {given!r:.60}; it must be a whole number, at least 0")
         if self.not_stationary not in ("keep", "nan", "error"):
             raise ValueError(f"`not_stationary` is {self.not_stationary!r}; it must be 'keep', 'nan' or 'error'")
 

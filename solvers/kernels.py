@@ -8,14 +8,25 @@ References: Huber 1964; Black & Anandan 1996; Barron, "A General and Adaptive Ro
 from __future__ import annotations
 
 import abc
-from typing import Self
+from typing import Any, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 Values = Float[Array, "*n"]
+
+
+def _number(given: Any) -> Array:
+    """One real number as an array; a traced one is taken as it is. ValueError for anything else."""
+    if isinstance(given, jax.Array):
+        return given
+    found = np.asarray(given)
+    if found.ndim or found.dtype.kind not in "iuf":
+        raise ValueError(f"the kernel's number is {given!r:.60}; expected a real number, as in `Huber(1.5)`")
+    return jnp.asarray(given)
 
 
 class AbstractKernel(eqx.Module):
@@ -80,7 +91,7 @@ class Huber(AbstractKernel):
 
     """
 
-    delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
+    delta: Float[Array, ""] = eqx.field(converter=_number, default=1.5)
 
     def _root(self, s: Values) -> tuple[Bool[Array, "*n"], Values]:
         """`sqrt(s)`, made safe below `delta` so that neither branch of `where` makes a NaN gradient."""
@@ -109,7 +120,7 @@ class Cauchy(AbstractKernel):
 
     """
 
-    delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
+    delta: Float[Array, ""] = eqx.field(converter=_number, default=1.5)
 
     def rho(self, s: Values) -> Values:
         return self.delta**2 * jnp.log1p(s / self.delta**2)
@@ -130,7 +141,7 @@ class GemanMcClure(AbstractKernel):
 
     """
 
-    delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
+    delta: Float[Array, ""] = eqx.field(converter=_number, default=1.5)
 
     def rho(self, s: Values) -> Values:
         return s / (1 + s / self.delta**2)
@@ -155,8 +166,8 @@ class Barron(AbstractKernel):
 
     """
 
-    delta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.5)
-    alpha: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+    delta: Float[Array, ""] = eqx.field(converter=_number, default=1.5)
+    alpha: Float[Array, ""] = eqx.field(converter=_number, default=1.0)
 
     def _base(self, s: Values) -> tuple[Float[Array, ""], Values]:
         breadth = self.delta**2 * (2 - self.alpha)

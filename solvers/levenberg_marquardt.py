@@ -13,6 +13,7 @@ it grows while steps keep their promise and is halved when one does not. `benchm
 from __future__ import annotations
 
 import numbers
+import sys
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -20,6 +21,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_gradient
@@ -52,6 +54,11 @@ class Termination(eqx.Enumeration):
     )
 
 
+_NUMBERS = {
+    **dict.fromkeys(("rtol", "atol", "initial_damping", "max_damping", "min_damping"), sys.float_info.max),
+    "max_correction": 1.0,
+}
+"""Fields of the solver that are numbers, and how large each may be."""
 CONVERGED = (Termination.energy_converged, Termination.gradient_converged, Termination.step_converged)
 
 
@@ -176,12 +183,16 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         whole = isinstance(most, numbers.Integral) and not isinstance(most, bool)
         if not whole or not 0 <= most <= MOST_ITERATIONS:
             raise ValueError(f"`max_iterations` is {most!r:.60}; expected a whole number from 0 to {MOST_ITERATIONS}")
-        for name in ("rtol", "atol"):
+        for name, highest in _NUMBERS.items():
             given: Any = getattr(self, name)
             if isinstance(given, jax.Array):  # a traced one has no value to ask
                 continue
-            if not isinstance(given, numbers.Real) or not float(given) >= 0:
-                raise ValueError(f"`{name}` is {given!r:.60}; it must be a number, at least 0")
+            if not isinstance(given, int | float | np.floating | np.integer) or not 0 <= given <= highest:
+                until = "" if highest > 1 else f", at most {highest:g}"
+                raise ValueError(f"`{name}` is {given!r:.60}; it must be a number, at least 0{until}")
+        parts: tuple[Any, Any] = (self.norm, self.reduced_solver)
+        if not callable(parts[0]) or not isinstance(parts[1], AbstractReducedSolver):
+            raise ValueError("`norm` must be a function, and `reduced_solver` one of `vggtgeo.solvers.reduced`")
 
     def init(
         self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, f_struct: Any, aux_struct: Any, tags: Any

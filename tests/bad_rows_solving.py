@@ -54,6 +54,31 @@ def fix(rows: int = 1, **other: Any) -> Fix:
     return Fix(**({"keyframe": [0], "position": jax.numpy.zeros((rows, 3)), "weight": jax.numpy.ones(1)} | other))
 
 
+def residual(value: Callable[[Any], Any]) -> Callable[[Path], Any]:
+    """`vg.energy` with a term whose residual is this of a camera's centre."""
+
+    class Own(Fix):
+        def residual(self, pose: Any, camera: Any) -> Any:
+            return value(pose.inverse().translation())
+
+    return with_pair(lambda p, s: vg.energy(p.with_term(Own(**vars(fix()))), s))
+
+
+def with_prior(kind: Any, **data: Any) -> Callable[[Path], Any]:
+    """`vg.energy` with a term of the package, of one observation."""
+    ends = {"keyframe": [0]} if kind is vg.RotationPrior else {"first": [0], "second": [1]}
+    term = {**ends, "weight": np.ones(1), **data}
+    return with_pair(lambda p, s: vg.energy(p.with_term(kind(**term)), s))
+
+
+class Points(Fix):
+    """A class that is called as the term of matches is."""
+
+
+ONE = np.ones(1)
+UPRIGHT, TWICE = (length * np.array([[1.0, 0.0, 0.0, 0.0]]) for length in (1, 2))
+ROOT, ROOT_OF_POSE = np.eye(3)[None], np.eye(6)[None]
+
 SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`pack`: poses of complex numbers", pack(poses=SCENE.start_poses.astype(complex))),
     ("`pack`: poses with a mask", pack(poses=np.ma.masked_less(SCENE.start_poses, 0.5))),
@@ -118,6 +143,23 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a term of keyframe one and a half", lambda _: fix(keyframe=[1.5])),
     ("a term with two rows of data and one weight", with_pair(lambda p, s: vg.energy(p.with_term(fix(rows=2)), s))),
     ("a term with a list as data", with_pair(lambda p, s: vg.solve(p.with_term(fix(position=[[0, 0, 0]])), s))),
+    ("a term whose weights are a text", lambda _: fix(weight="one")),
+    ("a term of the name of another", with_pair(lambda p, s: p.with_term(Points(**vars(fix()))))),
+    ("a residual that is a list", residual(lambda centre: [centre[0], centre[1]])),
+    ("a residual that is nothing", residual(lambda centre: None)),
+    ("a residual of truth values", residual(lambda centre: centre > 0)),
+    ("a residual of complex numbers", residual(lambda centre: centre * 1j)),
+    ("a residual that is a matrix", residual(lambda centre: jax.numpy.outer(centre, centre))),
+    ("a pair of a keyframe with itself", with_prior(vg.BaselinePrior, second=[0], length=ONE, sigma=ONE)),
+    ("a baseline of length 0", with_prior(vg.BaselinePrior, length=0 * ONE, sigma=ONE)),
+    ("a baseline whose length is nothing", with_prior(vg.BaselinePrior, length=None, sigma=ONE)),
+    ("a measured rotation of length 2", with_prior(vg.RotationPrior, measured=TWICE, root=ROOT)),
+    ("a measured rotation with the root of a pose", with_prior(vg.RotationPrior, measured=UPRIGHT, root=ROOT_OF_POSE)),
+    ("a kernel whose width is a text", lambda _: vg.Huber("1.5")),
+    ("`pack`: Barron's kernel of shape 3", pack(kernel=vg.Barron(1.5, 3.0))),
+    ("a solver with damping below zero", lambda _: vg.SchurLevenbergMarquardt(initial_damping=-1.0)),
+    ("a derivative of half a step", lambda _: vg.ArrowAdjoint(polish=1.5)),
+    ("`pack`: a size of texts", lambda _: SCENE.pack(size=vg.PaddedSize("3", 40, 9, 2))),
     ("`no_prior` of -1 keyframes", lambda _: vg.no_prior(-1)),
     ("`no_prior` of 10^9 keyframes", lambda _: vg.no_prior(10**9)),
     ("`reorder` by a text", lambda _: vg.reorder(vg.no_prior(3), "210")),

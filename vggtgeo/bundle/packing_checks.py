@@ -14,7 +14,10 @@ from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.terms.term import check_width
 from vggtgeo.geometry.cameras import AbstractCamera
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real, real_numbers
+from vggtgeo.io.given import check_real, check_whole, real_numbers
+
+MOST_PADDED = 10_000_000
+"""Rows of a padded array."""
 
 UNIT = 1e-3
 """How far a quaternion's length and a line's normal may be from 1: what single precision and text files leave."""
@@ -245,7 +248,10 @@ def check_positive(name: str, values: np.ndarray, count: int) -> None:
 
 
 def check_size(size: PaddedSize, needed: PaddedSize) -> None:
-    """A padded size that is large enough."""
+    """A padded size that is large enough, of whole numbers."""
+    for name in ("keyframes", "points", "lines", "degree", "edges", "samples"):
+        if getattr(size, name) is not None or name not in ("edges", "samples"):
+            check_whole(f"size.{name}", getattr(size, name), 0, MOST_PADDED)
     if needed.samples is not None and size.lines % needed.samples:
         raise InputError(f"`size.lines` is {size.lines}; it must be a multiple of `size.samples`, {needed.samples}")
     for name in ("keyframes", "points", "lines", "degree", "edges"):

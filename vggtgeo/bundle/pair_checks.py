@@ -9,9 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.baseline import BaselinePrior
 from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm
+from vggtgeo.bundle.terms.relative_pose import RelativePose
+from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
+
+_ROWS: dict[type, dict[str, tuple[int, ...]]] = {
+    BaselinePrior: {"length": (), "sigma": ()},
+    RelativePose: {"measured": (7,), "root": (6, 6)},
+    RotationPrior: {"measured": (4,), "root": (3, 3)},
+}
+"""Shapes of the data of one observation."""
+_UNIT = 1e-3
+"""How far a quaternion's length may be from 1: what single precision and text files leave."""
 
 
 def check_kinds(problem: Any, state: Any, name: str = "state") -> None:
@@ -61,6 +73,15 @@ def _check_term(term: PoseTerm | PairTerm | CameraTerm, keyframes: int) -> None:
                     f"`{term.name}.{field}` has shape {shape}, `{term.name}.weight` {weight}; both must be arrays, "
                     "with a row an observation"
                 )
+            if getattr(leaf, "dtype", np.dtype(float)).kind not in "biuf":
+                raise InputError(f"`{term.name}.{field}` holds {leaf.dtype}; expected real numbers")
+    _check_measured(term)
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in (term.weight, *named.values()))
+    if isinstance(term, PairTerm) and not traced:
+        same = (np.asarray(term.first) == np.asarray(term.second)) & (np.asarray(term.weight) > 0)
+        if same.any():
+            number = int(np.asarray(term.first)[same][0])
+            raise InputError(f"`{term.name}` is of keyframe {number} twice; `first` and `second` must be two keyframes")
     for index in named.values():
         if not isinstance(index, jax.core.Tracer) and not isinstance(term.weight, jax.core.Tracer):
             asked = np.asarray(index)[np.asarray(term.weight) > 0]
@@ -69,6 +90,27 @@ def _check_term(term: PoseTerm | PairTerm | CameraTerm, keyframes: int) -> None:
                 raise InputError(
                     f"`{term.name}` is of keyframe {wrong}; there are {keyframes}: use 0 to {keyframes - 1}"
                 )
+
+
+def _check_measured(term: PoseTerm | PairTerm | CameraTerm) -> None:
+    """Data of a term of this package: of its shapes, and, where they have values, rotations and lengths that are some.
+    A rotation of another length turns otherwise, and nothing would say so.
+    """
+    rows: dict[str, tuple[int, ...]] = next((rows for kind, rows in _ROWS.items() if isinstance(term, kind)), {})
+    for field, shape in rows.items():
+        value = getattr(term, field)
+        wanted = (*jnp.shape(term.weight), *shape)
+        if jnp.shape(value) != wanted:
+            raise InputError(f"`{term.name}.{field}` has shape {jnp.shape(value)}; expected {wanted}")
+        if isinstance(value, jax.core.Tracer) or isinstance(term.weight, jax.core.Tracer):
+            continue
+        known = np.asarray(value, np.float64)[np.asarray(term.weight) > 0]
+        if field == "measured":
+            known = np.linalg.norm(known[:, :4], axis=1)
+        wrong = ~(np.abs(known - 1) <= _UNIT) if field == "measured" else ~(known > 0)
+        if field != "root" and wrong.any():
+            what = "a quaternion of length 1, w first" if field == "measured" else "positive numbers"
+            raise InputError(f"`{term.name}.{field}` has {known[wrong][0]:.3g}; expected {what}")
 
 
 def check_finite(state: State, name: str = "state") -> None:

@@ -19,6 +19,7 @@ from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
 
@@ -130,11 +131,17 @@ class Problem(eqx.Module):
         """The problem with `term` in place of the one of the same name, or added as the last.
 
         Raises:
-            InputError: it is no term.
+            InputError: it is no term, or of another kind than the one of its name.
 
         """
         check_kind("term", term, AbstractTerm, "a term, such as `vggtgeo.PointTerm`")
         names = [old.name for old in self.terms]
+        for old in self.terms:
+            if old.name == term.name and not (isinstance(term, type(old)) or isinstance(old, type(term))):
+                raise InputError(
+                    f"`{term.name}` is the name of a `{type(old).__name__}` of the problem, which a "
+                    f"`{type(term).__name__}` would replace; give its class another `name`"
+                )
         terms = tuple(term if old.name == term.name else old for old in self.terms)
         return self.with_terms(terms if term.name in names else (*terms, term))
 

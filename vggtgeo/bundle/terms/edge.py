@@ -18,7 +18,14 @@ from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.fast import pinhole
 from vggtgeo.bundle.fast.pinhole import Projection
-from vggtgeo.bundle.terms.term import AbstractTerm, reweighted_rows, reweighting, robust_energy, squared_norm
+from vggtgeo.bundle.terms.term import (
+    AbstractTerm,
+    check_residual,
+    reweighted_rows,
+    reweighting,
+    robust_energy,
+    squared_norm,
+)
 from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import Cameras, Pinhole, SquarePinhole
@@ -145,7 +152,7 @@ class EdgeTerm(AbstractTerm):
         host, camera = (cameras.of(keyframe) for keyframe in view.ends)
 
         def one(data: dict, pixel: Array, inverse_depth: Array) -> Array:
-            return jnp.atleast_1d(self.holding(data).residual(View(relative, camera, pixel, inverse_depth, host)))
+            return check_residual(self, self.holding(data).residual(View(relative, camera, pixel, inverse_depth, host)))
 
         return jax.vmap(one, in_axes=-1, out_axes=-1)(self.data(), view.pixels, depth)
 

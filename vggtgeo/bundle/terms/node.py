@@ -12,7 +12,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.bundle.terms.term import AbstractTerm, Local, local_model
+from vggtgeo.bundle.terms.term import AbstractTerm, Local, check_residual, local_model
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import AbstractCamera, Cameras
 from vggtgeo.io.errors import InputError
@@ -58,7 +58,7 @@ class PoseTerm(AbstractTerm):
         def function(step: Array) -> Array:
             pose = lie.move(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
             camera = cameras.moved(step[lie.TANGENT :]).of(touched[0])
-            return jnp.atleast_1d(self.holding(data).residual(pose, camera))
+            return check_residual(self, self.holding(data).residual(pose, camera))
 
         return function
 
@@ -102,7 +102,7 @@ class PairTerm(AbstractTerm):
         def function(step: Array) -> Array:
             first = lie.move(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
             second = lie.move(jaxlie.SE3(poses[touched[1]]), step[lie.TANGENT :])
-            return jnp.atleast_1d(self.holding(data).residual(first, second))
+            return check_residual(self, self.holding(data).residual(first, second))
 
         return function
 
@@ -139,7 +139,7 @@ class CameraTerm(AbstractTerm):
 
     def residuals(self, parameters: Float[Array, " q"]) -> Float[Array, "m k"]:
         """Of all of them, the residual's own axis first."""
-        one = lambda data, _: jnp.atleast_1d(self.holding(data).residual(parameters))
+        one = lambda data, _: check_residual(self, self.holding(data).residual(parameters))
         return jax.vmap(one, out_axes=-1)(self.data(), self.weight)
 
     def model(
@@ -148,7 +148,7 @@ class CameraTerm(AbstractTerm):
         """Hessian and gradient of the energy."""
 
         def one(data: dict, weight: Array) -> tuple[Array, Array]:
-            residual = lambda step: jnp.atleast_1d(self.holding(data).residual(parameters + step))
+            residual = lambda step: check_residual(self, self.holding(data).residual(parameters + step))
             return local_model(self, weight, residual, len(parameters), correction, exact)
 
         hessians, gradients = jax.vmap(one)(self.data(), self.weights)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.terms.term import AbstractTerm, reweighted_rows
+from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighted_rows
 
 Derivatives = tuple[Float[Array, "n s"], Float[Array, "n s"]]
 
@@ -31,7 +31,7 @@ class SlotTerm(AbstractTerm):
 
     def residuals(self, inverse_depth: Float[Array, "n s"]) -> Float[Array, "m n s"]:
         """Of all of them, the residual's own axis first."""
-        each = lambda data, depth: jnp.atleast_1d(self.holding(data).residual(depth))
+        each = lambda data, depth: check_residual(self, self.holding(data).residual(depth))
         return jax.vmap(jax.vmap(each, out_axes=-1), out_axes=1)(self.data(), inverse_depth)
 
     def derivatives(

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import real_numbers
-from vggtgeo.solvers.kernels import AbstractKernel, Square
+from vggtgeo.solvers.kernels import AbstractKernel, Barron, Square
 
 Local = Callable[[Array], Array]
 """A residual as a function of local coordinates."""
@@ -36,6 +36,33 @@ def check_width(name: str, kernel: Any) -> None:
     known = isinstance(width, jax.Array | np.ndarray | float | int) and not isinstance(width, jax.core.Tracer)
     if known and not np.all(np.asarray(width) > 0):
         raise InputError(f"`{name}` has the width {width}; it must be positive")
+    shape = getattr(kernel, "alpha", None) if isinstance(kernel, Barron) else None
+    known = isinstance(shape, jax.Array) and not isinstance(shape, jax.core.Tracer)
+    if known and not ((np.asarray(shape) < 2) & (np.asarray(shape) != 0)).all():
+        raise InputError(f"`{name}` has the shape {shape}; it must be below 2, and not 0, where `Cauchy` is its limit")
+
+
+def _weights(given: Any) -> Array:
+    """Weights as an array; InputError for what is no real numbers."""
+    if not isinstance(given, jax.Array):
+        real_numbers("weight", given)
+    return jnp.asarray(given)  # a number stays one of any precision
+
+
+def check_residual(term: AbstractTerm, residual: Any) -> Array:
+    """The residual of one observation as an array [m], where it is traced; InputError for what is none, so that the
+    writer of a term reads of it and not of what JAX makes of it far below.
+    """
+    kind, shape = getattr(residual, "dtype", None), getattr(residual, "shape", None)
+    if isinstance(residual, float | int) and not isinstance(residual, bool):
+        return jnp.asarray([float(residual)])
+    if kind is None or shape is None or len(shape) > 1 or not jnp.issubdtype(kind, jnp.floating):
+        found = f"of the type `{type(residual).__name__}`" if kind is None else f"{kind} of shape {shape}"
+        raise InputError(
+            f"`residual` of the term `{term.name}` gives something {found}; expected a number, or an array [m], of "
+            "floats"
+        )
+    return jnp.atleast_1d(residual)
 
 
 def shared_field(**options: Any) -> Any:
@@ -66,7 +93,7 @@ class AbstractTerm(eqx.Module):
 
     """
 
-    weight: Float[Array, "*observations"] = eqx.field(converter=jnp.asarray, kw_only=True, default=1.0)
+    weight: Float[Array, "*observations"] = eqx.field(converter=_weights, kw_only=True, default=1.0)
     """Of each observation, 1 / variance of its residual; 0 means that it is not there."""
     kernel: AbstractKernel = eqx.field(kw_only=True, default=Square())
 
