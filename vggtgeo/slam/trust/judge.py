@@ -31,7 +31,6 @@ from vggtgeo.slam.trust.reversal import check_reversal
 from vggtgeo.slam.trust.scale_drift import check_scale, hand_overs
 from vggtgeo.slam.trust.scale_hand_over import check_hand_over
 from vggtgeo.slam.trust.sensor_drift import check_sensors
-from vggtgeo.slam.trust.sensor_jumps import check_jumps
 from vggtgeo.slam.trust.shutter import check_shutter, corners_at_once
 from vggtgeo.slam.trust.speed import check_speed
 from vggtgeo.slam.trust.steps import breaks, check_steps, steps
@@ -73,7 +72,6 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
         found += _images(slam, estimate, aligned, (width, height))
         if any(np.isfinite(noted.depth_median) for noted in aligned):
             found += check_sensors(slam)
-            found += check_jumps(slam)
     else:
         found += check_speed(estimate)
     return conclude(found, estimate.frames.tolist(), estimate.times.tolist(), estimate.metric)

@@ -1,13 +1,20 @@
-"""With measured depth: do the lens and the unit of the depth stay what they are, from the first frame to the last?
+"""With measured depth: are the lens and the unit of the depth the same in all keyframes?
+
+A phone that zooms, a depth camera that warms up, one that starts again in another mode, recordings that were joined.
 
 A picture that grows because the camera goes forward grows by `t_z / z`, near parts more than far ones; one that grows
 because the lens zooms grows everywhere alike. So the matches of two keyframes whose depth was measured say, with their
 relative pose free, by what factor the focal length changed in between. And the depth that the first one measured,
-carried by the pose of matches and one lens, says by what factor the second one measures longer: a depth camera that
-warms up. Where the lens zooms, that pose is wrong, and nothing is said of the depth.
+carried by the pose of matches and one lens, says by what factor the second one measures longer. Where the lens changes,
+that pose is wrong, and nothing is said of the depth.
 
-The logarithm of either factor is fitted to all pairs of a stretch of keyframes by a line over its first and one over
-its second half; the covariance is the sandwich over keyframes.
+Each keyframe gets a logarithm of its own, of the focal length and of the unit, by robust least squares over the pairs
+that are at most `REACH` keyframes apart: a jump is no outlier to these, and a slow change adds up. The largest
+difference between any two keyframes counts that is beyond `MOST_CHANGE` and beyond chance.
+
+What a sensor measures wrongly at a distance, as `z (1 + b z)`, looks like either change, by about `b` for each metre
+that the camera goes forward: what lies ahead is measured longer than it is from nearer. So no two keyframes are
+compared between which the camera went farther ahead than `MOST_AHEAD`.
 
 Without measured depth nothing is asked here: see `zoom.py`.
 """
@@ -16,10 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
-from scipy.stats import t as student_t
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
@@ -30,27 +35,33 @@ from vggtgeo.slam.rolling_shutter import camera_motions, pair_at_once
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 
-MOST_ZOOM = 0.08
-"""Relative change of the focal length. Four clips in pieces of 40 to 500 frames have at most 0.028, and 0.053 with a
-standard deviation of as much; enlarged by 1.3 at their end they have 0.16 to 0.38. From 8 % on a focal length that is
-off as a whole is told, too."""
-MOST_LONGER = 0.15
-"""Relative change of the unit of depth. The clips have at most 0.057 (240 frames of corridor-office); made 1.4 times as
-long over 60 frames they have 0.21 to 0.31."""
-SIGMAS, CHANCE = 5.0, 1e-3
-"""How sure it must be: standard deviations, and with few keyframes what Student's t makes of this chance."""
-NOISE = 0.01
+MOST_CHANGE = 0.08
+"""Of the logarithm of either factor: what is told of a focal length, or a scale, that is off as a whole. Maps of the
+four clips as they are (6 to 161 keyframes) have at most 0.035 of the lens, and where white walls leave it open 0.079 by
+four standard deviations (building-walk); 0.026 of the unit, and redkitchen as a whole 0.056. Noise of 3 % a metre,
+holes, depth cut off at 3 m, that of 40 x 30 pixels change that by 0.02. Depth that is 1.15 times as long at the end of
+125 frames of corridor-office has 0.12 to 0.15 (11 cm off), 1.2 times as long from the middle on 0.19 (21 cm)."""
+SIGMAS = 5.0
+NOISE = 0.003
 """Standard deviation of the log factor of a pair beyond that of its matches: errors of depth that they share."""
-MOST_NOISE = 0.02
-"""Relative noise between two depths of a point above which nothing is said. Noisy depth does not tell near from far,
-and a part of what steps forward enlarge looks like a zoom: `noise^2` of the variance of the logarithm of the depths
-(0.3^2 in rooms), here 0.4 %, and a hundred keyframes that walk forward enlarge by `exp(10)`. The clips have 0.004 to
-0.009."""
-STRETCH = 100
-"""Keyframes that are asked together. What a sensor measures wrongly at a distance adds up where a camera goes forward:
-5.7 % in the 81 keyframes of corridor-office. A long run would be called wrong for it."""
-MOST_PAIRS = 60
-"""Of a stretch."""
+MOST_SIGMA = MOST_CHANGE / SIGMAS
+"""Of a logarithm by its own pair: one that knows it worse says nothing. Straight on before a white wall the lens is
+left open: in building-walk, frames 43 to 49, by 0.03 to 0.05, and the six values there, -0.12 in their median, were
+taken for a zoom."""
+WITHIN = 100
+"""Keyframes: small errors add up over more."""
+WITHIN_NOISE, MOST_NOISE = 20, 0.02
+"""The same where the relative noise between two depths of a point is more than that. Noisy depth does not tell near
+from far, and a part of what steps forward enlarge looks like a zoom: `noise^2` of the variance of the logarithm of the
+depths (0.3^2 in rooms), here 0.4 %, and a hundred keyframes that walk forward enlarge by `exp(10)`. The clips have
+0.004 to 0.009."""
+REACH = 3
+"""Keyframes that a pair is apart at most; a few milliseconds a pair."""
+LEAST_PAIRS = 2
+"""From one side of a place between keyframes to the other: the matches of one may be those of something that moves."""
+MOST_AHEAD = 4.0
+"""Metres: near and far within pairs say b = 1.9 % a metre of the Kinect of redkitchen, which was not calibrated, and
+0.1 to 0.2 % of the HoloLens clips."""
 LEAST_MATCHES = 15
 LEAST_FLOW = 3.0
 """Pixels, the median of a pair's matches: a camera that stands still says nothing of its lens."""
@@ -63,42 +74,175 @@ ROBUST = 1.5
 """Standard deviations: Huber's width over pairs."""
 ITERATIONS, SETTLED, LONGEST_STEP = 15, 1e-4, 0.1
 """Of the pose and the factor: metres, radians, and shares; a hundredth of what is told."""
-KNOTS = 3
 
 
-def check_sensors(slam: Slam) -> list[Finding]:
-    """Do focal length and unit of depth change, between start, middle and end of some stretch of keyframes?"""
-    found = []
-    for stretch in stretches(len(slam.keyframes)):
-        ends = max(slam.keyframes[stretch[0]].frame, 0), slam.keyframes[stretch[-1]].frame
-        if ends[1] < 0:  # of a known map alone, which was judged when it was made
-            continue
-        lens, unit = changes(slam, stretch)
-        when = f"between frames {ends[0]} and {ends[1]}"
-        if lens is not None and lens.is_sure and abs(lens.value) > MOST_ZOOM:
-            text = f"the lens zooms: the focal length changes by about {_percent(lens)} % {when}"
-            found.append(Finding("calibration", "degraded", f"{text}, and one is assumed for all", *ends))
-        elif unit is not None and unit.is_sure and abs(unit.value) > MOST_LONGER:
-            text = f"the unit of the sensor's depth changes by about {_percent(unit)} % {when}"
-            found.append(Finding("depth scale", "degraded", text, *ends, scale=True))
+def check_sensors(slam: Slam) -> Iterator[Finding]:
+    """Whether one lens and one unit of depth hold in all keyframes."""
+    said, ahead = statements(slam), way_ahead(slam)
+    within = WITHIN if said.noise <= MOST_NOISE else WITHIN_NOISE
+    lens = changes(said.focal, ahead, within)
+    for first, last, value in lens:
+        text = f"the lens zooms: the focal length changes, by a factor of {np.exp(value):.2f}"
+        yield from _told(slam, first, last, "calibration", text)
+    unit = said.unit.apart_from(lens)
+    for first, last, value in changes(unit, ahead, within):
+        text = f"the unit of the sensor's depth changes, by a factor of {np.exp(value):.2f}"
+        yield from _told(slam, first, last, "depth scale", text)
+
+
+def _told(slam: Slam, first: int, last: int, check: str, text: str) -> Iterator[Finding]:
+    start, end = (slam.keyframes[place].frame for place in (first, last))
+    if end >= 0:  # not of a known map, which was judged when it was made
+        text = f"frames {max(start, 0)} to {end}: {text}, and one is assumed for all"
+        yield Finding(check, "degraded", text, max(start, 0), end, scale=check == "depth scale")
+
+
+@dataclass(frozen=True, eq=False)
+class Ratios:
+    """Logarithms of a quantity in the second keyframe of each pair over that in the first, known to `MOST_SIGMA`.
+
+    numbers: int [m, 2], first and second keyframe; value, sigma: float64 [m].
+    """
+
+    numbers: np.ndarray
+    value: np.ndarray
+    sigma: np.ndarray
+
+    @classmethod
+    def of(cls, numbers: list[tuple[int, int]], said: list[tuple[float, float]]) -> Ratios:
+        """Those that are known; said: value and standard deviation of each."""
+        value, sigma = np.array(said, np.float64).reshape(-1, 2).T
+        known = sigma <= MOST_SIGMA
+        return cls(np.array(numbers, int).reshape(-1, 2)[known], value[known], sigma[known])
+
+    def rows(self, which: np.ndarray) -> Ratios:
+        """Some of them; which: bool [m]."""
+        return Ratios(self.numbers[which], self.value[which], self.sigma[which])
+
+    def among(self, first: int, last: int) -> Ratios:
+        """Between keyframes `first` to `last - 1`, counted from `first`."""
+        low, high = self.numbers.min(1), self.numbers.max(1)
+        inside = self.rows((low >= first) & (high < last))
+        return replace(inside, numbers=inside.numbers - first)
+
+    def apart_from(self, spans: list[tuple[int, int, float]]) -> Ratios:
+        """Without the pairs that reach into what lies between two places."""
+        low, high = self.numbers.min(1), self.numbers.max(1)
+        into = [(low < last) & (high > first) for first, last, _ in spans]
+        return self.rows(~np.any(into, axis=0)) if into else self
+
+
+@dataclass(frozen=True, eq=False)
+class Statements:
+    """What the pairs of a map say of focal length and unit of depth. noise: the median one of their depths, relative; 0
+    without any.
+    """
+
+    focal: Ratios
+    unit: Ratios
+    noise: float
+
+
+def statements(slam: Slam) -> Statements:
+    """Of the keyframes that are at most `REACH` apart, both ways."""
+    camera = np.asarray(slam.intrinsics, np.float64)
+    near = list(directed_pairs(slam, [pair for pair in slam.pairs if pair.second - pair.first <= REACH]))
+    found = [compare(pair, camera) for pair in near]
+    numbers = [pair.numbers for pair in near]
+    focal, unit = (Ratios.of(numbers, said) for said in ([f.focal for f in found], [f.depth for f in found]))
+    noise = [one.noise for one in found if np.isfinite(one.noise)]
+    return Statements(focal, unit, float(np.median(noise)) if noise else 0.0)
+
+
+def way_ahead(slam: Slam) -> np.ndarray:
+    """How far the camera went in the direction it looked, up to each keyframe: float64 [n], metres."""
+    poses = np.array([keyframe.pose for keyframe in slam.keyframes], np.float64).reshape(-1, 4, 4)
+    return np.append(0.0, -np.cumsum((poses[1:] @ rigid.invert(poses[:-1]))[:, 2, 3]))[: len(poses)]
+
+
+def changes(ratios: Ratios, ahead: np.ndarray, within: int) -> list[tuple[int, int, float]]:
+    """First and last keyframe of each change that is beyond chance, and its logarithm, in order; of those that overlap
+    the largest, which goes on as long as it grows by `MOST_CHANGE` in `WITHIN` keyframes.
+
+    ahead: float64 [n], metres of each keyframe's way ahead.
+    """
+    beyond: list[tuple[int, int, float]] = []
+    for start in range(0, max(len(ahead) - within // 2, 1), within // 2):
+        own = ahead[start : start + within]
+        curve = Curve.of(ratios.among(start, start + len(own)), len(own))
+        near = np.abs(own - own[:, None]) < MOST_AHEAD
+        beyond += [(start + first, start + last, value) for first, last, value in curve.differences(near)]
+    found: list[tuple[int, int, float]] = []
+    grown = lambda one: abs(one[2]) - (one[1] - one[0]) * MOST_CHANGE / WITHIN
+    for first, last, value in sorted(beyond, key=grown, reverse=True):
+        if all(last <= start or first >= end for start, end, _ in found):
+            found.append((first, last, value))
+    return sorted(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The logarithm of a quantity in each keyframe, float64 [n], and its covariance [n, n]. part: int [n], the same for
+    those whose difference is known.
+    """
+
+    value: np.ndarray
+    covariance: np.ndarray
+    part: np.ndarray
+
+    @classmethod
+    def of(cls, ratios: Ratios, keyframes: int) -> Curve:
+        """By iteratively reweighted least squares; both directions of a pair have the same matches and count as one.
+        Pairs that agree with each other less than they say count as they agree.
+        """
+        first, second = ratios.numbers.T
+        value, information = np.zeros(keyframes), 0.5 / (ratios.sigma**2 + NOISE**2)
+        free = np.sqrt(max(1.0 - 2 * keyframes / max(len(first), 1), 0.1))
+        weight, normal = information, np.eye(keyframes)
+        for _ in range(ITERATIONS):
+            normal = _normal(first, second, weight, keyframes)
+            side = np.bincount(second, weight * ratios.value, keyframes)
+            value = np.linalg.solve(normal, side - np.bincount(first, weight * ratios.value, keyframes))
+            off = np.abs(value[second] - value[first] - ratios.value) * np.sqrt(2 * information)
+            scale = max(1.48 * float(np.median(off)) / free, 1.0) if len(off) else 1.0
+            weight = information / scale**2 * np.minimum(1.0, ROBUST * scale / np.maximum(off, 1e-9))
+        part = _parts(ratios.numbers, keyframes)
+        return cls(_medians_of_three(value, part), np.linalg.inv(normal), part)
+
+    def differences(self, near: np.ndarray) -> Iterator[tuple[int, int, float]]:
+        """The earlier and the later keyframe, and the difference, of those that count; near: bool [n, n], which may."""
+        change = self.value - self.value[:, None]
+        own = np.diag(self.covariance)
+        sigma = np.sqrt(np.maximum(own[:, None] + own - 2 * self.covariance, NOISE**2))
+        sure = (np.abs(change) > MOST_CHANGE) & (np.abs(change) > SIGMAS * sigma)
+        for first, last in np.argwhere(np.triu(sure & near & (self.part[:, None] == self.part))).tolist():
+            yield first, last, float(change[first, last])
+
+
+def _normal(first: np.ndarray, second: np.ndarray, weight: np.ndarray, keyframes: int) -> np.ndarray:
+    """Normal equations of the differences, with a weak prior for keyframes that nothing joins: float64 [n, n]."""
+    normal = np.eye(keyframes)
+    np.add.at(normal, (np.r_[first, second], np.r_[first, second]), np.r_[weight, weight])
+    np.add.at(normal, (np.r_[first, second], np.r_[second, first]), -np.r_[weight, weight])
+    return normal
+
+
+def _parts(numbers: np.ndarray, keyframes: int) -> np.ndarray:
+    """Which keyframes too few pairs part from the next ones: int [n], the same within a part."""
+    over = np.zeros(max(keyframes - 1, 0), int)
+    for first, last in np.unique(np.sort(numbers, axis=1), axis=0):
+        over[first:last] += 1
+    return np.append(0, np.cumsum(over < LEAST_PAIRS))
+
+
+def _medians_of_three(value: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """With both neighbours of the same part: what changes stays changed, and one bad picture is none."""
+    found = np.full(len(value), np.nan)
+    for own in (np.flatnonzero(part == number) for number in np.unique(part)):
+        if len(own) >= 3:
+            middle = np.median(np.lib.stride_tricks.sliding_window_view(value[own], 3), axis=1)
+            found[own] = np.r_[middle[0], middle, middle[-1]]
     return found
-
-
-def changes(slam: Slam, stretch: range) -> tuple[Change | None, Change | None]:
-    """Of focal length and of the unit of depth in a stretch of keyframes; None of what nobody can say."""
-    pairs = list(depth_pairs(slam, stretch))
-    factors = [compare(pair, np.asarray(slam.intrinsics, np.float64)) for pair in pairs]
-    noise = [factor.noise for factor in factors if np.isfinite(factor.noise)]
-    if not noise or np.median(noise) > MOST_NOISE:
-        return None, None
-    numbers = np.array([pair.numbers for pair in pairs], np.float64)
-    return change(numbers, [factor.focal for factor in factors]), change(numbers, [factor.depth for factor in factors])
-
-
-def stretches(keyframes: int) -> list[range]:
-    """All keyframes, in stretches of about `STRETCH`."""
-    ends = np.linspace(0, keyframes, max(round(keyframes / STRETCH), 1) + 1).astype(int)
-    return [range(first, last) for first, last in pairwise(ends.tolist()) if last > first]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,22 +268,6 @@ class Factors:
     focal: tuple[float, float]
     depth: tuple[float, float]
     noise: float = float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class Change:
-    """The largest change of a logarithm between start, middle and end, its standard deviation, and how many of these
-    make it sure.
-    """
-
-    value: float
-    sigma: float
-    needed: float
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether it is beyond chance."""
-        return abs(self.value) > self.needed * self.sigma
 
 
 def compare(pair: DepthPair, intrinsics: np.ndarray) -> Factors:
@@ -210,47 +338,8 @@ def _carried(pair: DepthPair, intrinsics: np.ndarray, relative: np.ndarray) -> n
     return np.asarray(local @ relative[:3, :3].T + relative[:3, 3])
 
 
-def change(numbers: np.ndarray, factors: list[tuple[float, float]]) -> Change | None:
-    """How a quantity changes over a run; None where too few pairs speak.
-
-    numbers: [m, 2], first and second keyframe of each pair. factors: log ratio of the quantity, second to first, and
-    its standard deviation.
-    """
-    value, sigma = np.array(factors, np.float64).reshape(-1, 2).T
-    known = np.isfinite(sigma)
-    numbers, value, information = numbers[known], value[known], 1.0 / (sigma[known] ** 2 + NOISE**2)
-    keyframes, first = np.unique(numbers.min(1) if len(numbers) else [], return_inverse=True)
-    free = len(keyframes) - (KNOTS - 1)
-    if free < 2:
-        return None
-    knots = np.linspace(numbers.min(), numbers.max(), KNOTS)
-    design = (_hats(numbers[:, 1], knots) - _hats(numbers[:, 0], knots))[:, 1:]  # the start is zero
-    curve, weight, normal = np.zeros(KNOTS - 1), information, np.eye(KNOTS - 1)
-    for _ in range(ITERATIONS):
-        normal = design.T @ (design * weight[:, None]) + 1e-6 * np.eye(KNOTS - 1)
-        curve = np.linalg.solve(normal, design.T @ (weight * value))
-        off = np.abs(design @ curve - value) * np.sqrt(information)
-        weight = information * np.minimum(1.0, ROBUST / np.maximum(off, 1e-9))
-    gradient = np.zeros((len(keyframes), KNOTS - 1))
-    np.add.at(gradient, first, design * (weight * (design @ curve - value))[:, None])
-    inverse = np.linalg.inv(normal)
-    covariance = len(keyframes) / free * inverse @ gradient.T @ gradient @ inverse
-    between = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 1.0]])
-    values, sigmas = between @ curve, np.sqrt(np.diag(between @ covariance @ between.T))
-    most = int(np.argmax(np.abs(values)))
-    needed = max(SIGMAS, float(student_t.isf(CHANCE / 2, free)))
-    return Change(float(values[most]), float(sigmas[most]), needed)
-
-
 _UNKNOWN = 0.0, float("inf")
 _NOTHING = Factors(_UNKNOWN, _UNKNOWN)
-
-
-def depth_pairs(slam: Slam, stretch: range) -> Iterator[DepthPair]:
-    """Pairs of keyframes in a stretch, evenly over it."""
-    inside = [pair for pair in slam.pairs if pair.first in stretch and pair.second in stretch]
-    rows = np.unique(np.linspace(0, len(inside) - 1, MOST_PAIRS).astype(int)) if inside else ()
-    yield from directed_pairs(slam, [inside[row] for row in rows])
 
 
 def directed_pairs(slam: Slam, pairs: list[Pair]) -> Iterator[DepthPair]:
@@ -297,12 +386,3 @@ def _depth(keyframe: Keyframe, slots: np.ndarray) -> np.ndarray:
 
 def _flow(pair: DepthPair) -> np.ndarray:
     return np.asarray(np.linalg.norm(pair.after - pair.before, axis=1))
-
-
-def _percent(changed: Change) -> str:
-    return f"{100 * np.expm1(abs(changed.value)):.0f}"
-
-
-def _hats(at: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """Values float64 [n, KNOTS] of the piecewise linear functions that are one at a knot and zero at the others."""
-    return np.maximum(0.0, 1.0 - np.abs(at[:, None] - knots) / (knots[1] - knots[0]))
