@@ -13,11 +13,10 @@ from scipy.spatial.transform import Rotation
 from trust_checks import found_by_depth
 from witness import Walk, walk, with_depth
 
-from vggtgeo.slam.trust.depth_agreement import MOST_OFF, MUCH, depth_ratios
+from vggtgeo.slam.trust.depth_agreement import CONTRADICTIONS, MOST_OFF, MUCH, PART, DepthRatios, agree, depth_ratios
 from vggtgeo.slam.trust.evidence import FrameEvidence
 
-
-@pytest.mark.parametrize(
+KINDS = pytest.mark.parametrize(
     ("name", "check"),
     [
         ("constant", "depth and motion"),
@@ -26,23 +25,69 @@ from vggtgeo.slam.trust.evidence import FrameEvidence
         ("drifting", "depth scale"),
     ],
 )
-def test_depth_of_another_world_is_told(healthy: Walk, name: str, check: str) -> None:
-    """Depth that is constant, some frames late, of another unit than the poses, or of a scale that changes."""
-    rng = np.random.default_rng(0)
+
+
+def _changed(evidence: list[FrameEvidence], name: str, rows: range) -> list[FrameEvidence]:
+    """With depth in these frames that is constant, some frames late, of another unit than the poses, or of a scale that
+    changes.
+    """
     change = {
         "constant": lambda f: np.full(len(f.ids), 2.0),
-        "late": lambda f: _of_frame(healthy.evidence[max(f.frame - 8, 0)], f, rng),
+        "late": lambda f: _of_frame(evidence[max(f.frame - 8, 0)], f),
         "other unit": lambda f: 1.25 * f.depth,
         "drifting": lambda f: f.depth * (0.7 if f.frame % 2 else 1.3),
     }[name]
-    found = found_by_depth(healthy.estimate, with_depth(healthy.evidence, change))
+    return with_depth(evidence, lambda f: change(f) if f.frame in rows else f.depth)
+
+
+@KINDS
+def test_depth_of_another_world_is_told(healthy: Walk, name: str, check: str) -> None:
+    """Of whatever kind."""
+    found = found_by_depth(healthy.estimate, _changed(healthy.evidence, name, range(40)))
     assert check in {f.check for f in found}
     assert all(f.scale for f in found), "such depth gives no metres"
 
 
-def _of_frame(other: FrameEvidence, frame: FrameEvidence, rng: np.random.Generator) -> np.ndarray:
+@pytest.fixture(scope="module")
+def long() -> Walk:
+    """Six times as long as what is looked at together."""
+    return walk(count=6 * PART)
+
+
+@KINDS
+def test_depth_of_another_world_in_a_part_is_told(long: Walk, name: str, check: str) -> None:
+    """In a sixth of a run, of which shares over all frames say nothing; oracle: the frames that were changed."""
+    rows = range(2 * PART, 3 * PART)
+    changed = _changed(long.evidence, name, rows)
+    ratios = depth_ratios(long.estimate, changed)
+    assert [kind for kind, contradiction in CONTRADICTIONS if kind == check and contradiction(ratios) is not None] == []
+    found = [f for f in found_by_depth(long.estimate, changed) if f.check == check]
+    assert found
+    for one in found:
+        assert one.start is not None
+        assert one.end is not None
+        assert rows[0] - PART < one.start < rows[-1]
+        assert rows[0] < one.end < rows[-1] + PART
+        assert one.text.startswith(f"frames {one.start} to {one.end}: ")
+    assert found_by_depth(long.estimate, long.evidence) == []
+
+
+def test_frozen_depth_is_asked_of_where_it_froze() -> None:
+    """Depth that is off in half of the corners of 25 of 240 frames agrees with the motion over all of the run, and not
+    around there; where too little is seen all of it counts. Oracle: the frames that were changed.
+    """
+    rows = np.repeat(np.arange(6 * PART), 20)
+    tracks, frozen = np.arange(len(rows)), (rows >= 100) & (rows < 125)
+    off = np.where(frozen & (tracks % 2 == 0), 2 * MUCH, 0.0)
+    ratios = DepthRatios(rows, tracks, off, rows, np.zeros(len(rows)))
+    assert agree(ratios, 0, 6 * PART)
+    assert not agree(ratios, 100, 124)
+    assert agree(ratios, 180, 200)
+    assert agree(replace(ratios, tracks=np.where((rows > 60) & (rows < 160), 0, tracks)), 100, 124)
+
+
+def _of_frame(other: FrameEvidence, frame: FrameEvidence) -> np.ndarray:
     """The depth that another frame has at this frame's pixels: that of its nearest corner."""
-    del rng
     gap = np.linalg.norm(other.pixels[None] - frame.pixels[:, None], axis=2)
     return other.depth[gap.argmin(1)]
 

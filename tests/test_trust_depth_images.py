@@ -18,15 +18,19 @@ def test_a_frozen_depth_image_is_told(healthy: Walk) -> None:
     """The same depth image while the picture moves is told with its frames; the same image too (a still) is not, nor is
     depth that was not used.
     """
+    never, always_so = (lambda first, last, answer=answer: answer for answer in (False, True))
     frozen = [replace(f, depth_changed=0.0 if 10 <= f.frame <= 20 else 1.0) for f in healthy.evidence]
-    assert [(f.start, f.end) for f in check_frozen(healthy.estimate, frozen, harmless=False)] == [(9, 20)]
-    assert [(f.local, f.scale) for f in check_frozen(healthy.estimate, frozen, harmless=True)] == [(True, False)]
-    assert check_frozen(replace(healthy.estimate, metric=False), frozen, harmless=False) == []
+    assert [(f.start, f.end) for f in check_frozen(healthy.estimate, frozen, harmless=never)] == [(9, 20)]
+    assert [(f.local, f.scale) for f in check_frozen(healthy.estimate, frozen, harmless=always_so)] == [(True, False)]
+    asked = []
+    check_frozen(healthy.estimate, frozen, harmless=lambda first, last: bool(asked.append((first, last))))
+    assert asked == [(10, 20)], "of these frames alone"
+    assert check_frozen(replace(healthy.estimate, metric=False), frozen, harmless=never) == []
     always = [replace(f, depth_changed=0.0) for f in healthy.evidence]
-    told = check_frozen(healthy.estimate, always, harmless=True)
+    told = check_frozen(healthy.estimate, always, harmless=always_so)
     assert [(f.local, f.scale) for f in told] == [(False, True)], "poses that such depth made agree with it"
     still = [replace(healthy.evidence[0], frame=k, depth_changed=0.0) for k in range(20)]
-    assert check_frozen(healthy.estimate, still, harmless=False) == []
+    assert check_frozen(healthy.estimate, still, harmless=never) == []
 
 
 @pytest.mark.parametrize("factor", [0.001, 0.1, 1.0, 5.0])

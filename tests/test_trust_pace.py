@@ -41,6 +41,6 @@ def test_the_pace_is_that_of_the_camera(slow: Walk, healthy: Walk) -> None:
 def test_depth_of_another_unit_is_told_of_a_slow_camera(slow: Walk) -> None:
     """Depth a quarter too long: frames beside each other have no corner with parallax, and nothing was told."""
     wrong = with_depth(slow.evidence, lambda noted: 1.25 * noted.depth)
-    assert check_depth(slow.estimate, depth_ratios(slow.estimate, wrong)) == []
+    assert list(check_depth(slow.estimate, depth_ratios(slow.estimate, wrong))) == []
     assert "depth scale" in {finding.check for finding in found_by_depth(slow.estimate, wrong)}
     assert found_by_depth(slow.estimate, slow.evidence) == []

@@ -35,7 +35,7 @@ def found_by_sides(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Fi
 
 def found_by_depth(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:
     """Depth against motion and other depth."""
-    return check_depth(estimate, depth_ratios(estimate, evidence, pace(estimate, evidence)))
+    return list(check_depth(estimate, depth_ratios(estimate, evidence, pace(estimate, evidence))))
 
 
 def found_by_camera(estimate: Estimate, evidence: list[FrameEvidence]) -> list[Finding]:

@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -37,11 +38,11 @@ SMALLEST_ROOM = 1.0
 """Metres: of the depths at corners, over the whole run, more than a twentieth is farther."""
 
 
-def check_frozen(estimate: Estimate, evidence: Evidence, harmless: bool) -> list[Finding]:
+def check_frozen(estimate: Estimate, evidence: Evidence, harmless: Callable[[int, int], bool]) -> list[Finding]:
     """Depth images that are repeated while the picture moves, where they were used.
 
-    harmless: whether depth and motion agree all the same, as they do where the camera hardly moves: then it marks the
-    segment only, if most frames have a depth image of their own.
+    harmless: whether depth and motion agree all the same between two rows, as they do where the camera hardly moves:
+    then it marks the segment only, if most frames have a depth image of their own.
     """
     if not estimate.metric:  # all beyond its range, say, which is the same all the time
         return []
@@ -50,12 +51,13 @@ def check_frozen(estimate: Estimate, evidence: Evidence, harmless: bool) -> list
         frozen = (np.array([frame.depth_changed for frame in evidence]) < LEAST_CHANGED) & (moved > MOVED)
     if np.count_nonzero(frozen) < LEAST_FRAMES:
         return []
-    harmless = harmless and bool(np.mean(frozen) < MOSTLY)
+    own = bool(np.mean(frozen) < MOSTLY)
     found = []
     for first, last in spans(frozen, join=3):
         start, end = evidence[max(first - 1, 0)].frame, evidence[last].frame
         text = f"frames {start} to {end}: the depth image stays the same while the picture moves"
-        found.append(Finding("frozen depth", "degraded", text, start, end, scale=not harmless, local=harmless))
+        local = own and harmless(first, last)
+        found.append(Finding("frozen depth", "degraded", text, start, end, scale=not local, local=local))
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -102,7 +103,7 @@ def _images(slam: Slam, estimate: Estimate, evidence: Evidence, size: tuple[int,
     yield from check_parts(estimate, [divide(step) for step in taken])
     ratios = depth_ratios(estimate, evidence, pace(estimate, evidence))
     yield from check_depth(estimate, ratios)
-    yield from check_frozen(estimate, evidence, harmless=agree(ratios))
+    yield from check_frozen(estimate, evidence, harmless=partial(agree, ratios))
     yield from check_range(estimate, evidence)
     yield from check_edges(estimate, np.array([noted.edges_elsewhere for noted in evidence], np.float64))
     sound = np.ones(len(estimate), bool)
