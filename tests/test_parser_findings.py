@@ -19,6 +19,7 @@ import tiny_sequences as tiny
 from parsers import KINDS
 
 from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets.exr_files import exr_depth
 from vggtgeo.io.errors import InputError, InputWarning
 
 Change = Callable[[bytes], bytes]
@@ -235,6 +236,8 @@ def test_a_listed_name_that_no_file_system_takes_costs_its_frame(tmp_path: Path)
     (scene / "transforms.json").write_text(json.dumps(content))
     with pytest.warns(InputWarning, match="none of the 3 depth images is there"):
         assert not open_sequence(scene).has_depth
+    with pytest.raises(InputError, match=r"\.exr` cannot be read: no such file"):
+        exr_depth(tmp_path / f"{LONG[:-4]}.exr")
 
 
 @pytest.mark.filterwarnings("ignore:.*the IMU is not used")

@@ -1,5 +1,6 @@
 """Depth in EXR files of renderers and of the app Record3D, read by the package OpenEXR (extra `phones`)."""
 
+import os
 import re
 from pathlib import Path
 
@@ -24,7 +25,7 @@ def exr_depth(path: Path) -> np.ndarray:
         import OpenEXR
     except ImportError:
         raise InputError(f"`{path}` needs the package OpenEXR; {install_hint('phones')}") from None
-    if not path.is_file():
+    if not os.path.isfile(path):  # a name from a list may be none that a file system takes
         raise InputError(f"`{path}` cannot be read: no such file")
     try:
         header = OpenEXR.File(str(path), header_only=True).header()
