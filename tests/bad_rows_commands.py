@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import bad_files as bad
 import numpy as np
@@ -15,7 +17,7 @@ from bad_rows_outputs import OUTPUT, linked_to_itself
 from bad_rows_results import RESULTS, TRAJECTORIES, folder_of_run, summary_of
 
 from vggtgeo.cli.address_space import check_address_space
-from vggtgeo.export import export
+from vggtgeo.export import FORMATS, export
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.jax_environment import cache_folder
 
@@ -120,6 +122,16 @@ def run_of_a_continent(folder: Path) -> Path:
     """The folder of a run whose map is 10,000 km across."""
     PointCloud(np.diag([1e7, 1.0, 1.0]), np.zeros((3, 3), np.uint8)).save_ply(folder / "map.ply")
     return folder_of_run(summary_of("good"))(folder)
+
+
+def export_onto_full_disk(made: Path) -> None:
+    """An export that finds no space for its first file."""
+
+    def full(source: Path, target: Path) -> dict[str, float]:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target / "trajectory.txt"))
+
+    with patch.dict(FORMATS, tum=full):
+        export(made, "tum", made / "out")
 
 
 def exported_over(folder: Path) -> Path:
@@ -275,6 +287,7 @@ OTHERS = rows(
             exported_over,
             {"call": lambda made: export(made / "run", "tum", made / "mine")},
         ),
+        ("`export` onto a full disk", folder_of_run(summary_of("good")), {"call": export_onto_full_disk}),
         (
             "`export` onto a link to itself",
             run_and_link,

@@ -17,6 +17,7 @@ from vggtgeo.export.surfaces import write_glb, write_las, write_ply
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import whole_path
 from vggtgeo.io.given import path_of
+from vggtgeo.io.locks import not_written
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.summary_file import read_summary
 from vggtgeo.results.unfinished import check_is_run
@@ -73,6 +74,10 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
             (stage / name).replace(output / name)
     except EmptyRunError as error:
         raise InputError(f"{error} ({failed})" if failed else str(error)) from None
+    except OSError as error:
+        if error.filename is not None and Path(error.filename).is_relative_to(stage):  # which will be gone
+            raise not_written(output, error) from None
+        raise
     finally:
         shutil.rmtree(stage, ignore_errors=True)
         for folder in made:  # innermost first

@@ -18,6 +18,7 @@ import numpy as np
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.given import check_kind
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.edges import EVERY, edges_elsewhere
@@ -114,6 +115,7 @@ class EvidenceRecorder(Callback):
     """
 
     def __init__(self, camera: Camera) -> None:
+        check_kind("camera", camera, Camera, "a `vggtgeo.Camera`, as `sequence.camera`")
         self._left_out: np.ndarray | None = None
         self._frames: list[FrameEvidence] = []
         self._waiting: deque[Future[None]] = deque()
