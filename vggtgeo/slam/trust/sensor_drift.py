@@ -37,10 +37,11 @@ from vggtgeo.slam.trust.finding import Finding
 
 MOST_CHANGE = 0.08
 """Of the logarithm of either factor: what is told of a focal length, or a scale, that is off as a whole. Maps of the
-four clips as they are (6 to 161 keyframes) have at most 0.035 of the lens, and where white walls leave it open 0.079 by
-four standard deviations (building-walk); 0.026 of the unit, and redkitchen as a whole 0.056. Noise of 3 % a metre,
-holes, depth cut off at 3 m, that of 40 x 30 pixels change that by 0.02. Depth that is 1.15 times as long at the end of
-125 frames of corridor-office has 0.12 to 0.15 (11 cm off), 1.2 times as long from the middle on 0.19 (21 cm)."""
+four clips as they are (6 to 161 keyframes) have at most 0.031 of the lens, and where white walls leave it open 0.077,
+which is four standard deviations (building-walk); 0.027 of the unit, and redkitchen as a whole 0.058. Noise of 3 % a
+metre, holes, depth cut off at 3 m, that of 40 x 30 pixels have at most 0.034. Depth that is 1.15 times as long at the
+end of 125 frames of corridor-office has 0.10 (11 cm off), over fifty of them 0.15, 1.2 times from the middle on 0.20
+(21 cm); docs/stress.md has a table."""
 SIGMAS = 5.0
 NOISE = 0.003
 """Standard deviation of the log factor of a pair beyond that of its matches: errors of depth that they share."""
