@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vggtgeo.bundle.packing_checks import UNIT
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.baseline import BaselinePrior
 from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm
@@ -22,8 +23,6 @@ _ROWS: dict[type, dict[str, tuple[int, ...]]] = {
     RotationPrior: {"measured": (4,), "root": (3, 3)},
 }
 """Shapes of the data of one observation."""
-_UNIT = 1e-3
-"""How far a quaternion's length may be from 1: what single precision and text files leave."""
 
 
 def check_kinds(problem: Any, state: Any, name: str = "state") -> None:
@@ -107,7 +106,7 @@ def _check_measured(term: PoseTerm | PairTerm | CameraTerm) -> None:
         known = np.asarray(value, np.float64)[np.asarray(term.weight) > 0]
         if field == "measured":
             known = np.linalg.norm(known[:, :4], axis=1)
-        wrong = ~(np.abs(known - 1) <= _UNIT) if field == "measured" else ~(known > 0)
+        wrong = ~(np.abs(known - 1) <= UNIT) if field == "measured" else ~(known > 0)
         if field != "root" and wrong.any():
             what = "a quaternion of length 1, w first" if field == "measured" else "positive numbers"
             raise InputError(f"`{term.name}.{field}` has {known[wrong][0]:.3g}; expected {what}")
