@@ -14,6 +14,7 @@ from witness import SIZE, K, Walk, walk
 
 from vggtgeo.slam.camera_of_pairs import CameraOpinion
 from vggtgeo.slam.trust.calibration import _blocks, camera_opinion, check_camera
+from vggtgeo.slam.trust.evidence import FrameEvidence
 
 
 @pytest.mark.parametrize(
@@ -129,6 +130,33 @@ def test_published_calibrations_are_no_other_images(
     """No camera that is known to be right is called that of cut images; oracle: the data sets' own calibrations."""
     estimate = replace(healthy.estimate, intrinsics=np.array([*K[:2], *centre]))
     assert check_camera(estimate, None, (width, height)) == []
+
+
+def test_a_display_over_the_picture_is_no_lens(healthy: Walk) -> None:
+    """Corners of a display at the lower corners of the image, where depth is that of the room behind, have no say in
+    what camera the images want. Oracle: the same walk without them.
+    """
+    rng = np.random.default_rng(5)
+    places = np.vstack([rng.uniform((x, 340), (x + 180, 470), (12, 2)) for x in (10, 450)])
+    ids = np.arange(100_000, 100_000 + len(places), dtype=np.int32)
+
+    def displayed(frame: FrameEvidence) -> FrameEvidence:
+        pixels = (places + 0.1 * rng.standard_normal(places.shape)).astype(np.float32)
+        depth = rng.uniform(1.5, 3.0, len(ids)).astype(np.float32)
+        join = np.concatenate
+        return replace(
+            frame,
+            ids=join([frame.ids, ids]),
+            pixels=join([frame.pixels, pixels]),
+            depth=join([frame.depth, depth]),
+        )
+
+    opinion = camera_opinion(healthy.estimate, [displayed(frame) for frame in healthy.evidence])
+    without = camera_opinion(healthy.estimate, healthy.evidence)
+    assert opinion is not None
+    assert without is not None
+    assert opinion.value == pytest.approx(without.value, abs=1e-3)
+    assert check_camera(healthy.estimate, opinion, SIZE) == []
 
 
 def test_distortion_that_was_not_told_is_named() -> None:
