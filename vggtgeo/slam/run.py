@@ -202,6 +202,31 @@ def in_order(frames: Iterable[Frame], camera: Camera, last: float = -math.inf) -
         yield frame
 
 
+def with_own_depth(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """The frames, without depth where it is to the last bit that of another picture, the one before.
+
+    Recorders that store a depth image with each picture repeat it where the depth camera is slower: it is what was seen
+    from where the camera was then. At half the rate of the pictures a walk of 6 cm a frame was 4.1 cm off, and called
+    good; with the depth of every second picture alone 1.3.
+    """
+    last, repeated = None, False
+    for frame in frames:
+        repeated = last is not None and _same_depth(frame, last) and (repeated or not _same(frame.image, last.image))
+        yield replace(frame, depth=None) if repeated else frame
+        last = frame
+
+
+def _same_depth(frame: Frame, last: Frame) -> bool:
+    if frame.depth is None or last.depth is None:
+        return False
+    some = np.s_[::16, ::16]  # enough of nearly all frames
+    return _same(frame.depth[some], last.depth[some]) and _same(frame.depth, last.depth)
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    return one.shape == other.shape and one.tobytes() == other.tobytes()
+
+
 def _described(
     frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock, last: float
 ) -> Iterator[tuple[Frame, Description]]:
@@ -234,7 +259,7 @@ def _described(
             frame = next(source, None)
         return None if frame is None else prepare(frame)
 
-    source = in_order(frames, camera, last)
+    source = with_own_depth(in_order(frames, camera, last))
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames") as pool:
         queue: deque[Future[tuple[Frame, Description] | None]] = deque(
             pool.submit(read_and_prepare) for _ in range(AHEAD)

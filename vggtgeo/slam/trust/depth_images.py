@@ -26,10 +26,13 @@ MOVED = 2.0
 LEAST_CHANGED = 0.02
 """Share of pixels of a depth image that a moving camera changes at least, quantisation to 5 cm included (0.7)."""
 LEAST_FRAMES = 3
+SLOWER = 4
+"""Pictures in a row that repeat a depth image: a depth camera of a fifth of their rate, and none is slower. What is
+repeated is not used (`with_own_depth`), and no fault.
+"""
 MOSTLY = 0.8
 """Share of the frames: where as many show one depth image while the picture moves, poses that agree with it were made
-by it. Depth at a fifth of the rate of the images repeats itself in as many, and no sensor is slower. 40 frames of
-building-walk, all of them 1 m away, 34 cm off, agreed with themselves and were called good."""
+by it. 40 frames of building-walk, all of them 1 m away, 34 cm off, agreed with themselves and were called good."""
 NEAREST = 0.2
 """Metres: at most a tenth of the corners is nearer to a sensor for rooms."""
 SENSED = 0.2, 8.0
@@ -48,7 +51,11 @@ def check_frozen(estimate: Estimate, evidence: Evidence, harmless: Callable[[int
         return []
     moved = np.array([0.0, *(_flow(a, b) for a, b in pairwise(evidence))])
     with np.errstate(invalid="ignore"):
-        frozen = (np.array([frame.depth_changed for frame in evidence]) < LEAST_CHANGED) & (moved > MOVED)
+        changed = np.array([frame.depth_changed for frame in evidence])
+        frozen = (changed < LEAST_CHANGED) & (moved > MOVED)
+    for first, last in spans(changed == 0):
+        if last - first < SLOWER:
+            frozen[first : last + 1] = False
     if np.count_nonzero(frozen) < LEAST_FRAMES:
         return []
     own = bool(np.mean(frozen) < MOSTLY)

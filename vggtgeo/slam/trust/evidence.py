@@ -64,10 +64,11 @@ class FrameEvidence:
     """One frame's corners.
 
     ids: int32 [m], a track's number, the same in each frame that saw it. pixels: float32 [m, 2], of the ideal pinhole
-    image. depth: float32 [m], the sensor's, metres, NaN = none. depth_changed: share of the pixels with depth whose
-    depth is not exactly that of the frame before, NaN without depth. contrast: standard deviation of the grey levels.
-    enlarged: logarithm of the factor by which the picture is larger than the one before, less what measured depth
-    explains by coming nearer; None where nothing says. edges_elsewhere: see `edges.py`, of one frame in `EVERY`.
+    image. depth: float32 [m], the sensor's, metres, NaN = none, or none but that of the picture before. depth_changed:
+    share of the pixels with depth whose depth is not exactly that of the frame before, NaN without depth. contrast:
+    standard deviation of the grey levels. enlarged: logarithm of the factor by which the picture is larger than the one
+    before, less what measured depth explains by coming nearer; None where nothing says. edges_elsewhere: see
+    `edges.py`, of one frame in `EVERY`.
     """
 
     frame: int
@@ -123,6 +124,7 @@ class EvidenceRecorder(Callback):
         self._camera = camera
         self._image: np.ndarray | None = None
         self._depth: np.ndarray | None = None
+        self._own_depth: np.ndarray | None = None
         self._ids = np.zeros(0, np.int32)
         self._pixels = np.zeros((0, 2), np.float32)
         self._next = 0
@@ -155,6 +157,7 @@ class EvidenceRecorder(Callback):
         """The next frame follows the last of these."""
         self._frames = list(so_far.frames)
         self._image, self._depth, self._next = so_far.image, so_far.depth, so_far.next
+        self._own_depth = so_far.depth
         self._ids, self._pixels = so_far.ids, so_far.pixels
 
     def add(self, frame: Frame) -> None:
@@ -165,12 +168,16 @@ class EvidenceRecorder(Callback):
     def _add(self, frame: Frame) -> None:
         scale = max(frame.image.shape[:2]) / WIDTH
         grey, contrast = _small_grey(frame.image)
-        depth_before, (changed, median) = self._depth, self._compare_depth(frame.depth)
+        depth_before, (changed, median) = self._own_depth, self._compare_depth(frame.depth)
+        # The run does not use what was seen with another picture (`with_own_depth`).
+        repeated = changed == 0 and (depth_before is None or not np.array_equal(grey, self._image))
+        own = None if repeated else frame.depth
+        self._own_depth = None if repeated else self._depth
         enlarged = None
         if self._image is not None and len(self._ids):
             pixels, kept = _follow_through_bands(self._image, grey, self._pixels)
             kept &= self._of_the_world(pixels)
-            nearer = lambda start, end: _nearer(depth_before, self._depth, start, end, scale)
+            nearer = lambda start, end: _nearer(depth_before, self._own_depth, start, end, scale)
             corners = self._pixels[kept], pixels[kept]
             enlarged = followed_enlargement(*corners, nearer(*corners))
             if enlarged is None:
@@ -185,11 +192,11 @@ class EvidenceRecorder(Callback):
         self._pixels = np.concatenate([self._pixels, fresh])
         self._image = grey
         full = (self._pixels + 0.5) * scale - 0.5
-        depth = np.full(len(full), np.nan, np.float32) if frame.depth is None else _read(frame.depth, full)
+        depth = np.full(len(full), np.nan, np.float32) if own is None else _read(own, full)
         ideal = self._camera.undistorted(full).astype(np.float32)
         numbers, edges = self._ids.copy(), None
-        if frame.depth is not None and len(self._frames) % EVERY == 0:
-            edges = edges_elsewhere(grey, frame.depth, self._left_out)
+        if own is not None and len(self._frames) % EVERY == 0:
+            edges = edges_elsewhere(grey, own, self._left_out)
         self._frames.append(
             FrameEvidence(
                 *(frame.index, frame.timestamp, numbers, ideal, depth, median, changed, contrast, enlarged, edges)
