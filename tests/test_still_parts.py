@@ -49,6 +49,11 @@ def text(picture: np.ndarray) -> None:
     cv2.putText(picture, "REC 12:03", (20, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255, 255, 255), 2)
 
 
+def display(picture: np.ndarray) -> None:
+    """As bright as what passes behind it: its edges are those of something brighter now, of something darker then."""
+    cv2.putText(picture, "ALT 1.2", (20, 200), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (60, 190, 60), 3)
+
+
 def specks(picture: np.ndarray) -> None:
     for x, y in ((60, 60), (220, 90), (150, 180)):
         cv2.circle(picture, (x, y), 6, (10, 10, 10), -1)
@@ -68,7 +73,7 @@ def painted(pictures: list[np.ndarray], paint: Callable[[np.ndarray], None]) -> 
     return found, edge | (plain[..., 0] == 0)
 
 
-@pytest.mark.parametrize("paint", [bars, text, specks, board])
+@pytest.mark.parametrize("paint", [bars, text, display, specks, board])
 def test_what_the_camera_carries_is_found(paint: Callable[[np.ndarray], None]) -> None:
     """Its edges, nearly all of them, and little of the rest. Oracle: where it was painted."""
     pictures, edges = painted(moving(), paint)
