@@ -192,6 +192,15 @@ def test_a_camera_that_cannot_be_is_told_though_nobody_gave_it(healthy: Walk) ->
         assert ["what was found cannot be right" in text for text in texts] == [True] * told
 
 
+def test_a_camera_wider_than_any_lens_is_told(healthy: Walk) -> None:
+    """40 px for 400, found by the run itself, are told; a fisheye's 0.32 of the width, or given ones, are not."""
+    for share, sigma, told in ((0.1, 150.0, True), (0.32, 150.0, False), (0.1, 5.0, False)):
+        found = np.array([share * SIZE[0], share * SIZE[0], *K[2:]])
+        estimate = replace(healthy.estimate, intrinsics=found, given=found, sigma=np.full(4, sigma))
+        texts = [finding.text for finding in check_camera(estimate, None, SIZE)]
+        assert ["are 157 degrees wide, as by no lens" in text for text in texts] == [True] * told
+
+
 def test_a_guess_that_was_never_checked_is_told(healthy: Walk) -> None:
     """Where two keyframes are all, nothing tells of the camera; where there are more, it is estimated, and nothing is
     said. Oracle: both.
