@@ -170,7 +170,8 @@ class EvidenceRecorder(Callback):
         grey, contrast = _small_grey(frame.image)
         depth_before, (changed, median) = self._own_depth, self._compare_depth(frame.depth)
         # The run does not use what was seen with another picture (`with_own_depth`).
-        repeated = changed == 0 and (depth_before is None or not np.array_equal(grey, self._image))
+        other_picture = self._image is None or not np.array_equal(grey, self._image)
+        repeated = changed == 0 and (depth_before is None or other_picture)
         own = None if repeated else frame.depth
         self._own_depth = None if repeated else self._depth
         enlarged = None
