@@ -34,7 +34,7 @@ of them, no more than 0.0001 of the picture is above 0.9 while the camera moves;
 nine pictures of a camera that turns to the side."""
 KEPT = 12.0
 """Grey levels by which a pixel of a display differs from its median in nine of ten pictures at most: what a stroke does
-that fills three quarters of the pixel, the rest being what passes. In eight pieces of four clips, of 40 to 500 frames,
+that fills three quarters of the pixel, the rest being what passes. In seven pieces of four clips, of 40 to 240 frames,
 no more than 0.00001 of the picture keeps its brightness so well and has a gradient in `LEAST_SEEN` of the pictures."""
 LEAST_SEEN = 0.8
 """Share of the pictures in which a pixel has a gradient."""
