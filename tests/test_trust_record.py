@@ -22,6 +22,19 @@ def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
     assert [f.check for f in check_record(replace(healthy.estimate, pieces=2))] == ["parts"]
 
 
+def test_many_losses_are_one_sentence(healthy: Walk) -> None:
+    """Every fourth frame lost, once two in a row: one reason, and each loss marks its own segment.
+
+    Forty sentences hid the other reasons of a run in which every second picture was of another place.
+    """
+    lost = np.arange(40) % 4 == 2
+    lost[11] = True
+    findings = check_record(replace(healthy.estimate, tracked=~lost))
+    (reason,) = [finding for finding in findings if not finding.local]
+    assert reason.text == "11 of 40 frames were lost, 10 times, longest from frame 10 to 11; they have no pose"
+    assert [(f.start, f.end) for f in findings if f.local] == [(n, n + (n == 10)) for n in range(2, 40, 4)]
+
+
 def test_a_run_that_never_began_has_failed(healthy: Walk) -> None:
     """No map, or one tracked frame: failed."""
     never = replace(healthy.estimate, tracked=np.arange(40) == 0)

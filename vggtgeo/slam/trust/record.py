@@ -7,6 +7,8 @@ end of a run that is never found again by `a T^2 / 2`. The RMS over all frames s
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vggtgeo.slam.trust.estimate import Estimate
@@ -19,6 +21,8 @@ MOST_BRIDGED = 0.04
 MOST_LOST = 0.10
 LEAST_TRACKED = 0.5
 """Share of frames below which the run is not to be used."""
+MOST_NAMED = 5
+"""Stretches of lost frames that have a sentence each; more have one together. The segments hold them either way."""
 
 
 def check_record(estimate: Estimate) -> list[Finding]:
@@ -35,7 +39,14 @@ def check_record(estimate: Estimate) -> list[Finding]:
         start, end = int(estimate.frames[first]), int(estimate.frames[last])
         text = f"frames {start} to {end} were lost; they have no pose"
         text = text if end > start else f"frame {start} was lost; it has no pose"
-        found.append(Finding("lost", "degraded", text, start, end, local=not serious))
+        found.append(Finding("lost", "degraded", text, start, end, local=not serious or len(stretches) > MOST_NAMED))
+    if serious and len(stretches) > MOST_NAMED:
+        lost, count, longest = len(estimate) - np.count_nonzero(estimate.tracked), len(stretches), _longest(found)
+        text = (
+            f"{lost} of {len(estimate)} frames were lost, {count} times, longest from frame {longest.start} to "
+            f"{longest.end}; they have no pose"
+        )
+        found.append(replace(longest, text=text, local=False))
     if share < LEAST_TRACKED:
         found.append(Finding("lost", "failed", f"only {100 * share:.0f} % of the frames were tracked"))
     if estimate.pieces > 1:
@@ -45,6 +56,10 @@ def check_record(estimate: Estimate) -> list[Finding]:
         )
         found.append(Finding("parts", "degraded", text))
     return found
+
+
+def _longest(lost: list[Finding]) -> Finding:
+    return max(lost, key=lambda finding: (finding.end or 0) - (finding.start or 0))
 
 
 def _never_began(estimate: Estimate) -> str:
