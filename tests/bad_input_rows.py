@@ -10,6 +10,7 @@ from bad_rows_images import ALL_IMAGES
 from bad_rows_layouts import LAYOUTS
 from bad_rows_lists import ALL_LISTS
 from bad_rows_maps import MAPS
+from bad_rows_networks import ANSWERS
 from bad_rows_videos import VIDEOS
 
 ROWS: list[Row] = [
@@ -23,5 +24,6 @@ ROWS: list[Row] = [
     *LAYOUTS,
     *MAPS,
     *ALL_CLOUDS,
+    *ANSWERS,
 ]
 __all__ = ["ROWS", "Row"]

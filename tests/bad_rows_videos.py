@@ -59,6 +59,22 @@ def joined_video(path: Path) -> Path:
     return calibrated(path)
 
 
+def headless(path: Path) -> Path:
+    """A video whose first block was lost: its frames are there, and nothing says when they were taken."""
+    whole = bad.video(path).read_bytes()
+    path.write_bytes(bytes(8) + whole[8:])
+    return calibrated(path)
+
+
+def hasty(path: Path) -> Path:
+    """A video that states so many frames a second as no camera takes."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 65535.0, (bad.WIDTH, bad.HEIGHT))
+    for number in range(6):
+        writer.write(bad.picture(number))
+    writer.release()
+    return calibrated(path)
+
+
 VIDEOS = rows(
     "Videos",
     [
@@ -82,6 +98,9 @@ VIDEOS = rows(
         ("two recordings that were joined (.ts)", lambda folder: joined_video(folder / "clip.ts")),
         ("a picture of a phone (.heic)", bad.file("a.heic", b"\0\0\0\x18ftypheic" + bytes(40))),
         ("a zip archive", bad.file("clip.mp4", b"PK\x03\x04" + b"\0" * 999)),
+        ("one whose header is lost, and its frames are not", lambda folder: headless(folder / "clip.mp4")),
+        ("65535 frames a second in its header", lambda folder: hasty(folder / "clip.mp4")),
+        ("a file by its address, in place of a stream", lambda folder: f"file://{bad.video(folder / 'clip.mp4')}"),
     ],
     call=read_frames,
 )

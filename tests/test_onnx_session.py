@@ -10,7 +10,7 @@ import onnx
 import pytest
 import tiny_networks as tiny
 from onnx import TensorProto, helper
-from vggtgeo.models.onnx import contracts, providers
+from vggtgeo.models.onnx import contracts, patience, providers
 from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
 from vggtgeo.models.onnx.graph_bytes import external_files
 from vggtgeo.models.onnx.providers import choose_provider
@@ -203,6 +203,40 @@ def test_a_wrong_input_is_an_error_of_the_network(files: dict[str, Path]) -> Non
     session = open_session(files["letr"], contracts.LETR)
     with pytest.raises(NetworkRunError, match=r"letr\.onnx` failed on cpu"):
         session.run({"image": np.zeros((1, 3, 28, 43))})
+
+
+def test_a_loop_without_end_is_ended_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    # Proves that a network that never answers ends with an error that names it, after it was told that it takes long,
+    # and that others go on answering. Oracle: a file whose loop has no end.
+    monkeypatch.setattr(patience, "TOLD", 0.1)
+    monkeypatch.setattr(patience, "LONGEST", 0.3)
+    monkeypatch.setattr(patience, "_EVERY", 0.05)
+    session = open_session(tiny.endless(tmp_path / "endless.onnx"), contracts.LETR)
+    with pytest.raises(NetworkRunError, match=r"endless\.onnx` gave no answer within .* s and was ended: a loop"):
+        session.run({"image": np.zeros((1, 3, 28, 42))})
+    assert "endless.onnx` has not answered for" in caplog.text
+    other = open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
+    assert other.run({"image": np.zeros((1, 3, 48, 64))})["pred_lines"].shape == (1, 3, 4)
+
+
+def test_an_answer_of_other_sizes_is_an_error_of_the_network(tmp_path: Path) -> None:
+    # Proves that sizes that a file leaves open are those of the contract when it runs: as many views as were given, of
+    # their size. Oracle: a constant for two views, asked with three.
+    outputs = {"pose_enc": np.zeros((2, 9)), "depth": np.ones((2, 28, 42)), "depth_conf": np.ones((2, 28, 42))}
+    nodes = [helper.make_node("Identity", [f"value of {name}"], [name]) for name in outputs]
+    values = {f"value of {name}": np.asarray(value, np.float32) for name, value in outputs.items()}
+    shapes: dict[str, tiny.Shape] = {"pose_enc": ("n", 9), "depth": ("n", "h", "w"), "depth_conf": ("n", "h", "w")}
+    path = tiny.save(tmp_path / "vggt.onnx", nodes, {"images": ("n", 3, "h", "w")}, shapes, values)
+    session = open_session(path, contracts.VGGT)
+    assert session.run({"images": np.zeros((2, 3, 28, 42))})["depth"].shape == (2, 28, 42)
+    with pytest.raises(
+        NetworkRunError, match="other sizes than those of `vggt`: views is 3 in `images` and 2 in `pose"
+    ):
+        session.run({"images": np.zeros((3, 3, 28, 42))})
+    with pytest.raises(NetworkRunError, match="H is 14 in `images` and 28 in `depth`"):
+        session.run({"images": np.zeros((2, 3, 14, 42))})
 
 
 def test_outputs_stay_where_they_are(files: dict[str, Path]) -> None:

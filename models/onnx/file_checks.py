@@ -34,6 +34,7 @@ class Signature:
 
 
 Signatures = Mapping[str, Signature]
+Sizes = tuple[int, ...]
 
 _STRANGERS = (
     (b"PK\x03\x04", "a zip archive, such as a PyTorch checkpoint: export it first with `vggtgeo models export`"),
@@ -89,6 +90,22 @@ def disagreements(contract: Contract, inputs: Signatures, outputs: Signatures) -
         f"expected `{tensor}`, found {have}"
         for tensor, have in pairs
         if len(tensor.shape) != len(have.shape) or have.dtype not in tensor.dtypes
+    ]
+    return wrong or _sizes(contract, pairs)
+
+
+def wrong_sizes(contract: Contract, given: Mapping[str, Sizes], found: Mapping[str, Sizes]) -> list[str]:
+    """Where the sizes of an answer depart from the contract, for inputs of the sizes `given`: what a file leaves open
+    shows only then. An image may have no line; of all else an answer has something.
+    """
+    sizes = {**given, **found}
+    tensors = [tensor for tensor in (*contract.inputs, *contract.outputs) if tensor.name in sizes]
+    pairs = [(tensor, Signature(sizes[tensor.name], "numbers")) for tensor in tensors]
+    wrong = [
+        f"expected `{tensor}`, found {have}"
+        for tensor, have in pairs
+        if len(tensor.shape) != len(have.shape)
+        or any(size == 0 and letter != "Q" for letter, size in zip(tensor.shape, have.shape, strict=True))
     ]
     return wrong or _sizes(contract, pairs)
 

@@ -23,8 +23,10 @@ from vggtgeo.models.onnx.file_checks import (
     Signatures,
     check_looks_like_onnx,
     check_signature,
+    wrong_sizes,
 )
 from vggtgeo.models.onnx.graph_bytes import external_files
+from vggtgeo.models.onnx.patience import Call, watched
 from vggtgeo.models.onnx.providers import (
     CUDA_OPTIONS,
     NAMES,
@@ -81,6 +83,11 @@ class DeviceArray:
     def __dlpack_device__(self) -> tuple[int, int]:
         return self.value._ortvalue.__dlpack_device__()
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Its sizes."""
+        return tuple(self.value.shape())
+
     def numpy(self) -> np.ndarray:
         """A copy on the host, in the file's own element type."""
         return self.value.numpy()
@@ -136,7 +143,11 @@ class Session:
         return {name: _full_precision(array) for name, array in found.items()}
 
     def run_on_device(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, DeviceArray]:
-        """The same, left on the device in the file's own element type; nothing is checked."""
+        """The same, left on the device in the file's own element type; of the values nothing is checked.
+
+        Raises `NetworkRunError` where onnxruntime fails, and for an answer of other sizes than the contract's: a file
+        may leave sizes open.
+        """
         names = list(self.outputs if wanted is None else wanted)
         began = time.perf_counter()
         binding = self.session.io_binding()
@@ -144,13 +155,16 @@ class Session:
             binding.bind_ortvalue_input(name, self._on_device(name, value))
         for name in names:
             binding.bind_output(name, self.provider, 0)
-        try:
-            self.session.run_with_iobinding(binding)
-        except _RUNTIME_ERRORS as error:
-            raise NetworkRunError(f"`{self.path}` failed on {self.provider}: {error}") from None
+        with watched(self.path) as call:
+            try:
+                self.session.run_with_iobinding(binding, call.options)
+            except _RUNTIME_ERRORS as error:
+                raise NetworkRunError(self._why_failed(call, error)) from None
         self.tally.calls += 1
         self.tally.seconds += time.perf_counter() - began
-        return dict(zip(names, map(DeviceArray, binding.get_outputs()), strict=True))
+        found = dict(zip(names, map(DeviceArray, binding.get_outputs()), strict=True))
+        self._check_sizes(inputs, found)
+        return found
 
     def warm_up(self, seed: int = 0) -> None:
         """Run once on noise, where all inputs are images of a fixed size: the first run allocates, and on CUDA tunes.
@@ -166,6 +180,25 @@ class Session:
             noise = np.random.default_rng(seed)
             self.run({name: noise.uniform(size=shape) for name, shape in fixed.items()})
             self.tally.calls, self.tally.seconds = 0, 0.0
+
+    def _why_failed(self, call: Call, error: Exception) -> str:
+        if call.ended:
+            return (
+                f"`{self.path}` gave no answer within {call.seconds:.0f} s and was ended: a loop in it may have no "
+                "end; export it again, or give smaller images"
+            )
+        return f"`{self.path}` failed on {self.provider}: {error}"
+
+    def _check_sizes(self, inputs: Mapping[str, Input], found: Mapping[str, DeviceArray]) -> None:
+        given = {
+            name: array.shape if isinstance(array, DeviceArray) else np.shape(array) for name, array in inputs.items()
+        }
+        wrong = wrong_sizes(self.contract, given, {name: array.shape for name, array in found.items()})
+        if wrong:
+            raise NetworkRunError(
+                f"`{self.path}` answers with other sizes than those of `{self.contract.network}`: {'; '.join(wrong)}; "
+                "export it again"
+            )
 
     def _on_device(self, name: str, value: Input) -> onnxruntime.OrtValue:
         if isinstance(value, DeviceArray):
@@ -236,8 +269,10 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
         limit = {} if memory_limit_gb is None else {"gpu_mem_limit": int(memory_limit_gb * 2**30)}
         providers.insert(0, (NAMES["cuda"], {**CUDA_OPTIONS, **limit}))
     try:
+        # Without CUDA there is nothing to fall back on, and onnxruntime would say on stdout that it tries.
+        again = int(device == "cuda")
         with quiet() if device == "cuda" else nullcontext():
-            return onnxruntime.InferenceSession(str(path), options, providers)
+            return onnxruntime.InferenceSession(str(path), options, providers, enable_fallback=again)
     except (*_RUNTIME_ERRORS, UnicodeError) as error:  # of a name that is no UTF-8, in the file or of it
         raise NetworkFileError(_why_not_opened(path, str(error))) from None
 

@@ -9,20 +9,25 @@ import cv2
 import numpy as np
 import typer
 
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.network_errors import as_input_errors
 from vggtgeo.models.onnx import verification
+from vggtgeo.models.onnx.bounds import BoundedDepth, BoundedWindow
 from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, PARITY_SUFFIX
 from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
+from vggtgeo.models.onnx.moge2 import MogeDepth
 from vggtgeo.models.onnx.providers import Provider
 from vggtgeo.models.onnx.registry import NETWORKS
-from vggtgeo.models.onnx.session import open_session, read_signature
+from vggtgeo.models.onnx.session import Session, open_session, read_signature
+from vggtgeo.models.onnx.vggt import VggtWindow
 
 
 @dataclass(frozen=True)
 class Report:
     """What was found. inputs: shapes that were shown. parity: largest relative difference from PyTorch an output,
-    empty where nothing is recorded; limit: what of it is only rounding. latency: seconds.
+    empty where nothing is recorded; limit: what of it is only rounding. latency: seconds. depth_pixels: those of the
+    image that get a depth that a run would use; None for a network that gives none.
     """
 
     file: str
@@ -35,6 +40,7 @@ class Report:
     latency: float
     parity: dict[str, float]
     limit: float
+    depth_pixels: int | None
 
 
 def verify_file(
@@ -49,7 +55,8 @@ def verify_file(
         session = open_session(file, CONTRACTS[_contract_name(file, network)], provider=provider)
         # First: whether the record is one is known at once, and the room that is shown takes seconds to render.
         parity = verification.parity(session, record) if record else {}
-        inputs = verification.example_inputs(session, shown_image(image))
+        shown = shown_image(image)
+        inputs = verification.example_inputs(session, shown)
         return Report(
             file=str(file),
             network=session.contract.network,
@@ -61,6 +68,7 @@ def verify_file(
             latency=verification.latency(session, inputs, runs),
             parity=parity,
             limit=verification.tolerance(session),
+            depth_pixels=_depth_pixels(session, shown),
         )
 
 
@@ -71,6 +79,8 @@ def faults(report: Report) -> list[str]:
         for name, output in report.outputs.items()
         if output.not_finite
     ]
+    if report.depth_pixels == 0 and not report.random_weights:
+        wrong.append("no pixel of the image gets a depth that a run would use")
     return wrong + [
         f"`{name}` differs from PyTorch by {gap:.2g}, expected at most {report.limit:g}"
         for name, gap in report.parity.items()
@@ -89,6 +99,8 @@ def print_report(report: Report) -> None:
     for name, output in report.outputs.items():
         state = f"{output.not_finite} values not finite" if output.not_finite else "all finite"
         typer.echo(f"output {name} {list(output.shape)}: {output.lowest:.4g} to {output.highest:.4g}, {state}")
+    if report.depth_pixels is not None:
+        typer.echo(f"pixels with a depth that a run would use: {report.depth_pixels}")
     typer.echo(f"latency {1e3 * report.latency:.1f} ms on {report.provider}")
     if report.parity:
         typer.echo(f"differs from PyTorch by {max(report.parity.values()):.1e} (at most {report.limit:g} expected)")
@@ -106,6 +118,18 @@ def shown_image(path: Path | None) -> np.ndarray:
     if pixels is None:
         raise InputError(f"`{path}` cannot be read as an image; give a PNG or JPEG file")
     return pixels
+
+
+def _depth_pixels(session: Session, image: np.ndarray) -> int | None:
+    if session.contract.network == "moge2":
+        height, width = image.shape[:2]  # with a camera, as in a run: without, a flat wall may lie anywhere
+        camera = Camera.guess(width, height).intrinsics
+        depth = BoundedDepth(MogeDepth(session)).estimate(image, None, camera).depth
+    elif session.contract.network == "vggt":
+        depth = BoundedWindow(VggtWindow(session)).window([image]).depth
+    else:
+        return None
+    return int(np.isfinite(depth).sum())
 
 
 def _contract_name(file: Path, asked: str | None) -> str:

@@ -1,5 +1,6 @@
 """A camera that is running: a webcam (`webcam:0`) or a stream by its address (`rtsp://...`, `http://...`)."""
 
+import math
 import re
 import time
 import warnings
@@ -40,15 +41,23 @@ class LiveCamera:
         capture = _capture(source)
         try:
             there, image = capture.read()
+            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         finally:
             capture.release()
         if not there:
-            raise InputError(f"`{source}` gives no frame: is the camera there, and free?")
+            raise InputError(f"`{_public(source)}` gives no frame: is the camera there, and free?")
         height, width = image.shape[:2]
+        if _ADDRESS.fullmatch(source) and math.isfinite(count) and count > 0:  # a camera that is running knows no end
+            warnings.warn(
+                f"`{_public(source)}` is a recording of {count:.0f} frames, and the time of each would be that of its "
+                "arrival: fetch it first (`curl -O ADDRESS`), and give the file",
+                InputWarning,
+                stacklevel=3,
+            )
         camera = Camera.guess(width, height)
         warnings.warn(
-            f"`{source}`: no intrinsics found; starting from a guess, f = {camera.intrinsics[0]:.0f} pixels: give "
-            "--intrinsics fx,fy,cx,cy",
+            f"`{_public(source)}`: no intrinsics found; starting from a guess, f = {camera.intrinsics[0]:.0f} pixels: "
+            "give --intrinsics fx,fy,cx,cy",
             InputWarning,
             stacklevel=3,
         )
@@ -57,7 +66,7 @@ class LiveCamera:
     @property
     def name(self) -> str:
         """The source, without a password in it."""
-        return re.sub(r"//[^/@]*@", "//", self.source)
+        return _public(self.source)
 
     def __len__(self) -> int:
         return 0
@@ -91,6 +100,11 @@ class LiveCamera:
             capture.release()
 
 
+def _public(source: str) -> str:
+    """An address without the user's name and password."""
+    return re.sub(r"//[^/?#]*@", "//", source)
+
+
 def _capture(source: str) -> cv2.VideoCapture:
     webcam = _WEBCAM.fullmatch(source)
     logging: Any = cv2.utils.logging
@@ -101,5 +115,5 @@ def _capture(source: str) -> cv2.VideoCapture:
         logging.setLogLevel(level)
     if not capture.isOpened():
         capture.release()
-        raise InputError(f"`{source}` cannot be opened: is the camera there, and its address right?")
+        raise InputError(f"`{_public(source)}` cannot be opened: is the camera there, and its address right?")
     return capture

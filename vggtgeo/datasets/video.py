@@ -28,8 +28,15 @@ _MADE_OF_OTHERS = tuple(map(ord, "PB"))
 _MOST_ALIKE = 6
 """Frames that are the same to the bit, one behind the other."""
 _CONVERT = "`ffmpeg -i FILE -c:v libx264 NEW.mp4` makes one that it does"
-_PACKETS = b"\0\0\1\xba"
-"""The begin of an MPEG program stream, which is a container."""
+_STREAMS = (b"\xff\xd8\xff", b"\0\0\1", b"\0\0\0\1")
+"""Begins of frames of JPEG, MPEG and H.264 that lie one behind the other, without their times."""
+_CONTAINERS = (b"\0\0\1\xba", b"\x1aE\xdf\xa3", b"OggS", b"RIFF", b"FLV", b"G", b"0&\xb2u", b"nut/", b"YUV4")
+"""Begins of containers, which state times where they state no count: MPEG program stream, Matroska and WebM, Ogg, AVI,
+FLV, MPEG transport stream, ASF, NUT, YUV4MPEG2."""
+_BOXES = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"free", b"skip", b"wide")
+"""What an MP4 or a MOV begins with, behind four bytes."""
+_FASTEST = 1000
+"""Frames a second that a header may state."""
 _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 """Control characters other than those of text and terminals; no container of videos is without them."""
 
@@ -66,14 +73,11 @@ class VideoFile:
             aspect = _pixel_aspect(capture)
         height, width = image.shape[:2]
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
-        known_rate = math.isfinite(rate) and 0 < rate < 1000
-        if not stated > 0 and _has_no_container(path):  # a browser's recording states no count, but times
-            _warn(
-                InputWarning(
-                    f"`{path}` is a stream that states neither its times nor how many frames it has; {rate:g} frames a "
-                    "second are taken: give `--fps` if it has others"
-                )
-            )
+        known_rate = math.isfinite(rate) and 0 < rate < _FASTEST
+        if not stated > 0 and (what := _without_container(path)):  # a browser's recording states no count, but times
+            _warn(InputWarning(f"`{path}` {what}; {rate:g} frames a second are taken: give `--fps` if it has others"))
+        if math.isfinite(rate) and rate > _FASTEST:
+            _warn(InputWarning(f"`{path}` states {rate:g} frames a second: give `--fps` if that is not its rate"))
         return cls(path, path.name, camera, rate if known_rate else _FALLBACK_RATE, max(count, 1))
 
     def __len__(self) -> int:
@@ -223,11 +227,15 @@ def _pixel_aspect(capture: Any) -> float:
     return across / down if known else 1.0
 
 
-def _has_no_container(path: Path) -> bool:
-    """Whether frames of H.264, MPEG or JPEG lie there one behind the other, without their times."""
+def _without_container(path: Path) -> str:
+    """What is said of a file whose frames lie in no container, which would state their times; "" for others."""
     with path.open("rb") as file:
-        head = file.read(4)
-    return head.startswith((b"\xff\xd8\xff", b"\0\0\1", b"\0\0\0\1")) and head != _PACKETS
+        head = file.read(8)
+    if head.startswith(_CONTAINERS) or head[4:] in _BOXES:
+        return ""
+    if head.startswith(_STREAMS):
+        return "is a stream that states neither its times nor how many frames it has"
+    return "does not begin as a video does (is its header damaged?), and what was found in it has no times"
 
 
 def _codec(capture: Any) -> str:
