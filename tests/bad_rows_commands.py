@@ -17,9 +17,10 @@ from bad_rows_outputs import OUTPUT, linked_to_itself
 from bad_rows_results import RESULTS, TRAJECTORIES, folder_of_run, summary_of
 
 from vggtgeo.cli.address_space import check_address_space
-from vggtgeo.export import FORMATS, export
+from vggtgeo.export import FORMATS, export, formats
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.jax_environment import cache_folder
+from vggtgeo.io.locks import locked
 
 
 def flags(*words: Any) -> dict[str, Any]:
@@ -132,6 +133,24 @@ def export_onto_full_disk(made: Path) -> None:
 
     with patch.dict(FORMATS, tum=full):
         export(made, "tum", made / "out")
+
+
+def export_beside(made: Path) -> None:
+    """An export while another puts its files into the same folder, and does not come to an end."""
+    (made / "out").mkdir()
+    with (
+        patch.object(formats, "_TURNS", 1),
+        patch.dict(FORMATS, tum=lambda source, target: {}),
+        locked(made / "out/.vggtgeo-export.lock"),
+    ):
+        export(made, "tum", made / "out")
+
+
+def killed_run(folder: Path) -> Path:
+    """A folder where the first run was killed."""
+    (folder / "unfinished").mkdir()
+    (folder / "unfinished/checkpoint.npz").write_bytes(b"")
+    return folder
 
 
 def exported_over(folder: Path) -> Path:
@@ -286,6 +305,21 @@ OTHERS = rows(
             "`export` over files that no export wrote",
             exported_over,
             {"call": lambda made: export(made / "run", "tum", made / "mine")},
+        ),
+        (
+            "`export` into a folder where another export goes on",
+            folder_of_run(summary_of("good")),
+            {"call": export_beside},
+        ),
+        (
+            "`export` of a run that was killed",
+            killed_run,
+            {"argv": lambda made: ["export", made, "--to", "ply"]},
+        ),
+        (
+            "`view` of a run that was killed",
+            killed_run,
+            {"argv": lambda made: ["view", made, "--rerun", made / "run.rrd"]},
         ),
         ("`export` onto a full disk", folder_of_run(summary_of("good")), {"call": export_onto_full_disk}),
         (

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import pickle
+import warnings
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import tiny_layouts as layouts
 import tiny_sequences as tiny
 from bad_row import Row, read_frames, rows, solve_with
 
+from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem_file import load_problem
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
@@ -290,6 +293,25 @@ CLOUDS = rows(
     ],
     call=PointCloud.load_ply,
 )
+
+
+def twice(folder: Path) -> Path:
+    """A problem whose archive has two arrays of one name."""
+    made = bad.problem()(folder)
+    with warnings.catch_warnings(), zipfile.ZipFile(made, "a") as archive:
+        warnings.simplefilter("ignore", UserWarning)
+        archive.writestr("d_prior.npy", archive.read("d_prior.npy"))
+    return made
+
+
+def energy_of(made: Path) -> None:
+    """The energy of a problem in a file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a landmark that only its depth told of
+        problem, start, _ = load_problem(made)
+    assert np.isfinite(energy(problem, start))
+
+
 NPY = io.BytesIO()
 np.save(NPY, np.zeros(9))
 HUGE = {"descr": "<f8", "fortran_order": False, "shape": (10**13,)}
@@ -315,7 +337,9 @@ PROBLEMS = rows(
             bad.member("d_prior", {**HUGE, "shape": (4 * 10**7,)}, bytes(32 * 10**7)),
             {"slack": 5.0},
         ),
+        ("an array twice", twice),
         ("`alpha` that is NaN", bad.problem(alpha=np.nan)),
+        ("`alpha` of 0: no depth", bad.problem(alpha=0.0), {"call": energy_of, "argv": None}),
         ("`alpha` that is negative", bad.problem(alpha=-1.0)),
         ("`huber` that is zero", bad.problem(huber=0.0)),
         ("`huber` that is NaN", bad.problem(huber=np.nan)),

@@ -30,6 +30,7 @@ from vggtgeo.export import export
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputWarning
+from vggtgeo.results.source import opened
 from vggtgeo.simulation import Sensor
 from vggtgeo.slam.run import in_order
 
@@ -140,6 +141,30 @@ def of_one_array() -> Sequence[Any]:
 def as_they_were(_: Path) -> None:
     """Frames of one array keep their own images."""
     frames = list(frame_stream(of_one_array()).frames())
+    assert all((frame.image == image).all() for frame, image in zip(frames, IMAGES, strict=True))
+
+
+class OneArray:
+    """A sequence of one's own that fills one array anew for each frame."""
+
+    name = "own"
+    camera = vg.Camera.guess(*IMAGES[0].shape[1::-1])
+    has_depth = False
+
+    def __len__(self) -> int:
+        return len(IMAGES)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Any:
+        """All of them."""
+        return (frame(index, image=image) for index, image in enumerate(of_one_array()))
+
+    def ground_truth(self) -> None:
+        """None."""
+
+
+def as_they_are_in_a_run(_: Path) -> None:
+    """Frames of such a sequence keep their own images."""
+    frames = list(opened(OneArray(), None, vg.SlamSettings()).frames.frames())
     assert all((frame.image == image).all() for frame, image in zip(frames, IMAGES, strict=True))
 
 
@@ -256,6 +281,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("an index of 10^30", stream(lambda: [frame(0), frame(1, index=10**30)])),
     ("a time of 1e300", stream(lambda: [frame(0), frame(1, timestamp=1e300)])),
     ("images in one array, filled anew for each", as_they_were),
+    ("a `Sequence` of one's own that fills one array anew", as_they_are_in_a_run),
     ("a name as alignment", lambda _: vg.Roles(alignment="icp")),
     ("`perception`: a number as folder", lambda _: vg.perception(folder=5)),
     ("`perception`: a name as mixture", lambda _: vg.perception(mixed="mlsd")),

@@ -127,6 +127,7 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`reorder`: a keyframe twice", lambda _: vg.reorder(vg.no_prior(3), [0, 0, 1])),
     ("`solve_batch` of one window", with_pair(vg.solve_batch)),
     ("`load_problem` of an empty name", lambda _: vg.load_problem("")),
+    ("`load_problem` of whole numbers", lambda _: vg.load_problem("no.npz", dtype="int32")),
     ("`save_problem` to a number", lambda _: vg.save_problem(1, *SCENE.pack())),
     ("`with_term` of nothing", with_pair(lambda p, s: p.with_term(None))),
     ("`with_terms` of a list", with_pair(lambda p, s: p.with_terms([p.points]))),

@@ -143,6 +143,17 @@ def test_a_step_that_is_not_finite(solved: Solve) -> None:
     assert finite(solution)
 
 
+def test_depth_that_counts_nothing(solved: Solve) -> None:
+    # Proves that `alpha` of 0 is a problem without depth, not one that is no number. Oracle: depth weights of 0.
+    problem, start, _ = NOISY.pack(**OPTIONS)
+    assert float(problem.depth.weight.max()) > 0
+    none = eqx.tree_at(lambda p: p.depth.alpha, problem, jnp.zeros(()))
+    solution = solved(none, start)
+    expected = solved(problem.with_term(problem.depth.reweighted(0 * problem.depth.weight)), start)
+    assert bool(solution.converged)
+    np.testing.assert_allclose(solution.state.inverse_depth, expected.state.inverse_depth, rtol=1e-9)
+
+
 def test_no_weight_at_all(solved: Solve) -> None:
     # Proves that a problem that asks for nothing leaves the state as it is. Oracle: the start.
     scene = NOISY.with_observations(

@@ -14,6 +14,7 @@ from jax.typing import DTypeLike
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.observed import check_tied
 from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.packing_checks import check_dtype
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.precision import check_precision
 from vggtgeo.bundle.problem import Problem, State
@@ -74,6 +75,8 @@ def load_problem(
 
     """
     path = path_of("path", path)
+    if dtype is not None:
+        check_dtype(dtype)
     arrays = _read(path)
     if DESCRIPTION in arrays:
         return _restored(path, arrays, terms, dtype)

@@ -106,7 +106,7 @@ def _frame(item: Any, index: int, rate: float) -> Frame:
         given: Any = item.image
         if not isinstance(given, np.ndarray) or given.ndim != 3:
             raise InputError(f"`frames[{index}]` has an image {described(given)}; it must be uint8 [H, W, 3], RGB")
-        return replace(item, image=_own(item.name, given), depth=_own(item.name, item.depth))
+        return copied(item)
     image, depth = item if isinstance(item, tuple) and len(item) == 2 else (item, None)
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(
@@ -116,6 +116,11 @@ def _frame(item: Any, index: int, rate: float) -> Frame:
         check_depth(f"the depth of `frames[{index}]`", depth, image)
         depth = depth.astype(np.float32)
     return Frame(index, index / rate, _own(f"frame {index}", image), depth, f"frame {index}")
+
+
+def copied(frame: Frame) -> Frame:
+    """The frame with arrays of its own; InputError for one that is too large."""
+    return replace(frame, image=_own(frame.name, frame.image), depth=_own(frame.name, frame.depth))
 
 
 def _own(name: str, given: Any) -> Any:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.images import ImageFolder
+from vggtgeo.datasets.in_memory import copied
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.rgbd_folders import RgbdFolders
@@ -38,9 +39,12 @@ class SequenceView:
         return len(self.source)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`."""
+        """See `Sequence.frames`. Those of a class from elsewhere are copied: it may fill one array anew for each frame,
+        and the map holds some of them.
+        """
         frames = self.source.frames(start, end, stride)
-        return frames if self.has_depth else (replace(frame, depth=None) for frame in frames)
+        frames = frames if self.has_depth else (replace(frame, depth=None) for frame in frames)
+        return frames if type(self.source).__module__.startswith("vggtgeo.") else map(copied, frames)
 
     def ground_truth(self) -> Trajectory | None:
         """The truth of the source, unless it is hidden."""

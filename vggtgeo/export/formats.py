@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from vggtgeo.export.colmap import write_colmap
@@ -17,7 +19,7 @@ from vggtgeo.export.surfaces import write_glb, write_las, write_ply
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import whole_path
 from vggtgeo.io.given import path_of
-from vggtgeo.io.locks import not_written
+from vggtgeo.io.locks import LockedError, locked, not_written
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.summary_file import read_summary
 from vggtgeo.results.unfinished import check_is_run
@@ -34,6 +36,9 @@ FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
 """Each writes below a folder what the format wants of a run's folder, and returns what was written, in numbers."""
 _RECORD = ".vggtgeo-export"
 """Names of the files that exports wrote into a folder: those an export may replace, and no others."""
+_LOCK = ".vggtgeo-export.lock"
+_TURNS, _WAIT = 100, 0.1
+"""How often, and how many seconds between, an export waits for another."""
 
 
 def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[str] | None = None) -> dict[str, float]:
@@ -68,10 +73,11 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     try:  # what is there already stays until all is written
         written = FORMATS[to](place, stage)
         names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
-        _claim(output, names, ours=whole_path(output) == whole_path(place / "export" / to))
-        for name in names:
-            (output / name).parent.mkdir(parents=True, exist_ok=True)
-            (stage / name).replace(output / name)
+        with _in_turn(output):
+            _claim(output, names, ours=whole_path(output) == whole_path(place / "export" / to))
+            for name in names:
+                (output / name).parent.mkdir(parents=True, exist_ok=True)
+                (stage / name).replace(output / name)
     except EmptyRunError as error:
         raise InputError(f"{error} ({failed})" if failed else str(error)) from None
     except OSError as error:
@@ -86,6 +92,25 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     if failed:
         warnings.warn(f"`{place}`: {failed}", InputWarning, stacklevel=2)
     return written
+
+
+@contextmanager
+def _in_turn(output: Path) -> Iterator[None]:
+    """Waits while another export puts its files into the folder, so that they are not mixed: a moment, as all of them
+    are written by then. InputError where it does not end.
+    """
+    with ExitStack() as holding:
+        for turn in range(_TURNS + 1):
+            try:
+                holding.enter_context(locked(output / _LOCK))
+                break
+            except LockedError as error:
+                if turn == _TURNS:
+                    raise InputError(
+                        f"`{output}` is in use by another export ({error}); give another folder with `-o`"
+                    ) from None
+                time.sleep(_WAIT)
+        yield
 
 
 def _check_target(output: Path, run: Path) -> None:

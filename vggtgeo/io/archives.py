@@ -121,7 +121,12 @@ def read_archive(path: Path, what: str, use: Callable[[Archive], dict[str, np.nd
         raise InputError(f"`{path}` is no file; give that of {what}")
     try:
         with path.open("rb") as handle, zipfile.ZipFile(handle) as file:
-            members = {info.filename.removesuffix(".npy"): info for info in file.infolist()}
+            members: dict[str, zipfile.ZipInfo] = {}
+            for info in file.infolist():
+                name = info.filename.removesuffix(".npy")
+                if name in members:
+                    raise InputError(f"`{path}` has the array `{name}` twice; write it again, with each name once")
+                members[name] = info
             return use(Archive(path, members, file))
     except InputError:
         raise

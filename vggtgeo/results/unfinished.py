@@ -28,7 +28,10 @@ def check_finished(folder: Path) -> str | None:
 def check_is_run(folder: Path) -> None:
     """InputError unless `folder` is that of a run."""
     if not (folder / SUMMARY).is_file():
-        raise InputError(f"`{folder}` holds no run (no `{SUMMARY}`); give a folder that `vggtgeo run` wrote")
+        raise InputError(
+            check_finished(folder)
+            or f"`{folder}` holds no run (no `{SUMMARY}`); give a folder that `vggtgeo run` wrote"
+        )
 
 
 def check_can_be_shown(folder: Path) -> None:
@@ -37,7 +40,9 @@ def check_can_be_shown(folder: Path) -> None:
         raise InputError(f"`{folder}` is no folder; give the folder that `vggtgeo run -o` wrote")
     for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
         if not (folder / name).is_file():
-            raise InputError(f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote")
+            raise InputError(
+                check_finished(folder) or f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote"
+            )
 
 
 def check_may_be_folder(place: Path) -> None:
