@@ -89,6 +89,18 @@ def suite(content: str) -> Any:
     return lambda folder: bad.file("suite.toml", content)(folder).parent
 
 
+SEQUENCES = """title = "t"
+[[sequence]]
+name = "walk"
+simulate = {frames = 4}
+[[sequence]]
+name = "Walk"
+simulate = {frames = 4}
+[[setting]]
+name = "full"
+"""
+
+
 def without_home(folder: Path) -> None:
     """No home folder, and one that cannot be written: there is no cache, and that is all."""
     with pytest.MonkeyPatch.context() as patch:
@@ -386,6 +398,21 @@ OTHERS = rows(
             "`bench --sequences` of one that is none",
             nothing,
             {"argv": lambda made: ["bench", "quick", "-o", made / "new", "--sequences", "x"], "slack": IMPORTS},
+        ),
+        (
+            "`bench` into the root of the file system",
+            nothing,
+            {"argv": line("bench", "quick", "-o", "/"), "slack": IMPORTS},
+        ),
+        (
+            "`bench` into the folder of a run",
+            bad.file("report.html", "of a run"),
+            {"argv": lambda made: ["bench", "quick", "-o", made.parent], "slack": IMPORTS},
+        ),
+        (
+            "`bench` of two sequences whose names differ in capitals",
+            suite(SEQUENCES),
+            {"argv": benched("{}/suite.toml"), "slack": IMPORTS},
         ),
         (
             "`bench` of a suite without sequences",

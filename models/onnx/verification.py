@@ -105,6 +105,8 @@ def _summary(array: np.ndarray) -> Output:
 
 
 def _read_record(session: Session, recorded: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    if not recorded.is_file():  # a pipe has no end
+        raise NetworkFileError(f"`{recorded}` is no file; give a parity record (.npz)")
     try:
         # NumPy takes what is no archive for a pickle, and would have the user trust it.
         with recorded.open("rb") as handle, zipfile.ZipFile(handle), np.load(handle, allow_pickle=False) as file:

@@ -25,7 +25,7 @@ from vggtgeo.benchmark.table import Row, as_csv, write_parquet
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import write_text
+from vggtgeo.io.files import whole_path, write_text
 from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import locked_folder
 
@@ -142,8 +142,7 @@ def bench(
         memory_gb=chosen.memory_gb if memory_gb is None else memory_gb,
     )
     folder = path_of("output", output)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
+    _check_output(folder)
     if workers < 1:
         raise InputError(f"`workers` is {workers}; it must be at least 1")
     jobs = jobs_of(chosen, data_folders(data))
@@ -157,6 +156,20 @@ def bench(
         report = BenchReport(chosen, tuple(rows), folder)
         report.write(folder)
     return report
+
+
+def _check_output(folder: Path) -> None:
+    """InputError where a batch would replace files that are not of one: those of a single run, say."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
+    if whole_path(folder) == Path(whole_path(folder).anchor):
+        raise InputError(f"`output` is `{folder}`, the root of the file system; give a folder")
+    there = [name for name in OUTPUTS if (folder / name).exists()]
+    if there and not (folder / "runs").is_dir() and not {"tables.md", "runs.csv"} <= set(there):
+        raise InputError(
+            f"`{folder}` holds `{there[0]}`, which a batch replaces, and nothing else of a batch; give another folder "
+            "with `-o`"
+        )
 
 
 def all_rows(

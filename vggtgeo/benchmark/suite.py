@@ -371,9 +371,10 @@ def _check_protocol(name: str) -> None:
 
 
 def _check_different(what: str, names: list[str]) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
+    folders = [name.lower() for name in names]  # each run has one, and some systems do not tell them apart by case
+    twice = sorted({name for name in names if folders.count(name.lower()) > 1})
     if twice:
-        raise InputError(f"{what} {', '.join(twice)}: each name may be there once")
+        raise InputError(f"{what} {', '.join(twice)}: each name may be there once, in capitals or not")
 
 
 def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:

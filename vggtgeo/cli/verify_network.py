@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import typer
 
@@ -114,10 +113,11 @@ def shown_image(path: Path | None) -> np.ndarray:
         from vggtgeo.simulation.sequence import simulate
 
         return simulate("room", 1, 0, (640, 480)).frame(0).image
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
-    if pixels is None:
-        raise InputError(f"`{path}` cannot be read as an image; give a PNG or JPEG file")
-    return pixels
+    from vggtgeo.datasets.image_files import read_image
+
+    if not path.is_file():  # a pipe has no end
+        raise InputError(f"`{path}` cannot be read as an image: it is no file; give a PNG or JPEG file")
+    return read_image(path)
 
 
 def _depth_pixels(session: Session, image: np.ndarray) -> int | None:
