@@ -15,8 +15,8 @@ import onnxruntime
 _log = logging.getLogger(__name__)
 TOLD = 60.0
 """Seconds until a call that goes on is told."""
-LONGEST = 1800.0
-"""Seconds of a call: VGGT takes minutes for a large window on a slow processor."""
+LONGEST = 7200.0
+"""Seconds of a call. VGGT takes minutes for ten views on six processors, and work that is slow is not to be lost."""
 _EVERY = 1.0
 """Seconds between two looks at the calls that go on: they cost nothing then, as a timer for each would."""
 
