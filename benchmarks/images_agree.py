@@ -14,7 +14,7 @@ Then, for each path, how far matches lie from each other's epipolar lines (Samps
 stood at the moment of each row of the image (`--readout`, seconds; 0 reads an image at once). One rotation between
 camera and body, the same for all frames, is fitted for each path: paths of other programs may take another principal
 point. A row a path: root mean square of the errors, none counted as more than `MOST` pixels; the median over all pairs
-of the median error of each; ATE to the other path, SE(3) and Sim(3), cm. Then rows for paths a tenth and more of the
+of the median error of each; ATE to the other path after Sim(3), cm. Then rows for paths a tenth and more of the
 way from it to `--towards`, aligned to that one: if the errors grow, the images do not want to go there.
 """
 
@@ -67,9 +67,9 @@ class FramePath:
         """Of poses as they are."""
         return cls(path.positions, Rotation.from_matrix(path.poses[:, :3, :3]), path.timestamps)
 
-    def aligned(self, to: FramePath, with_scale: bool) -> FramePath:
+    def aligned(self, to: FramePath) -> FramePath:
         """The same in the world of the other path."""
-        found = umeyama(self.centres, to.centres, with_scale=with_scale)
+        found = umeyama(self.centres, to.centres, with_scale=True)
         return FramePath(found.points(self.centres), Rotation.from_matrix(found.rotation) * self.rotations, self.times)
 
     def towards(self, to: FramePath, share: float) -> FramePath:
@@ -77,9 +77,9 @@ class FramePath:
         turns = Rotation.from_rotvec(share * (self.rotations.inv() * to.rotations).as_rotvec())
         return FramePath((1 - share) * self.centres + share * to.centres, self.rotations * turns, self.times)
 
-    def distance(self, to: FramePath, with_scale: bool) -> float:
-        """ATE, cm."""
-        apart = self.aligned(to, with_scale).centres - to.centres
+    def distance(self, to: FramePath) -> float:
+        """ATE after Sim(3), cm."""
+        apart = self.aligned(to).centres - to.centres
         return 100 * float(np.sqrt(np.mean(np.sum(apart**2, 1))))
 
     def turned(self, turn: np.ndarray) -> FramePath:
@@ -103,12 +103,12 @@ def main() -> None:
     other, *paths = _same_moments([options.towards, *options.paths])
     matches = _matches(options.clip, sequence.camera)
     print(f"{len(np.unique(matches.pair))} pairs of frames, {len(matches.pair)} matches\n")
-    print("| path | rms, px | median, px | ATE SE(3), cm | ATE Sim(3), cm |\n" + "|---" * 5 + "|")
+    print("| path | rms, px | median, px | ATE Sim(3), cm |\n" + "|---" * 4 + "|")
     _print_row(str(options.towards), other, other, matches, sequence.camera, options.readout)
     for name, path in zip(options.paths, paths, strict=True):
-        _print_row(str(name), path.aligned(other, with_scale=True), other, matches, sequence.camera, options.readout)
+        _print_row(str(name), path.aligned(other), other, matches, sequence.camera, options.readout)
         for share in SHARES:
-            between = path.aligned(other, with_scale=True).towards(other, share)
+            between = path.aligned(other).towards(other, share)
             words = f"... {100 * share:.0f} % of the way"
             _print_row(words, between, other, matches, sequence.camera, options.readout)
 
@@ -121,8 +121,8 @@ def _print_row(name: str, path: FramePath, other: FramePath, matches: Matches, c
     best = minimize(mean, np.zeros(3), method="Nelder-Mead", options={"initial_simplex": corners, "xatol": 1e-4})
     errors = _errors(path.turned(best.x), matches, fx, height, readout)
     medians = [np.median(errors[matches.pair == pair]) for pair in np.unique(matches.pair)]
-    ate = [path.distance(other, with_scale) for with_scale in (False, True)]
-    print(f"| {name} | {np.sqrt(best.fun):.3f} | {np.median(medians):.3f} | {ate[0]:.2f} | {ate[1]:.2f} |", flush=True)
+    cells = f"{np.sqrt(best.fun):.3f} | {np.median(medians):.3f} | {path.distance(other):.2f}"
+    print(f"| {name} | {cells} |", flush=True)
 
 
 def _errors(path: FramePath, matches: Matches, focal: float, height: float, readout: float) -> np.ndarray:
