@@ -20,9 +20,9 @@ first pose, as in `vggtgeo bench`. With `--rgb-only` lengths are taken by the sc
     python benchmarks/honest.py office room ../shared/data/icl-office --drawn 10
 
 What is stated of a frame counts what no run can see: the depth camera's constant factor, the calibration, the moment of
-an image. Rendered clips have none of these errors, and are far better than stated. Here each of ten runs of a clip has
-them, drawn with the standard deviations that are stated: depth times a factor, a focal length that is off, and the
-truth taken at moments beside those of the images. A row a clip: the NEES per number, its mean over the runs with the
+an image, the middle of the lens. Rendered clips have none of these errors, and are far better than stated. Here each of
+ten runs of a clip has them, drawn with the standard deviations that are stated: depth times a factor, a focal length
+that is off, all cameras turned by one angle, and the truth taken at moments beside those of the images. A row a clip: the NEES per number, its mean over the runs with the
 standard error of that mean, and the share of poses within three standard deviations.
 """
 
@@ -44,7 +44,7 @@ from vggtgeo.evaluation.consistency import pose_consistency
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, with_depths
 from vggtgeo.slam.evidence import tangent
-from vggtgeo.slam.pose_uncertainty import CALIBRATION, DEPTH_SCALE, MOMENT
+from vggtgeo.slam.pose_uncertainty import CALIBRATION, CENTRE, DEPTH_SCALE, MOMENT
 from vggtgeo.slam.state import Slam
 
 HEADER = (
@@ -172,7 +172,9 @@ def _drawn_row(name: str, source: Sequence, runs: int) -> str:
 
 
 def _with_unseen_errors(recording: Recording, seed: int) -> Recording:
-    """The recording with one depth factor, one focal length, and a moment for each image, drawn as they are stated."""
+    """The recording with one depth factor, one focal length, one turn of all cameras, as a principal point makes it that
+    is not where it is said to be, and a moment for each image, drawn as they are stated.
+    """
     rng = np.random.default_rng(seed)
     longer, wider = np.exp(rng.normal(0.0, (DEPTH_SCALE, CALIBRATION)))
     fx, fy, cx, cy = recording.camera.intrinsics
@@ -183,6 +185,8 @@ def _with_unseen_errors(recording: Recording, seed: int) -> Recording:
     centres = [np.interp(inside, times, column) for column in recording.truth.positions.T]
     poses[:, :3, :3] = Slerp(times, Rotation.from_matrix(recording.truth.poses[:, :3, :3]))(inside).as_matrix()
     poses[:, :3, 3] = np.stack(centres, 1)
+    aside = rng.normal(0.0, CENTRE, 2) * (recording.camera.height / fy, recording.camera.width / fx)
+    poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec([*aside, 0.0]).as_matrix()
     changed = with_depths(recording, lambda depth, row: longer * depth)
     return replace(changed, camera=camera, truth=vg.Trajectory(times, poses))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,7 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     """
     monkeypatch.setattr(pose_uncertainty, "DEPTH_SCALE", 0.0)  # the renderer's depth has no factor of its own,
     monkeypatch.setattr(pose_uncertainty, "CALIBRATION", 0.0)  # its camera is the one that is given,
+    monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.0)  # with its middle in that of the images,
     monkeypatch.setattr(pose_uncertainty, "MOMENT", 0.0)  # and its images are of one moment
     result = vg.reconstruct(vg.simulate("room", 40, size=(320, 240), rate=6.0))
     stated = result.uncertainty
@@ -108,6 +110,20 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     angles = Rotation.from_matrix(true[:, :3, :3]).magnitude()
     np.testing.assert_allclose(np.sqrt(calibrated.rotation**2 - stated.rotation**2), 0.01 * angles, atol=1e-4)
     monkeypatch.setattr(pose_uncertainty, "CALIBRATION", 0.0)
+    # A principal point that nobody has measured turns all cameras alike, and with the first one the whole path.
+    monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.01)
+    nominal, focal = result.uncertainty, result.record.slam.intrinsics[0]
+    assert nominal is not None
+    turn, distance = 0.01 * 320 / focal, np.linalg.norm(found[:, :3, 3], axis=1)
+    np.testing.assert_allclose(np.sqrt(nominal.translation**2 - stated.translation**2), turn * distance, atol=1e-4)
+    np.testing.assert_allclose(
+        np.sqrt(nominal.rotation**2 - stated.rotation**2), turn * 2 * np.sin(angles / 2), atol=1e-4
+    )
+    moved = replace(result.record.slam, intrinsics=result.record.slam.intrinsics + [0.0, 0.0, 3.0, 0.0])
+    measured = pose_uncertainty.frame_uncertainty(moved)
+    assert measured is not None
+    np.testing.assert_allclose(measured.translation, stated.translation)
+    monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.0)
     summary = result.save(tmp_path / "run")
     again = vg.Result.load(tmp_path / "run").uncertainty
     assert again is not None
