@@ -22,8 +22,9 @@ first pose, as in `vggtgeo bench`. With `--rgb-only` lengths are taken by the sc
 What is stated of a frame counts what no run can see: the depth camera's constant factor, the calibration, the moment of
 an image, the middle of the lens. Rendered clips have none of these errors, and are far better than stated. Here each of
 ten runs of a clip has them, drawn with the standard deviations that are stated: depth times a factor, a focal length
-that is off, all cameras turned by one angle, and the truth taken at moments beside those of the images. A row a clip: the NEES per number, its mean over the runs with the
-standard error of that mean, and the share of poses within three standard deviations.
+that is off, all cameras turned by one angle, and the truth taken at moments beside those of the images. A row a clip:
+the NEES per number, its mean over the runs with the standard error of that mean, and the share of poses within three
+standard deviations.
 """
 
 from __future__ import annotations
@@ -172,8 +173,8 @@ def _drawn_row(name: str, source: Sequence, runs: int) -> str:
 
 
 def _with_unseen_errors(recording: Recording, seed: int) -> Recording:
-    """The recording with one depth factor, one focal length, one turn of all cameras, as a principal point makes it that
-    is not where it is said to be, and a moment for each image, drawn as they are stated.
+    """The recording with one depth factor, one focal length, one turn of all cameras (as a principal point makes it
+    that is not where it is said to be), and a moment for each image, drawn as they are stated.
     """
     rng = np.random.default_rng(seed)
     longer, wider = np.exp(rng.normal(0.0, (DEPTH_SCALE, CALIBRATION)))
