@@ -167,7 +167,7 @@ class AbstractTerm(eqx.Module):
             return jnp.where(mask, leaf, 1.0)
 
         kept = self.holding(jax.tree.map(safe, self.data()))
-        return kept.reweighted(jnp.where(self.weights >= 0, self.weight, jnp.nan))
+        return kept.reweighted(jnp.where(present, self.weight, jnp.where(self.weights == 0, 0.0, jnp.nan)))
 
 
 def squared_norm(residual: Float[Array, "m *b"] | tuple[Array, ...]) -> Float[Array, "*b"]:
