@@ -40,6 +40,18 @@ def packed() -> Packed:
     return SCENE.pack(terms=own_terms())
 
 
+def test_absent_weights_have_no_derivative(packed: Packed) -> None:
+    """What a term is prepared to has a derivative by the weights that are there, and none by those of 0.
+
+    Oracle: which weights are 0. Two of them are made so here.
+    """
+    term = packed[0].points
+    weight = term.weight.at[0, :2].set(0.0)
+    derivative = jax.grad(lambda given: jnp.sum(term.reweighted(given).prepared().weight))(weight)
+    np.testing.assert_array_equal(derivative, weight > 0)
+    assert float(weight.max()) > 0
+
+
 @pytest.mark.long
 def test_padding_changes_neither_energy_nor_gradient(packed) -> None:
     # Proves that room for more keyframes, edges, landmarks and observations says nothing, for terms on edges, poses
