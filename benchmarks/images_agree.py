@@ -6,16 +6,18 @@ r"""With which of several paths through one clip do its images agree best? Epipo
     .venv/bin/vggtgeo run runs/redkitchen-lens -o runs/rgb-with-lens --dense none --rgb-only
     .venv/bin/python benchmarks/images_agree.py runs/redkitchen-lens --readout 0.028 \
         --towards ../shared/data/redkitchen/groundtruth-colour.txt \
-        ../shared/data/redkitchen/reference-colmap.txt runs/with-lens runs/rgb-with-lens
+        ../shared/data/redkitchen/reference-colmap.txt runs/redkitchen peer.txt runs/with-lens runs/rgb-with-lens
 
-(the lens is COLMAP's, `../shared/data/README.md`). SIFT of every fifth frame is matched between frames 10, 20 and 40
-apart, and a fundamental matrix of its own says which matches of a pair are right, so that no path has a part in it.
-Then, for each path, how far matches lie from each other's epipolar lines (Sampson's distance, pixels), where the camera
-stood at the moment of each row of the image (`--readout`, seconds; 0 reads an image at once). One rotation between
-camera and body, the same for all frames, is fitted for each path: paths of other programs may take another principal
-point. A row a path: root mean square of the errors, none counted as more than `MOST` pixels; the median over all pairs
-of the median error of each; ATE to the other path after Sim(3), cm. Then rows for paths a tenth and more of the
-way from it to `--towards`, aligned to that one: if the errors grow, the images do not want to go there.
+(the lens is COLMAP's, `../shared/data/README.md`; `runs/redkitchen` is the run of `two_truths.py`, `peer.txt` what
+`../shared/bench/simple_odometry.py` writes; README's last column is the same with `--towards` the reference). SIFT of
+every fifth frame is matched between frames 10, 20 and 40 apart, and a fundamental matrix of its own says which matches
+of a pair are right, so that no path has a part in it. Then, for each path, how far matches lie from each other's
+epipolar lines (Sampson's distance, pixels), where the camera stood at the moment of each row of the image (`--readout`,
+seconds; 0 reads an image at once). One rotation between camera and body, the same for all frames, is fitted for each
+path: paths of other programs may take another principal point. A row a path: root mean square of the errors, none
+counted as more than `MOST` pixels; the median over all pairs of the median error of each; ATE to the other path after
+Sim(3), cm. Then rows for paths a tenth and more of the way from it to `--towards`, aligned to that one: if the errors
+grow, the images do not want to go there.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.evaluation.association import associate
 from vggtgeo.geometry.camera import Camera
@@ -101,7 +103,7 @@ def main() -> None:
     options = _options()
     sequence = open_sequence(options.clip)
     other, *paths = _same_moments([options.towards, *options.paths])
-    matches = _matches(options.clip, sequence.camera)
+    matches = _matches(sequence)
     print(f"{len(np.unique(matches.pair))} pairs of frames, {len(matches.pair)} matches\n")
     print("| path | rms, px | median, px | ATE Sim(3), cm |\n" + "|---" * 4 + "|")
     _print_row(str(options.towards), other, other, matches, sequence.camera, options.readout)
@@ -142,11 +144,11 @@ def _errors(path: FramePath, matches: Matches, focal: float, height: float, read
     return focal * np.abs(np.sum(after * line, 1)) / np.maximum(size, 1e-12)
 
 
-def _matches(clip: Path, camera: Camera) -> Matches:
+def _matches(sequence: Sequence) -> Matches:
     """Matches of the pairs of frames, those of a fundamental matrix of the pair's own."""
-    sift, matcher = cv2.SIFT.create(FEATURES), cv2.BFMatcher()
+    camera, sift, matcher = sequence.camera, cv2.SIFT.create(FEATURES), cv2.BFMatcher()
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    for number, frame in enumerate(open_sequence(clip).frames(stride=EVERY)):
+    for number, frame in enumerate(sequence.frames(stride=EVERY)):
         points, descriptors = sift.detectAndCompute(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), None)
         if len(points) >= LEAST:
             pixels = camera.undistorted(np.array([point.pt for point in points]))
@@ -166,7 +168,7 @@ def _matches(clip: Path, camera: Camera) -> Matches:
             plane = (both - [cx, cy]) / [fx, fy]
             rows.append((np.full(len(both), number), np.tile([first, second], (len(both), 1)), plane))
     if not rows:
-        raise SystemExit(f"{clip}: no two frames {GAPS} apart share {LEAST} matches; nothing can be said")
+        raise SystemExit(f"{sequence.name}: no two frames {GAPS} apart share {LEAST} matches; nothing can be said")
     return Matches(*(np.concatenate(part) for part in zip(*rows, strict=True)))
 
 
