@@ -1,6 +1,10 @@
 """The session of all networks: what it refuses, what it computes, where it leaves results."""
 
+import os
+import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -217,6 +221,20 @@ def test_a_loop_without_end_is_ended_and_told(
     with pytest.raises(NetworkRunError, match=r"endless\.onnx` gave no answer within .* s and was ended: a loop"):
         session.run({"image": np.zeros((1, 3, 28, 42))})
     assert "endless.onnx` has not answered for" in caplog.text
+    other = open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
+    assert other.run({"image": np.zeros((1, 3, 48, 64))})["pred_lines"].shape == (1, 3, 4)
+
+
+def test_ctrl_c_ends_a_network_while_it_computes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that Ctrl-C does not wait for an answer, and that others go on answering. Oracle: a file whose loop has no
+    # end.
+    monkeypatch.setattr(patience, "LONGEST", 20.0)
+    session = open_session(tiny.endless(tmp_path / "endless.onnx"), contracts.LETR)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        session.run({"image": np.zeros((1, 3, 28, 42))})
+    assert time.monotonic() - began < patience.LONGEST / 2
     other = open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
     assert other.run({"image": np.zeros((1, 3, 48, 64))})["pred_lines"].shape == (1, 3, 4)
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import onnxruntime
@@ -36,6 +39,19 @@ class Call:
         """How long it goes on."""
         return time.monotonic() - self.began
 
+    def run(self, work: Callable[[], None]) -> None:
+        """Do the call's `work`. In the main thread Ctrl-C ends it at once: Python hears of a signal there alone, and
+        not while compiled code runs there, so that the work is done in another one.
+        """
+        if threading.current_thread() is not threading.main_thread():
+            work()
+            return
+        try:
+            _beside().submit(work).result()
+        except BaseException:  # whatever a signal raises
+            self.options.terminate = True  # between two nodes of the graph; nobody waits for that
+            raise
+
 
 _calls: set[Call] = set()
 _lock = threading.Lock()
@@ -60,6 +76,16 @@ def watched(path: Path) -> Iterator[Call]:
             _calls.discard(call)
 
 
+@cache
+def _beside() -> ThreadPoolExecutor:
+    """The one thread of the calls of the main thread: CUDA keeps memory for each thread that calls."""
+    return ThreadPoolExecutor(1, thread_name_prefix="network")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_beside.cache_clear)  # a fork leaves the thread behind
+
+
 def _watch() -> None:
     while True:
         time.sleep(_EVERY)
@@ -72,12 +98,7 @@ def _watch() -> None:
 def _look_at(call: Call) -> None:
     if call.seconds > TOLD and not call.told:
         call.told = True
-        _log.warning(
-            "`%s` has not answered for %.0f s; waiting up to %.0f s, Ctrl-C is seen after that",
-            call.path,
-            TOLD,
-            LONGEST,
-        )
+        _log.warning("`%s` has not answered for %.0f s; waiting up to %.0f s", call.path, TOLD, LONGEST)
     if call.seconds > LONGEST:
         call.ended = True
         call.options.terminate = True

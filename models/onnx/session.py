@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +157,7 @@ class Session:
             binding.bind_output(name, self.provider, 0)
         with watched(self.path) as call:
             try:
-                self.session.run_with_iobinding(binding, call.options)
+                call.run(partial(self.session.run_with_iobinding, binding, call.options))
             except _RUNTIME_ERRORS as error:
                 raise NetworkRunError(self._why_failed(call, error)) from None
         self.tally.calls += 1
