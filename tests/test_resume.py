@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -18,6 +19,7 @@ from vggtgeo.models.onnx.bounds import Refusals
 import vggtgeo.results.reconstruction as reconstruction
 from vggtgeo.cli.main import make_app
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, Notice, RunSoFar, frames_kept
 from vggtgeo.results.reconstruction import reconstruct
@@ -46,6 +48,15 @@ class KilledAfter(Callback):
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         if frame.index == self.frame:
             raise Killed
+
+
+class SlowerDepth(SequenceView):
+    """Each depth image comes with two pictures."""
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        depth = [frame.depth for frame in self.source.frames()]
+        for frame in self.source.frames(start, end, stride):
+            yield replace(frame, depth=depth[frame.index // 2 * 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +112,18 @@ def test_a_resumed_run_ends_as_an_undisturbed_one(
     assert plain(again) == plain(undisturbed)
     assert len(again.evidence) == FRAMES
     assert len(again.result.record.windows) == len(undisturbed.result.record.windows) > 1
+
+
+@pytest.mark.long
+def test_depth_that_comes_again_after_the_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Depth at half the rate of the pictures is not used twice where a run ended in between; oracle: the run that
+    nobody disturbs.
+    """
+    slower = SlowerDepth(sequence(), sequence().camera, has_depth=True)
+    undisturbed = run(monkeypatch, frames=slower)
+    again = run(monkeypatch, killed(monkeypatch, tmp_path / "kept", 7, frames=slower), frames=slower)
+    for one, other in ((undisturbed.result.record, again.result.record), (undisturbed.evidence, again.evidence)):
+        assert list(differences(one, other)) == []
 
 
 @pytest.mark.long

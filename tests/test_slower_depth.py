@@ -40,6 +40,9 @@ def test_depth_of_another_picture_is_not_used() -> None:
     frames.append(Frame(7, 0.7, frames[0].image, almost, "7"))
     own = [frame.depth is not None for frame in with_own_depth(frames)]
     assert own == [True, False, True, True, False, False, True, True]
+    for begun in range(1, len(frames)):
+        rest = with_own_depth(frames[begun:], frames[max(begun - 2, 0) : begun])
+        assert [frame.depth is not None for frame in rest] == own[begun:], "a run that goes on there"
     recorder = EvidenceRecorder(Camera((150.0, 150.0, 79.5, 59.5), 160, 120))
     for frame in frames[:7]:
         recorder.add(frame)

@@ -67,9 +67,10 @@ class TrackingLoop:
         self.hooks.each("on_begin", self.source.name, self.source.count(*self.selection))
         began = time.perf_counter()
         try:
-            frames = FramesInHand(self._frames(keeper))
+            before, rest = self._frames(keeper)
+            frames = FramesInHand(rest)
             roles, clock = self.perception.roles, self.hooks.clock
-            for slam in run_frames(frames, self.source.camera, roles, self.settings, clock, known):
+            for slam in run_frames(frames, self.source.camera, roles, self.settings, clock, known, before):
                 frame = read_only(frames.take(slam.frames[-1]))
                 self.hooks.each("on_frame", slam, frame)
                 if keeper is not None:
@@ -91,18 +92,26 @@ class TrackingLoop:
         earlier = 0.0 if self.before is None else self.before.tracking
         return Tracked(slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began))
 
-    def _frames(self, keeper: Keeper | None) -> Iterator[Frame]:
-        """The frames of the selection, or what is left of it after the last that was tracked, which is looked at."""
+    def _frames(self, keeper: Keeper | None) -> tuple[list[Frame], Iterator[Frame]]:
+        """The last two frames that were tracked, if any, of which one is looked at, and what is left of the
+        selection.
+        """
         start, end, stride = self.selection
         if self.before is None or keeper is None:
-            return iter(self.source.frames.frames(start, end, stride))
-        frames = iter(self.source.frames.frames(self.before.slam.frames[-1].frame, end, stride))
-        check_same_frame(keeper.asked, next(frames, None))
+            return [], iter(self.source.frames.frames(start, end, stride))
+        tracked = [record.frame for record in self.before.slam.frames[-2:]]
+        frames = iter(self.source.frames.frames(tracked[0], end, stride))
+        before = []
+        for frame in frames:
+            before += [frame] if frame.index in tracked else []
+            if frame.index >= tracked[-1]:
+                break
+        check_same_frame(keeper.asked, before[-1] if before else None)
         self.before.restore_refusals(self.perception.refusals)
         for stage, seconds in self.before.seconds.items():
             self.hooks.clock.seconds[stage] += seconds
         self.hooks.resume(self.before)
-        return frames
+        return before, frames
 
     def _so_far(self, slam: Slam, first: float) -> RunSoFar:
         now, before = time.perf_counter(), self.before

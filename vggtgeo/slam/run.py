@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -110,15 +111,19 @@ def run_frames(
     settings: SlamSettings,
     clock: Clock,
     known: Slam | None = None,
+    before: Collection[Frame] = (),
 ) -> Iterator[Slam]:
-    """The same over any iterable of frames of one camera, on from a state that is known."""
+    """The same over any iterable of frames of one camera, on from a state that is known.
+
+    before: the last frames of that state, of which the run that goes on asks whether the next depth image is new.
+    """
     slam = begin(camera, roles, settings) if known is None else known
     # Frames of a map whose camera's lens was found are as that lens drew them.
     seen_by = slam.lens or camera
     if roles.still_parts is not None:
         roles = replace(roles, still_parts=roles.still_parts.undistorted(seen_by))
     last = slam.frames[-1].timestamp if slam.frames else -math.inf
-    for frame, description in _described(frames, seen_by, roles, clock, last):
+    for frame, description in _described(frames, seen_by, roles, clock, last, before):
         slam = step(slam, frame, description, roles, settings, clock)
         yield slam
 
@@ -202,17 +207,18 @@ def in_order(frames: Iterable[Frame], camera: Camera, last: float = -math.inf) -
         yield frame
 
 
-def with_own_depth(frames: Iterable[Frame]) -> Iterator[Frame]:
+def with_own_depth(frames: Iterable[Frame], before: Collection[Frame] = ()) -> Iterator[Frame]:
     """The frames, without depth where it is to the last bit that of another picture, the one before.
 
     Recorders that store a depth image with each picture repeat it where the depth camera is slower: it is what was seen
     from where the camera was then. At half the rate of the pictures a walk of 6 cm a frame was 4.1 cm off, and called
-    good; with the depth of every second picture alone 1.3.
+    good; with the depth of every second picture alone 1.3. before: the frames before the first one.
     """
     last, repeated = None, False
-    for frame in frames:
+    for number, frame in enumerate(chain(before, frames)):
         repeated = last is not None and _same_depth(frame, last) and (repeated or not _same(frame.image, last.image))
-        yield replace(frame, depth=None) if repeated else frame
+        if number >= len(before):
+            yield replace(frame, depth=None) if repeated else frame
         last = frame
 
 
@@ -228,7 +234,7 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _described(
-    frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock, last: float
+    frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock, last: float, before: Collection[Frame]
 ) -> Iterator[tuple[Frame, Description]]:
     """Undistorted frames, prepared in a thread of their own while earlier ones are tracked; where every frame needs its
     key points, with them. last: time of the frame before the first.
@@ -259,7 +265,7 @@ def _described(
             frame = next(source, None)
         return None if frame is None else prepare(frame)
 
-    source = with_own_depth(in_order(frames, camera, last))
+    source = with_own_depth(in_order(frames, camera, last), before)
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames") as pool:
         queue: deque[Future[tuple[Frame, Description] | None]] = deque(
             pool.submit(read_and_prepare) for _ in range(AHEAD)

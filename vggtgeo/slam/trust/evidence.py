@@ -157,8 +157,9 @@ class EvidenceRecorder(Callback):
         """The next frame follows the last of these."""
         self._frames = list(so_far.frames)
         self._image, self._depth, self._next = so_far.image, so_far.depth, so_far.next
-        self._own_depth = so_far.depth
         self._ids, self._pixels = so_far.ids, so_far.pixels
+        # Depth that was another picture's was noted as none; where the last has none at its corners, none is asked.
+        self._own_depth = so_far.depth if so_far.frames and np.isfinite(so_far.frames[-1].depth).any() else None
 
     def add(self, frame: Frame) -> None:
         """Follow the corners into this frame, and begin new ones where there are none."""
