@@ -24,8 +24,8 @@ import vggtgeo as vg
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import dense_map
-from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state_file import load_state, save_state
 
 APART = 30.0

@@ -44,9 +44,9 @@ from vggtgeo.datasets import Sequence, open_sequence, without_depth
 from vggtgeo.evaluation.consistency import pose_consistency
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, with_depths
-from vggtgeo.slam.evidence import tangent
-from vggtgeo.slam.pose_uncertainty import CALIBRATION, CENTRE, DEPTH_SCALE, MOMENT
+from vggtgeo.slam.global_map.pose_uncertainty import CALIBRATION, CENTRE, DEPTH_SCALE, MOMENT
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.evidence import tangent
 
 HEADER = (
     "| clip | frames | within 3 sigma: translation | rotation | median error, mm | stated | median error, deg | stated "

@@ -29,8 +29,8 @@ from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.results.reconstruction import reconstruct
-from vggtgeo.slam.setting_groups import LineSettings
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.groups import LineSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 
 DRAWN = 4
 """Frames of which a picture is made, spread over the sequence."""

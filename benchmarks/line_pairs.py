@@ -4,9 +4,9 @@
 
 Every n-th frame is a keyframe at its true pose, and the frames 1, 3 and 5 after it are placed from it, from where a
 constant velocity leads. Printed as Markdown: the share of poses within 5 cm and 2 degrees of the truth; the median and
-the 90th percentile of the distance, cm; and how many poses by lines alone are believed (`vggtgeo/slam/evidence.py`), of
-those that are right and of those that are more than 15 cm or 5 degrees off. For the latter, segments are also started
-0.7 m and 14 degrees away. `few`: pairs of fewer than 100 matches.
+the 90th percentile of the distance, cm; and how many poses by lines alone are believed
+(`vggtgeo/slam/tracking/evidence.py`), of those that are right and of those that are more than 15 cm or 5 degrees off.
+For the latter, segments are also started 0.7 m and 14 degrees away. `few`: pairs of fewer than 100 matches.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from vggtgeo.models.roles import Features, LineFeatures
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.description import Description
-from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
-from vggtgeo.slam.rgbd_view import RgbdView
-from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.tracking import Expectation, Sight, Track, track
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
+from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.tracking.rgbd_view import RgbdView
+from vggtgeo.slam.tracking.track import Expectation, Sight, Track, track
 
 GAPS, FEW = (1, 3, 5), 100
 NEAR, FAR = (0.05, np.deg2rad(2.0)), (0.15, np.deg2rad(5.0))

@@ -36,8 +36,8 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.run import finish, frame_trajectory, run
-from vggtgeo.slam.setting_groups import LineSettings
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.groups import LineSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
 VARIANTS = {

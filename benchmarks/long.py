@@ -22,11 +22,11 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import warm_up
+from vggtgeo.slam.window.sliding_window import warm_up
 
 MEGABYTE = 2**20
 HEADER = "| frames | keyframes | pairs | ms a frame | largest ms | memory MB | MB a new keyframe |\n" + "|---" * 7 + "|"

@@ -33,7 +33,7 @@ from vggtgeo.models.exporters.recipes import RECIPES
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.providers import CUDA_OPTIONS, NAMES, check_started, choose_provider, load_cuda_libraries
 
-from vggtgeo.slam.presets import NEEDED
+from vggtgeo.slam.settings.presets import NEEDED
 
 CALLS = 3
 FRONT_END_FRAMES = 20
@@ -218,8 +218,8 @@ def front_end(folder: Path, frames: int, provider: str) -> dict:
     from vggtgeo.models.roles import PoseQuery
 
     from vggtgeo.simulation.sequence import simulate
-    from vggtgeo.slam.presets import perception
-    from vggtgeo.slam.settings import Roles
+    from vggtgeo.slam.settings.presets import perception
+    from vggtgeo.slam.settings.slam_settings import Roles
 
     walk = list(simulate("room", frames + 1, 0, (640, 480), rate=10.0).frames())
     camera, nothing = np.array([532.5, 532.5, 319.5, 239.5]), (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))

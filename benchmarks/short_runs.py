@@ -14,7 +14,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.run import default_roles, run_frames
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
 SETTINGS = SlamSettings()

@@ -29,7 +29,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.mapping.tracks import Tracks
 from vggtgeo.results.scene import Scene
 from vggtgeo.simulation.rolling_rows import camera_velocities
-from vggtgeo.slam.rolling_shutter import image_shift
+from vggtgeo.slam.camera.rolling_shutter import image_shift
 
 SOFT = 2.0
 """Pixels: where COLMAP's loss begins to doubt a match."""

@@ -26,8 +26,8 @@ import vggtgeo as vg
 from vggtgeo.datasets import without_depth
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.slam.presets import perception
 from vggtgeo.slam.run import default_roles
+from vggtgeo.slam.settings.presets import perception
 
 MIXTURES: dict[str, dict[str, str]] = {
     "SIFT, LSD": {},

@@ -21,7 +21,7 @@ from vggtgeo.bundle.problem_file import load_problem
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.results.source import opened
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings.slam_settings import SlamSettings
 
 PICTURE = bad.picture(1)
 WIDE = (PICTURE.astype(np.uint16) << 8) + 128

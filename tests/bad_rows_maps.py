@@ -16,11 +16,11 @@ from bad_row import Row, rows
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
 
-from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_images import KeyframeImages
-from vggtgeo.slam.known_map import MAP, save_map
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
+from vggtgeo.slam.sparse_map.known_map import MAP, save_map
 from vggtgeo.slam.state import Slam
 
 WIDTH, HEIGHT = bad.WIDTH, bad.HEIGHT

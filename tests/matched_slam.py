@@ -10,8 +10,8 @@ from test_trust_sensor_drift import K
 from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.covisibility import without_matches
-from vggtgeo.slam.keyframe import Slots
+from vggtgeo.slam.sparse_map.covisibility import without_matches
+from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.state import FramePose, Slam
 
 GUESSED = np.array([0.3 * K[0], 0.3 * K[1], 10.0, 10.0])

@@ -9,9 +9,9 @@ import pytest
 from test_keyframe_depth import SIZE, keyframe
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.carried_poses import carried_poses
-from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.tracking.carried_poses import carried_poses
 
 KEYFRAMES = (0, 4, 8)
 

@@ -15,9 +15,9 @@ from vggtgeo.models.roles import Features, LineFeatures, Segments
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.depth_alignment import FARTHEST, LEAST_COSINE, Surface, align, align_pairs
-from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_images import KeyframeImages
+from vggtgeo.slam.global_map.depth_alignment import FARTHEST, LEAST_COSINE, Surface, align, align_pairs
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 
 INTRINSICS = np.array([260.0, 255.0, 159.5, 119.5])
 SIZE = (240, 320)

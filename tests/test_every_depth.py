@@ -22,7 +22,7 @@ from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.frame_depth import rendered_depth
 from vggtgeo.results.every_depth import every_depth
 from vggtgeo.slam.run import default_roles
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
 
 CAMERA = np.array([200.0, 200.0, 79.5, 59.5])

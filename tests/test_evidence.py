@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.tracking.evidence import Evidence
 
 
 @pytest.mark.parametrize(

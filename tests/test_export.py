@@ -28,8 +28,8 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.mapping.tracks import make_tracks
 from vggtgeo.results.scene import Scene, write_scene
-from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 INTRINSICS = np.array([200.0, 210.0, 79.5, 59.5])
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import lie, rigid
-from vggtgeo.slam.factors import FREE_LENGTH, MeasuredRelativePose
+from vggtgeo.slam.sparse_map.factors import FREE_LENGTH, MeasuredRelativePose
 
 
 def _tie(seed: int) -> MeasuredRelativePose:

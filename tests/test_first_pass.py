@@ -20,15 +20,15 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.checkpoints import Checkpoints
-from vggtgeo.slam import first_pass
+from vggtgeo.slam.camera import first_pass
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pipeline import begin
-from vggtgeo.slam.presets import Perception
 from vggtgeo.slam.run import run_frames
+from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.window import _camera_sigma
+from vggtgeo.slam.window.pending_window import settled
+from vggtgeo.slam.window.sliding_window import _camera_sigma
 
 GUESS = Camera.guess(320, 240)
 LENS = Camera((280.0, 280.0, 158.0, 121.0), 320, 240, (-0.1, 0.01, 0.0, 0.0), known=False)

@@ -11,13 +11,13 @@ from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import GeometryResult, PoseGuess
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.carried_poses import carried_poses
-from vggtgeo.slam.evidence import Evidence
-from vggtgeo.slam.following import MOST_KEPT, Located
-from vggtgeo.slam.frame_poses import LEAST_POINTS, frame_poses
-from vggtgeo.slam.keyframe import Slots
-from vggtgeo.slam.rolling_shutter import frame_motions, image_shift
+from vggtgeo.slam.camera.rolling_shutter import frame_motions, image_shift
+from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.state import FramePose, Readout, SeenPoints, Slam
+from vggtgeo.slam.tracking.carried_poses import carried_poses
+from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.tracking.following import MOST_KEPT, Located
+from vggtgeo.slam.tracking.frame_poses import LEAST_POINTS, frame_poses
 
 POINTS = 60
 MOVED = np.array([0.05, -0.02, 0.03, 0.01, 0.02, -0.01])

@@ -10,13 +10,13 @@ from recorded_run import RecordedRun, recorded_run
 from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.frame_refinement import MOST, against_nearest, against_reference, squared_distance, with_view
-from vggtgeo.slam.fusion import AGREEMENT_GATE
-from vggtgeo.slam.rgbd_view import RgbdView
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.units import scaled_keyframe, scaled_record
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.units import scaled_keyframe, scaled_record
+from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.tracking.frame_refinement import MOST, against_nearest, against_reference, squared_distance, with_view
+from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
+from vggtgeo.slam.tracking.rgbd_view import RgbdView
 
 AWAY = np.array([0.006, -0.005, 0.004, 0.002, -0.003, 0.001])
 """Metres and radians."""

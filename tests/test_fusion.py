@@ -18,7 +18,7 @@ from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.fusion import SurfaceFusion, fused_mesh
 from vggtgeo.mapping.tsdf import View, blocks_of, joined
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 RADIUS, AWAY, VOXEL = 0.5, 2.0, 0.04
 INTRINSICS = np.array([200.0, 200.0, 59.5, 59.5])

@@ -21,12 +21,12 @@ from vggtgeo.bundle.solution import solve
 from vggtgeo.bundle.terms.relative_pose import RelativePose
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.small_window import SimulatedWindow, simulate_window
-from vggtgeo.slam.gauge import gauge_notes, with_one_gauge
-from vggtgeo.slam.setting_groups import WindowSettings
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings.groups import WindowSettings
+from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import make_room
-from vggtgeo.slam.window_prior import WindowPrior
+from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
+from vggtgeo.slam.window.sliding_window import make_room
+from vggtgeo.slam.window.window_prior import WindowPrior
 
 KEYFRAMES, POINTS = 7, 12
 SOLVE = eqx.filter_jit(solve)

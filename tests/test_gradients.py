@@ -15,7 +15,7 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
-from vggtgeo.slam.factors import MeasuredRelativePose, factor_terms
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose, factor_terms
 
 pytestmark = pytest.mark.long  # test_optimised.py, test_user_terms.py and test_two_ends.py hold one gradient each
 SCENE = make_scene(3, 5, 1, 2, noise=0.5, outliers=0.1, depth_error=0.05, seed=4)

@@ -18,7 +18,7 @@ import pytest
 import vggtgeo as vg
 from vggtgeo.io import kept_program
 from vggtgeo.io.kept_program import KeptProgram
-from vggtgeo.slam.window import solve_jit
+from vggtgeo.slam.window.sliding_window import solve_jit
 
 TRACED: list[str] = []
 

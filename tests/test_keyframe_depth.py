@@ -6,8 +6,8 @@ from scipy.ndimage import gaussian_filter
 from vggtgeo.models.roles import Features, LineFeatures, Segments
 
 from vggtgeo.mapping.keyframe_depth import fused_depths, optimised_depth
-from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_images import KeyframeImages
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 
 SIZE = (120, 160)
 INTRINSICS = np.array([160.0, 160.0, 79.5, 59.5])

@@ -17,7 +17,7 @@ from vggtgeo.datasets.seven_scenes import _TO_COLOUR
 from vggtgeo.datasets.tanks import inside_crop
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.results.source import opened
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings.slam_settings import SlamSettings
 
 
 def test_replica(tmp_path: Path) -> None:

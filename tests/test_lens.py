@@ -24,14 +24,14 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import SquarePinhole
-from vggtgeo.slam.global_adjustment import _taken_lens
-from vggtgeo.slam.known_map import as_map, entered
-from vggtgeo.slam.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
+from vggtgeo.slam.global_map.global_adjustment import _taken_lens
+from vggtgeo.slam.sparse_map.known_map import as_map, entered
 from vggtgeo.slam.state import SeenPoints, Slam
 from vggtgeo.slam.trust import judge as judging
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import FrameEvidence
+from vggtgeo.slam.window.pending_window import settled
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
 _solve = eqx.filter_jit(vg.solve)

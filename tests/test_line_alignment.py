@@ -13,14 +13,14 @@ from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, RelativeView, Segments
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.covisibility import Directed, match_keyframes
-from vggtgeo.slam.evidence import LARGEST_SIGMA, tangent, worst_sigma
-from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_images import KeyframeImages
-from vggtgeo.slam.line_alignment import END_SIGMA, align_lines
-from vggtgeo.slam.line_triangulation import with_segment_depths
-from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.settings_table import updated
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.settings.table import updated
+from vggtgeo.slam.sparse_map.covisibility import Directed, match_keyframes
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
+from vggtgeo.slam.tracking.evidence import LARGEST_SIGMA, tangent, worst_sigma
+from vggtgeo.slam.tracking.line_alignment import END_SIGMA, align_lines
+from vggtgeo.slam.window.line_triangulation import with_segment_depths
 
 INTRINSICS = np.array([400.0, 400.0, 239.5, 179.5])
 SIZE = (480, 360)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.slam.adjustment import _prior_trust
-from vggtgeo.slam.line_support import sample_shares, spread_samples, supported
-from vggtgeo.slam.setting_groups import DepthSettings, WeightSettings
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings.groups import DepthSettings, WeightSettings
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.window.adjustment import _prior_trust
+from vggtgeo.slam.window.line_support import sample_shares, spread_samples, supported
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
 # Along the optical axis' right: pixels (160 + 30 k, 120) for points (0.1 k * 3, 0, 3).

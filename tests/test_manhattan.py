@@ -12,10 +12,10 @@ from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import State
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.factors import MeasuredRotation, factor_terms
 from vggtgeo.slam.manhattan import constrain_rotation, mean_rotation
 from vggtgeo.slam.pipeline import begin
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.factors import MeasuredRotation, factor_terms
 
 INTRINSICS = np.array([266.0, 266.0, 159.5, 119.5])
 NOISE = 0.7

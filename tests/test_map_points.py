@@ -15,13 +15,13 @@ from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation import simulate
-from vggtgeo.slam.description import Description
-from vggtgeo.slam.evidence import tangent
-from vggtgeo.slam.fusion import with_systematic
-from vggtgeo.slam.keyframe import Keyframe, make_keyframe
-from vggtgeo.slam.map_points import Refined, refine_by_map
-from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.tracking import (
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
+from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.fusion import with_systematic
+from vggtgeo.slam.tracking.map_points import Refined, refine_by_map
+from vggtgeo.slam.tracking.track import (
     PIXEL_SIGMA,
     SEARCH_RADIUS,
     Expectation,

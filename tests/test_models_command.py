@@ -22,7 +22,7 @@ from vggtgeo.models.onnx.session import open_session
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.network_files import fetch_network, networks_folder
-from vggtgeo.slam.presets import perception
+from vggtgeo.slam.settings.presets import perception
 
 SMALL = NETWORKS["moge2-small"]
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.pending_window import LAG, begin_window, is_due, settled
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.window.pending_window import LAG, begin_window, is_due, settled
 
 CAMERA = np.array([100.0, 100.0, 50.0, 50.0])
 STATE = Slam(CAMERA, CAMERA, np.ones(4), True, window=(0, 1), notes=("before",))

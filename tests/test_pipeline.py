@@ -25,20 +25,20 @@ from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.summary import pieces
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.compile_ahead import compile_global, expected_keyframes
-from vggtgeo.slam.connected import piece_of
-from vggtgeo.slam.factors import FREE_LENGTH
-from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.global_adjustment import adjust_all
-from vggtgeo.slam.global_shape import padded_count, shape_for
-from vggtgeo.slam.loops import close_loops
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.global_map.compile_ahead import compile_global, expected_keyframes
+from vggtgeo.slam.global_map.global_adjustment import adjust_all
+from vggtgeo.slam.global_map.global_shape import padded_count, shape_for
+from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.setting_groups import RefinementSettings, WindowSettings
-from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.settings_table import updated
+from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.settings.table import updated
+from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.factors import FREE_LENGTH
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import adjust, solve_jit, window_problem
+from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.window.pending_window import settled
+from vggtgeo.slam.window.sliding_window import adjust, solve_jit, window_problem
 
 SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.

@@ -21,10 +21,10 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam import global_adjustment
-from vggtgeo.slam.global_adjustment import adjust_all, camera_of
-from vggtgeo.slam.lens import find_lens
-from vggtgeo.slam.pixel_aspect import FoundAspect, find_aspect
+from vggtgeo.slam.camera.lens import find_lens
+from vggtgeo.slam.camera.pixel_aspect import FoundAspect, find_aspect
+from vggtgeo.slam.global_map import global_adjustment
+from vggtgeo.slam.global_map.global_adjustment import adjust_all, camera_of
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
 _solve = eqx.filter_jit(vg.solve)

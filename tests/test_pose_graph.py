@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.loop_witnesses import witnessed
-from vggtgeo.slam.pose_graph import BELIEF, PoseGraph, solve_pose_graph
-from vggtgeo.slam.unit_graph import UnitRatio, solve_units
+from vggtgeo.slam.global_map.loop_witnesses import witnessed
+from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, solve_pose_graph
+from vggtgeo.slam.global_map.unit_graph import UnitRatio, solve_units
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 
 LAPS, KEYFRAMES = 2, 60
 """Each lap around a building; 0.5 m from keyframe to keyframe."""

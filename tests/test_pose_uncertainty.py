@@ -16,9 +16,9 @@ import vggtgeo as vg
 from vggtgeo.cli.progress import print_result
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.loop import simulate_loop
-from vggtgeo.slam import pose_uncertainty
-from vggtgeo.slam.evidence import tangent
-from vggtgeo.slam.pose_uncertainty import keyframe_sigma, sparse_worst
+from vggtgeo.slam.global_map import pose_uncertainty
+from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma, sparse_worst
+from vggtgeo.slam.tracking.evidence import tangent
 
 
 def test_keyframes_have_the_deviations_of_their_covariances() -> None:

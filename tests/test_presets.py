@@ -25,10 +25,10 @@ from vggtgeo.cli.models import FLAGS
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.simulation.sequence import SyntheticSequence, simulate
 from vggtgeo.simulation.tum_folder import write_tum_folder
-from vggtgeo.slam.presets import CHOICES, NEEDED, Perception, perception
 from vggtgeo.slam.run import frame_trajectory, run
-from vggtgeo.slam.setting_groups import RefinementSettings
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.groups import RefinementSettings
+from vggtgeo.slam.settings.presets import CHOICES, NEEDED, Perception, perception
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 
 RUN_AND_WRITE = "vggtgeo.cli.run_sequence"
 """The module from which the command takes `run_and_write`."""

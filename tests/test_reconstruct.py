@@ -18,7 +18,7 @@ from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.results.summary import OWN
 from vggtgeo.simulation.tum_folder import write_tum_folder
-from vggtgeo.slam.settings_table import changed
+from vggtgeo.slam.settings.table import changed
 
 pytestmark = pytest.mark.usefixtures("uncompiled")
 FRAMES = 5

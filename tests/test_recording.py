@@ -25,7 +25,7 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.results.files import write_depth, write_trajectories
-from vggtgeo.slam.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.folder import _log_depth
 

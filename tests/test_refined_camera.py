@@ -12,8 +12,8 @@ import pytest
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.calibration import Refinement, free_focal, try_camera
-from vggtgeo.slam.camera_of_pairs import CameraPair, _Points, camera_of_pairs
+from vggtgeo.slam.camera.calibration import Refinement, free_focal, try_camera
+from vggtgeo.slam.camera.camera_of_pairs import CameraPair, _Points, camera_of_pairs
 
 HELD = 1e-6
 """Relative standard deviation of a camera that is held, as in the pipeline."""

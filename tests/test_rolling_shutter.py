@@ -16,11 +16,9 @@ from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
-from vggtgeo.slam import calibration
-from vggtgeo.slam.calibration import keyframe_pairs
-from vggtgeo.slam.carried_poses import carried_poses
-from vggtgeo.slam.covisibility import Directed, directions
-from vggtgeo.slam.rolling_shutter import (
+from vggtgeo.slam.camera import calibration
+from vggtgeo.slam.camera.calibration import keyframe_pairs
+from vggtgeo.slam.camera.rolling_shutter import (
     _descend,
     _Search,
     camera_motions,
@@ -32,7 +30,9 @@ from vggtgeo.slam.rolling_shutter import (
     row_shifts,
     without_readout,
 )
+from vggtgeo.slam.sparse_map.covisibility import Directed, directions
 from vggtgeo.slam.state import Readout
+from vggtgeo.slam.tracking.carried_poses import carried_poses
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import EvidenceRecorder, FrameEvidence, common
 from vggtgeo.slam.trust.shutter import check_shutter, corners_at_once

@@ -26,7 +26,7 @@ from vggtgeo.results.files import write_depth
 from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import RESERVE, taken
 from vggtgeo.results.unfinished import check_finished
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="signals of another kind"),

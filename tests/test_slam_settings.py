@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import vggtgeo as vg
 from vggtgeo.cli.main import COMMANDS, load_command, make_app
 from vggtgeo.cli.pipeline_settings import pipeline_settings
-from vggtgeo.slam.settings_table import GROUPS, changed, names, parsed, tables_of, updated
+from vggtgeo.slam.settings.table import GROUPS, changed, names, parsed, tables_of, updated
 
 WRONG = {
     "tracking.least_inliers": (0, 2.5, True, "many"),

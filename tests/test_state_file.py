@@ -27,14 +27,14 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.record_file import DATA, HEADER, Layout
 from vggtgeo.io.records import by_name
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.evidence import Evidence
-from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRotation
-from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
+from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRotation
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.state import PendingWindow, Readout, SeenPoints, Slam, Waiting
 from vggtgeo.slam.state_file import STATE, load_state, save_state
-from vggtgeo.slam.window_prior import WindowPrior
+from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.window.pending_window import settled
+from vggtgeo.slam.window.window_prior import WindowPrior
 
 MIDDLE = 4
 """Frame of the recorded run whose state is saved."""

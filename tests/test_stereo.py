@@ -18,8 +18,8 @@ from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.plane_sweep import Photo, plane_homographies
 from vggtgeo.mapping.semi_global import EDGE, semi_global
 from vggtgeo.mapping.stereo import StereoSettings, stereo_depths
-from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_images import KeyframeImages
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 
 SIZE = (200, 150)
 

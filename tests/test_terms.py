@@ -36,7 +36,7 @@ from vggtgeo.bundle.objective import (
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.node import DenseTerm
 from vggtgeo.bundle.terms.relative_pose import quadratic
-from vggtgeo.slam.factors import (
+from vggtgeo.slam.sparse_map.factors import (
     MeasuredBaseline,
     MeasuredRelativePose,
     MeasuredRotation,

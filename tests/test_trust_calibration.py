@@ -12,7 +12,7 @@ import pytest
 from trust_checks import found_by_camera
 from witness import SIZE, K, Walk, walk
 
-from vggtgeo.slam.camera_of_pairs import CameraOpinion
+from vggtgeo.slam.camera.camera_of_pairs import CameraOpinion
 from vggtgeo.slam.trust.calibration import _blocks, camera_opinion, check_camera
 from vggtgeo.slam.trust.evidence import FrameEvidence
 

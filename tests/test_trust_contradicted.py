@@ -12,7 +12,7 @@ from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.trust.contradicted import FAR, NEAR, check_matches
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])

@@ -13,9 +13,9 @@ from test_keyframe_depth import SIZE, keyframe
 from vggtgeo.models.roles import PointMatches
 from witness import Walk
 
-from vggtgeo.slam.covisibility import Pair, without_matches
-from vggtgeo.slam.evidence import Evidence
+from vggtgeo.slam.sparse_map.covisibility import Pair, without_matches
 from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.islands import check_islands

@@ -13,7 +13,7 @@ from trust_checks import found_by_camera, found_by_depth, found_by_parts, found_
 from witness import walk, with_depth
 
 from vggtgeo.results.result import Result
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.trust import judge as judge_module
 from vggtgeo.slam.trust.depth_images import check_frozen, check_range
 from vggtgeo.slam.trust.estimate import Estimate

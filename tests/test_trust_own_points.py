@@ -13,9 +13,9 @@ from test_keyframe_depth import INTRINSICS, SIZE, keyframe
 from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.keyframe import Slots
+from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.state import FramePose, SeenPoints, Slam
+from vggtgeo.slam.tracking.frame_poses import frame_poses
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.own_points import IN_A_ROW, agreeing_landmarks, check_own_points

@@ -10,10 +10,10 @@ import pytest
 from test_keyframe_depth import SIZE, keyframe
 from vggtgeo.models.roles import Features, PointMatches
 
-from vggtgeo.slam.covisibility import Pair, without_matches
-from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.keyframe import Slots
-from vggtgeo.slam.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.sparse_map.covisibility import Pair, without_matches
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.state import FramePose, Slam
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.scale_hand_over import ALONE, check_hand_over, hand_over_sigma

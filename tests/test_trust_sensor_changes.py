@@ -10,7 +10,7 @@ from matched_slam import matched_slam
 from scipy.spatial.transform import Rotation
 from test_trust_sensor_drift import K
 
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.sensor_drift import (
     MOST_CHANGE,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.models import pinhole
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.rolling_shutter import camera_motions, image_shift
+from vggtgeo.slam.camera.rolling_shutter import camera_motions, image_shift
 from vggtgeo.slam.state import Readout
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.finding import Finding

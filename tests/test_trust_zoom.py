@@ -13,9 +13,9 @@ from test_trust_sensor_drift import KEYFRAMES, Curve, K, grows, still
 from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.covisibility import without_matches
-from vggtgeo.slam.keyframe import Slots
-from vggtgeo.slam.rolling_shutter import camera_motions, image_shift
+from vggtgeo.slam.camera.rolling_shutter import camera_motions, image_shift
+from vggtgeo.slam.sparse_map.covisibility import without_matches
+from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.state import FramePose, Readout, Slam
 from vggtgeo.slam.trust import zoom
 from vggtgeo.slam.trust.judge import judge

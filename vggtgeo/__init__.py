@@ -88,22 +88,22 @@ if TYPE_CHECKING:
     from vggtgeo.simulation import simulate as simulate
     from vggtgeo.simulation import simulate_window as simulate_window
     from vggtgeo.slam.callback import Callback as Callback
-    from vggtgeo.slam.known_map import load_map as load_map
-    from vggtgeo.slam.presets import perception as perception
     from vggtgeo.slam.run import finish as finish
     from vggtgeo.slam.run import frame_trajectory as frame_trajectory
     from vggtgeo.slam.run import run as run
-    from vggtgeo.slam.setting_groups import CameraSettings as CameraSettings
-    from vggtgeo.slam.setting_groups import DepthSettings as DepthSettings
-    from vggtgeo.slam.setting_groups import KeyframeSettings as KeyframeSettings
-    from vggtgeo.slam.setting_groups import LineSettings as LineSettings
-    from vggtgeo.slam.setting_groups import MatchingSettings as MatchingSettings
-    from vggtgeo.slam.setting_groups import RefinementSettings as RefinementSettings
-    from vggtgeo.slam.setting_groups import TrackingSettings as TrackingSettings
-    from vggtgeo.slam.setting_groups import WeightSettings as WeightSettings
-    from vggtgeo.slam.setting_groups import WindowSettings as WindowSettings
-    from vggtgeo.slam.settings import Roles as Roles
-    from vggtgeo.slam.settings import SlamSettings as SlamSettings
+    from vggtgeo.slam.settings.groups import CameraSettings as CameraSettings
+    from vggtgeo.slam.settings.groups import DepthSettings as DepthSettings
+    from vggtgeo.slam.settings.groups import KeyframeSettings as KeyframeSettings
+    from vggtgeo.slam.settings.groups import LineSettings as LineSettings
+    from vggtgeo.slam.settings.groups import MatchingSettings as MatchingSettings
+    from vggtgeo.slam.settings.groups import RefinementSettings as RefinementSettings
+    from vggtgeo.slam.settings.groups import TrackingSettings as TrackingSettings
+    from vggtgeo.slam.settings.groups import WeightSettings as WeightSettings
+    from vggtgeo.slam.settings.groups import WindowSettings as WindowSettings
+    from vggtgeo.slam.settings.presets import perception as perception
+    from vggtgeo.slam.settings.slam_settings import Roles as Roles
+    from vggtgeo.slam.settings.slam_settings import SlamSettings as SlamSettings
+    from vggtgeo.slam.sparse_map.known_map import load_map as load_map
     from vggtgeo.slam.trust.evidence import EvidenceRecorder as EvidenceRecorder
     from vggtgeo.slam.trust.finding import Verdict as Verdict
     from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
@@ -159,10 +159,10 @@ _HOME = {
     "simulation": ("SimulatedWindow", "simulate", "simulate_window"),
     "slam.callback": ("Callback",),
     "results.checkpoints": ("Checkpoints",),
-    "slam.known_map": ("load_map",),
-    "slam.presets": ("perception",),
+    "slam.sparse_map.known_map": ("load_map",),
+    "slam.settings.presets": ("perception",),
     "slam.run": ("finish", "frame_trajectory", "run"),
-    "slam.setting_groups": (
+    "slam.settings.groups": (
         "CameraSettings",
         "WeightSettings",
         "DepthSettings",
@@ -173,7 +173,7 @@ _HOME = {
         "TrackingSettings",
         "WindowSettings",
     ),
-    "slam.settings": ("Roles", "SlamSettings"),
+    "slam.settings.slam_settings": ("Roles", "SlamSettings"),
     "slam.trust.evidence": ("EvidenceRecorder",),
     "slam.trust.finding": ("Verdict",),
     "bundle.solution": ("Solution", "solve"),

@@ -27,9 +27,9 @@ from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, 
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.simulation import SimulatedOracle, simulate
 from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
-from vggtgeo.slam.presets import Perception, perception
 from vggtgeo.slam.run import default_roles
-from vggtgeo.slam.settings import Roles
+from vggtgeo.slam.settings.presets import Perception, perception
+from vggtgeo.slam.settings.slam_settings import Roles
 
 DATA_VARIABLE = "VGGTGEO_DATA"
 _LEVELS = ("", "*", "*/*")

@@ -16,8 +16,8 @@ from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.suite import SequenceTable, SettingTable, Suite
 from vggtgeo.datasets.opening import is_readable
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.slam.settings import SlamSettings
-from vggtgeo.slam.settings_table import Tables, changed, updated
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.settings.table import Tables, changed, updated
 
 
 @dataclass(frozen=True)

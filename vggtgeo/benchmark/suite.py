@@ -25,8 +25,8 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.simulation.degradations import DEGRADATIONS
 from vggtgeo.simulation.sequence import check_walk
-from vggtgeo.slam.settings import SlamSettings
-from vggtgeo.slam.settings_table import Tables, updated
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.settings.table import Tables, updated
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 _LONGEST_NAME = 100

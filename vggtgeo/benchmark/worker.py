@@ -25,8 +25,8 @@ from vggtgeo.io.warned import collected_warnings
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.settings import SlamSettings
-from vggtgeo.slam.settings_table import updated
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.settings.table import updated
 from vggtgeo.viewing.callback import RerunCallback
 from vggtgeo.viewing.target import open_target
 

@@ -31,7 +31,7 @@ def demo(
     from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.simulation import simulate
-    from vggtgeo.slam.settings import Roles
+    from vggtgeo.slam.settings.slam_settings import Roles
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vggtgeo.cli.settings_file import SettingsInUse
-from vggtgeo.slam.settings import SlamSettings
-from vggtgeo.slam.settings_table import Tables, parsed, updated
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.settings.table import Tables, parsed, updated
 
 Switches = Mapping[str, Tables]
 """What each switch of the command sets, by the name of its parameter."""

@@ -20,8 +20,8 @@ from vggtgeo.io.warned import collected_warnings
 
 if TYPE_CHECKING:
     from vggtgeo.datasets import Sequence
-    from vggtgeo.slam.presets import Perception
-    from vggtgeo.slam.settings import Roles
+    from vggtgeo.slam.settings.presets import Perception
+    from vggtgeo.slam.settings.slam_settings import Roles
 
 
 REFINE = {None: "auto", True: "always", False: "never"}
@@ -93,8 +93,8 @@ def run(
     if len(sequence):  # a camera has no end
         check_selection(sequence.name, len(sequence), start, end, stride)
     from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.slam.setting_groups import DepthSettings
-    from vggtgeo.slam.settings_table import Tables
+    from vggtgeo.slam.settings.groups import DepthSettings
+    from vggtgeo.slam.settings.table import Tables
 
     check_provider(provider)
     if save_depth and dense == "none":
@@ -111,8 +111,8 @@ def run(
         switches["localise_only"] = {"keyframes": {"localise_only": True}}
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     from vggtgeo.cli.run_sequence import Output, run_and_write
-    from vggtgeo.slam.known_map import load_map
     from vggtgeo.slam.run import default_roles
+    from vggtgeo.slam.sparse_map.known_map import load_map
 
     if save_map is not None:
         check_map_file(save_map)
@@ -181,7 +181,7 @@ def check_recording_file(target: str, output: Path) -> None:
 
 
 def _is_map(file: Path) -> bool:
-    from vggtgeo.slam.known_map import MAP
+    from vggtgeo.slam.sparse_map.known_map import MAP
 
     try:
         MAP.facts(file)
@@ -258,7 +258,7 @@ def make_perception(
     """The roles of a preset, some played by others; warns of networks whose weights are random, and of a GPU that none
     uses.
     """
-    from vggtgeo.slam.presets import perception
+    from vggtgeo.slam.settings.presets import perception
 
     perceived = perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
     if provider == "cuda" and not perceived.networks:

@@ -55,7 +55,7 @@ NoLinesOption = Annotated[
 NoConfidenceOption = Annotated[
     bool, typer.Option("--no-confidence/--use-confidence", help="All matches weigh the same: an ablation.")
 ]
-# Who plays a role, by the names of `vggtgeo.slam.presets.CHOICES`.
+# Who plays a role, by the names of `vggtgeo.slam.settings.presets.CHOICES`.
 PointsOption = Annotated[
     Literal["classical", "orb", "mast3r", "alike", "alike-tiny", "xfeat"] | None,
     typer.Option(help="Who finds and matches points, in place of the preset's choice; classical is SIFT."),

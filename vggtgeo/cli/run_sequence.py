@@ -29,9 +29,9 @@ from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, taken
 from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.presets import Perception
-from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.settings_table import changed, updated
+from vggtgeo.slam.settings.presets import Perception
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.settings.table import changed, updated
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
 from vggtgeo.viewing.target import STAND_IN, open_target

@@ -65,7 +65,7 @@ def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
 
 def _settings_by_group() -> dict[str, list[str]]:
     """The pipeline's settings."""
-    from vggtgeo.slam.settings_table import names  # slow: it brings JAX
+    from vggtgeo.slam.settings.table import names  # slow: it brings JAX
 
     settings: dict[str, list[str]] = {}
     for name in names():

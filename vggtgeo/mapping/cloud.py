@@ -12,7 +12,7 @@ from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe, read_at
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.threads import map_in_threads
 
 STEP = 3

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.slam.keyframe_images import CompressedImage, array_of
+from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 
 MANY = 200
 """Keyframes of a map from which on its depth maps are held compressed: at 640 x 480 one takes 3.7 MB, and 0.4 so, after

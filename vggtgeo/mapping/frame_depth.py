@@ -16,9 +16,9 @@ from vggtgeo.mapping.consistency import AGREE, PosedDepth, confirm
 from vggtgeo.mapping.dense import filled
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
-from vggtgeo.slam.connected import piece_of
-from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.frame_poses import frame_poses
 
 NEAREST = 4
 """Keyframes that a frame's depth is taken from."""

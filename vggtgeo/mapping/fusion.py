@@ -26,7 +26,7 @@ from vggtgeo.mapping.tsdf import (
     without_crumbs,
 )
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 
 

@@ -22,8 +22,8 @@ from scipy.ndimage import gaussian_filter
 from vggtgeo.geometry import rigid
 from vggtgeo.mapping.depth_map import MANY
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe, read_at
-from vggtgeo.slam.keyframe_images import CompressedImage, array_of
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
+from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 from vggtgeo.slam.threads import map_in_threads
 
 CELL = 24.0

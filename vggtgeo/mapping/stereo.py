@@ -22,7 +22,7 @@ from vggtgeo.mapping.semi_global import semi_global
 from vggtgeo.mapping.stereo_views import choose_views, known_points
 from vggtgeo.mapping.uncertainty import support
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 
 LEAST_POINTS = 8

@@ -8,7 +8,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 GOOD_ANGLE = np.radians(3.0)
 """Triangulation angle from which a neighbour counts in full: below it depth is uncertain."""

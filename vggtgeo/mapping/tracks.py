@@ -11,8 +11,8 @@ from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.keyframe import Keyframe, read_at
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 
 GATE = 4.0
 """Largest reprojection error of an observation, pixels: two standard deviations of the adjustment's Cauchy kernel."""

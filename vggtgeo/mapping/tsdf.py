@@ -28,7 +28,7 @@ from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe_images import CompressedImage, array_of
+from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 
 Block = tuple[int, int, int]
 """Corner of a block of voxels, in blocks."""

@@ -17,11 +17,11 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
-from vggtgeo.slam.keyframe import Keyframe
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
-from vggtgeo.slam.window_recorder import WindowRecord
+from vggtgeo.slam.window.window_recorder import WindowRecord
 
 _Value = TypeVar("_Value")
 SAMPLES = 4

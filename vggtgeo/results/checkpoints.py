@@ -31,11 +31,11 @@ from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.output_checks import check_place
 from vggtgeo.results.summary import versions
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
 from vggtgeo.slam.trust.evidence import EvidenceSoFar, FrameEvidence
-from vggtgeo.slam.window_recorder import WindowRecord
+from vggtgeo.slam.window.window_recorder import WindowRecord
 
 
 @dataclass(frozen=True)

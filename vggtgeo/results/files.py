@@ -14,10 +14,10 @@ import tomli_w
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_open, write_text
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.slam.connected import pieces_by_size
-from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.pose_uncertainty import PoseUncertainty, frame_uncertainty
+from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
+from vggtgeo.slam.sparse_map.connected import pieces_by_size
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 
 DEPTH_UNIT = 5000.0

@@ -11,9 +11,9 @@ from vggtgeo.io.given import check_kind
 from vggtgeo.results.checkpoints import RunSoFar
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.rgbd_alignment import compile_alignment
-from vggtgeo.slam.settings import Roles, SlamSettings
-from vggtgeo.slam.window import warm_up
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.tracking.rgbd_alignment import compile_alignment
+from vggtgeo.slam.window.sliding_window import warm_up
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,10 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.results.frames_again import read_again
-from vggtgeo.slam.connected import pieces_by_size
-from vggtgeo.slam.frame_poses import frame_poses
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.connected import pieces_by_size
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.frame_poses import frame_poses
 
 VERSION = 1
 MASK = "image-mask.png"

@@ -24,7 +24,7 @@ from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.summary import lens_of
 from vggtgeo.simulation.sequence import SyntheticSequence
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
 
 LEAST_SIDE = 32

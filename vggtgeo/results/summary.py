@@ -18,9 +18,9 @@ from vggtgeo.geometry.cameras import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.results.files import piece_file
-from vggtgeo.slam.connected import pieces_by_size
-from vggtgeo.slam.pose_uncertainty import frame_uncertainty
+from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
+from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
 

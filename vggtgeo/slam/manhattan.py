@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.models.classical import ManhattanEstimator, nearest_frame
-from vggtgeo.slam.factors import MeasuredRotation
-from vggtgeo.slam.settings import SlamSettings
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.sparse_map.factors import MeasuredRotation
 from vggtgeo.slam.state import Slam
 
 FIRST_VIEWS = 8

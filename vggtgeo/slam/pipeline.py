@@ -11,22 +11,21 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.connected import piece_of
-from vggtgeo.slam.covisibility import without_matches
-from vggtgeo.slam.description import Description
-from vggtgeo.slam.evidence import Evidence
-from vggtgeo.slam.factors import MeasuredRelativePose
-from vggtgeo.slam.frame_refinement import against_reference, with_view
-from vggtgeo.slam.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
-from vggtgeo.slam.pending_window import begin_window, is_due, settled
-from vggtgeo.slam.pieces import join_pieces
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.relocalisation import place_waiting, record_of, relocalise, revisit, sight_of, view_of, wait
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.covisibility import without_matches
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
+from vggtgeo.slam.sparse_map.pieces import join_pieces
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
 from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking import (
+from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
+from vggtgeo.slam.tracking.relocalisation import place_waiting, record_of, relocalise, revisit, sight_of, view_of, wait
+from vggtgeo.slam.tracking.track import (
     Expectation,
     Sight,
     Track,
@@ -37,7 +36,8 @@ from vggtgeo.slam.tracking import (
     track,
     track_by_map,
 )
-from vggtgeo.slam.window import adjust, enter
+from vggtgeo.slam.window.pending_window import begin_window, is_due, settled
+from vggtgeo.slam.window.sliding_window import adjust, enter
 
 LOST_PATIENCE = 10
 """Frames that show something, but nothing of the map, before a new piece of map begins. Black frames do not count."""

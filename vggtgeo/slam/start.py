@@ -10,12 +10,12 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, GeometryResult, PointMatches, StartGuess
-from vggtgeo.slam.description import Description
-from vggtgeo.slam.keyframe import Keyframe, make_keyframe
-from vggtgeo.slam.settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.state import FramePose, Slam, Waiting
-from vggtgeo.slam.tracking import Sight, track
-from vggtgeo.slam.window import adjust, enter, scale_anchor
+from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.tracking.track import Sight, track
+from vggtgeo.slam.window.sliding_window import adjust, enter, scale_anchor
 
 NOMINAL_DEPTH = 2.5
 """Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""

@@ -10,13 +10,13 @@ import numpy as np
 from vggtgeo.bundle.problem import State
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
-from vggtgeo.slam.adjustment import Adjustment
-from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.evidence import Evidence
-from vggtgeo.slam.factors import Factor, MeasuredRelativePose
-from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.rgbd_view import RgbdView
-from vggtgeo.slam.window_prior import WindowPrior
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.tracking.rgbd_view import RgbdView
+from vggtgeo.slam.window.adjustment import Adjustment
+from vggtgeo.slam.window.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 LEAST_TO_FIND_A_CAMERA = 3

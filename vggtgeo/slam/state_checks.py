@@ -11,10 +11,10 @@ import numpy as np
 from vggtgeo.models.checks import check_array, check_confidence, check_index, check_pose
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import Features
-from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.factors import Factor, MeasuredBaseline, MeasuredRelativePose
-from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_images import CompressedImage
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.factors import Factor, MeasuredBaseline, MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 

@@ -33,17 +33,17 @@ from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.mast3r import Mast3rView
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
-from vggtgeo.slam.adjustment import Adjustment
-from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.evidence import Evidence
-from vggtgeo.slam.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation
-from vggtgeo.slam.keyframe import Keyframe, Slots
-from vggtgeo.slam.keyframe_images import CompressedImage, KeyframeImages
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.rgbd_view import Points, RgbdView
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, KeyframeImages
 from vggtgeo.slam.state import FramePose, PendingWindow, Readout, SecondMotion, SeenPoints, Slam, Waiting
 from vggtgeo.slam.state_checks import check_state
-from vggtgeo.slam.window_prior import WindowPrior
+from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.tracking.rgbd_view import Points, RgbdView
+from vggtgeo.slam.window.adjustment import Adjustment
+from vggtgeo.slam.window.window_prior import WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 

@@ -11,12 +11,12 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.slam.connected import loop_edges, lost_stretches, piece_of
-from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.keyframe import Keyframe, read_at
 from vggtgeo.slam.run import frame_trajectory
+from vggtgeo.slam.sparse_map.connected import loop_edges, lost_stretches, piece_of
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window_recorder import WindowRecord
+from vggtgeo.slam.window.window_recorder import WindowRecord
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 ENTITIES = (

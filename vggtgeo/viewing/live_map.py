@@ -14,7 +14,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.keyframe import Keyframe, Slots, read_at
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots, read_at
 from vggtgeo.slam.state import Slam
 
 MOST_POINTS = 4000

@@ -1,7 +1,7 @@
 """The camera against the images: does what was given explain where corners with depth are seen?
 
 Pairs of frames `GAP` apart, in both directions, with the sensor's depth at the corners; what they say of the camera is
-found in `slam/camera_of_pairs.py`. Without such depth it is the map that is asked, see `free_focal`.
+found in `slam/camera/camera_of_pairs.py`. Without such depth it is the map that is asked, see `free_focal`.
 
 With the true poses, in pieces of 60 frames of corridor-office, building-walk and redkitchen, undisturbed: focal length
 -5.5 to +1 %, principal point within 20 px, k1 -0.045 (redkitchen, whose lens has about that) to +0.02. With a
@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.camera_of_pairs import CameraOpinion, CameraPair, camera_of_pairs
+from vggtgeo.slam.camera.camera_of_pairs import CameraOpinion, CameraPair, camera_of_pairs
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence, common
 from vggtgeo.slam.trust.finding import Finding

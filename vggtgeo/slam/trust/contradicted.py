@@ -23,7 +23,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.models.classical import EpipolarVerifier, can_search, match_pixels
 from vggtgeo.models.roles import PointMatches
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.trust.finding import Finding, spans
 

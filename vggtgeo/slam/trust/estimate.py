@@ -8,9 +8,9 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.connected import pieces_by_size
-from vggtgeo.slam.frame_poses import frame_poses
+from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Readout, Slam, was_given
+from vggtgeo.slam.tracking.frame_poses import frame_poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.slam.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.calibration import MOST_FOCAL
 from vggtgeo.slam.trust.finding import Finding

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vggtgeo.slam.evidence import BARE_OVERLAP, STRONG_INLIERS
-from vggtgeo.slam.evidence import Evidence as PoseEvidence
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.evidence import BARE_OVERLAP, STRONG_INLIERS
+from vggtgeo.slam.tracking.evidence import Evidence as PoseEvidence
 from vggtgeo.slam.trust.blind import LEAST_INLIERS, seen_around
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import Evidence

@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from vggtgeo.slam.connected import pieces_by_size
-from vggtgeo.slam.pose_uncertainty import frame_uncertainty
+from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
+from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.blind import check_blind, cuts
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera

@@ -12,7 +12,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical.two_view import TwoViewStart, parallax
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 

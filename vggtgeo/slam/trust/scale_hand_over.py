@@ -17,9 +17,9 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.connected import piece_of
-from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 

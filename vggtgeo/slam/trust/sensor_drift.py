@@ -28,12 +28,12 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.covisibility import Pair
-from vggtgeo.slam.gauge import NULL
-from vggtgeo.slam.keyframe import Keyframe
-from vggtgeo.slam.rolling_shutter import camera_motions, pair_at_once
+from vggtgeo.slam.camera.rolling_shutter import camera_motions, pair_at_once
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
+from vggtgeo.slam.window.gauge import NULL
 
 MOST_CHANGE = 0.08
 """Of the logarithm of either factor: what is told of a focal length, or a scale, that is off as a whole. Maps of the

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.trust.finding import Finding
 
 STEP = 8

@@ -20,9 +20,9 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.covisibility import directions
-from vggtgeo.slam.pose_uncertainty import SHARED_ERRORS
-from vggtgeo.slam.rolling_shutter import camera_motions, pair_at_once
+from vggtgeo.slam.camera.rolling_shutter import camera_motions, pair_at_once
+from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.sparse_map.covisibility import directions
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Finding
 

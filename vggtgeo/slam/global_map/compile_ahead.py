@@ -1,0 +1,83 @@
+"""Compiling the last adjustment while the run goes on, so that nobody waits for it at the end."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
+from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.global_map.global_adjustment import camera_of
+from vggtgeo.slam.global_map.global_shape import LARGEST_DENSE, GlobalShape, global_solver, padded_count, shape_for
+from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
+from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.sparse_map.factors import factor_terms, surface_term
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit
+
+CHECKED = (0.3, 0.6, 0.85)
+"""Shares of the frames at which the number of keyframes is foreseen: early, to have time, and again, to be right."""
+LEAST_KEYFRAMES = 8
+"""Where nobody knows how many frames will come: before the map has so many, it may stay small."""
+
+
+class CompileAhead(Callback):
+    """Compiles for as many keyframes as the map will have if it goes on as it began. The result of the run is the same
+    whatever it compiles, and what it did not foresee is compiled at the end.
+    """
+
+    def __init__(self, settings: SlamSettings) -> None:
+        self._settings = settings
+        self._total: int | None = None
+        self._asked: dict[int, Future[None]] = {}
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="compile")
+
+    def on_begin(self, name: str, total: int | None) -> None:
+        self._total = total
+
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
+        count = expected_keyframes(len(slam.keyframes), len(slam.frames), self._total)
+        if count is None or not slam.metric or not self._settings.refinement.global_adjustment:
+            return
+        padded = padded_count(count)
+        if padded <= LARGEST_DENSE and padded not in self._asked:
+            shape = shape_for(padded, self._settings)
+            self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, camera_of(slam))
+
+    def on_adjust(self, slam: Slam) -> None:
+        """Waits for what is needed now."""
+        future = self._asked.get(padded_count(len(slam.keyframes)))
+        if future is not None:
+            wait([future])
+
+
+def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | None:
+    """How many keyframes a map will have that has `keyframes` after so many of `total` frames; None at most frames: it
+    is foreseen a few times only.
+    """
+    if total is None:
+        return keyframes if keyframes >= LEAST_KEYFRAMES else None
+    if frames not in {int(share * total) for share in CHECKED}:
+        return None
+    return keyframes * total // max(frames, 1)
+
+
+@in_double_precision
+def compile_global(shape: GlobalShape, settings: SlamSettings, camera: type[Pinhole | SquarePinhole] = Pinhole) -> None:
+    """Compile the adjustment of maps of a shape and their uncertainties, on a problem that holds one observation: both
+    programs at once, on two cores.
+    """
+    nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
+    surfaces = surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing)
+    terms = (
+        *factor_terms((), {}, shape.room, metric=True),
+        *([surfaces] if settings.depth_terms.surface_points > 0 else []),
+    )
+    problem, initial = smallest_problem(shape.size, settings, terms, camera)
+    with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
+        sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)
+        solve_jit(problem, initial, global_solver(problem, settings)).energy.block_until_ready()
+        sigma.result()

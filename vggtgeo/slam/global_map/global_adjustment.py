@@ -1,0 +1,277 @@
+"""The last look at the whole map: one adjustment of all keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vggtgeo.bundle.problem import State
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
+from vggtgeo.slam.camera.calibration import Refinement, Solve, free_focal, keyframe_pairs, try_camera, without_surfaces
+from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted
+from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
+from vggtgeo.slam.camera.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
+from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
+from vggtgeo.slam.global_map.global_shape import GlobalShape, global_solver, shape_of
+from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.sparse_map.covisibility import Directed, directions
+from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose, factor_terms
+from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Slam
+from vggtgeo.slam.threads import map_in_threads
+from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
+from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
+from vggtgeo.slam.window.sliding_window import solve_jit
+
+MUCH = 0.01
+"""Relative change of the camera beyond which the user is told."""
+SURE, MOST_WARP = 5.0, 3.0
+"""Standard deviations, and pixels in the corners of the image, beyond which a distortion is told."""
+
+
+def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
+    """Bundle-adjust every keyframe: features and, where there is metric depth, surfaces, in a few rounds.
+
+    The first round also asks for a rolling shutter, and for another camera than the given or guessed one; those after
+    it take both as they are.
+    """
+    if len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA or not slam.pairs:
+        return slam
+    whole, solved = _Whole.of(slam, settings), None
+    for number in range(settings.refinement.global_rounds):
+        is_first = number == 0
+        adjustment, notes = whole.adjustment(slam, settings, finds_camera=is_first and not slam.calibrated)
+        slam = replace(slam, notes=(*slam.notes, *notes)) if is_first else slam
+        solution = solve_jit(adjustment.problem, adjustment.initial, global_solver(adjustment.problem, settings))
+        if not np.isfinite(float(solution.energy)):
+            return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
+        slam, solved = _taken(slam, adjustment, solution.state), (adjustment.problem, solution.state)
+        if is_first:
+            slam, adjustment, state = _with_its_readout(slam, adjustment, solution.state, settings)
+            slam, whole = whole.with_its_camera(slam, adjustment, state, settings)
+            solved = adjustment.problem, state
+    sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
+    return replace(slam, pose_sigma=sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class _Whole:
+    """What the rounds share: edges between keyframes, surfaces of those with metric depth, the camera's prior, and
+    the size that all problems are padded to.
+    """
+
+    edges: list[Directed]
+    surfaces: list[Surface]
+    camera: CameraPrior
+    shape: GlobalShape
+
+    @classmethod
+    def of(cls, slam: Slam, settings: SlamSettings) -> _Whole:
+        edges = _edges(slam, settings)
+        degrees = np.bincount([edge.host for edge in edges])
+        shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.factors, len(slam.pairs), settings)
+        camera = CameraPrior(slam.given_intrinsics, slam.intrinsics_sigma, camera_of(slam))
+        return cls(edges, _surfaces(slam), camera, shape)
+
+    def adjustment(self, slam: Slam, settings: SlamSettings, finds_camera: bool) -> tuple[Adjustment, tuple[str, ...]]:
+        """A round's adjustment, and what its gauge is worth a word of. finds_camera: without what was measured with the
+        camera of that moment, the tracked motions and the surfaces.
+        """
+        factors = _of_any_camera(slam) if finds_camera else slam.factors
+        adjustment = build(
+            slam.keyframes,
+            self.edges,
+            slam.intrinsics,
+            settings,
+            size=self.shape.size,
+            camera=self.camera,
+            fixed_pose=np.isin(np.arange(len(slam.keyframes)), slam.origins),
+            terms=_terms(slam, factors, self.surfaces, self.shape, settings),
+        )
+        problem = without_surfaces(adjustment.problem) if finds_camera else adjustment.problem
+        problem, gauge = with_one_gauge(problem, adjustment.initial, len(slam.keyframes), slam.metric)
+        notes = gauge_notes(gauge, adjustment.keyframes, "global adjustment")
+        return _without_readout(slam, replace(adjustment, problem=problem)), notes
+
+    def with_its_camera(
+        self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
+    ) -> tuple[Slam, _Whole]:
+        """The state after a trial of its camera, and what the rounds that follow share: a guessed camera, once
+        estimated, is held (see `_of_any_camera`).
+        """
+        before = slam.intrinsics
+        if slam.calibrated and not slam.metric:
+            slam = replace(slam, focal_wanted=free_focal(adjustment.problem, state, _solves(settings)))
+        if settings.camera.refine_intrinsics != "never":
+            slam = _with_its_camera(slam, adjustment, state, self.edges, settings)
+        if settings.refinement.global_rounds == 1 or (slam.calibrated and slam.intrinsics is before):
+            return slam, self
+        camera = replace(self.camera, mean=slam.intrinsics)
+        if not slam.calibrated:
+            held = settings.camera.known_intrinsics_sigma * slam.intrinsics[0]
+            camera = replace(camera, sigma=np.full(4, held), kind=_of_pixels(slam.intrinsics))
+        return slam, replace(self, edges=_edges(slam, settings), surfaces=_surfaces(slam), camera=camera)
+
+
+def _solves(settings: SlamSettings) -> Solve:
+    """Adjusts any problem of the shape of a global adjustment."""
+    return lambda problem, state: solve_jit(problem, state, global_solver(problem, settings)).state
+
+
+def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:
+    """The adjustment with its matches where they would be if images were read at once, where a readout is known."""
+    if slam.readout is None:
+        return adjustment
+    problem, initial = adjustment.problem, adjustment.initial
+    motions = camera_motions(slam, problem.num_keyframes)
+    return replace(adjustment, problem=without_readout(problem, initial, motions, slam.keyframes[0].size, slam.readout))
+
+
+def _with_its_readout(
+    slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
+) -> tuple[Slam, Adjustment, State]:
+    """The state after a search for a rolling shutter; with what was adjusted last, and its solution."""
+    if slam.readout is not None or not settings.refinement.rolling_shutter:
+        return slam, adjustment, state
+    motions = camera_motions(slam, adjustment.problem.num_keyframes)
+    size, longest = slam.keyframes[0].size, frame_interval(slam)
+    found = find_readout(adjustment.problem, state, motions, size, longest, _solves(settings))
+    if found is None or not found.pays:
+        return slam, adjustment, state
+    adjustment = replace(adjustment, problem=found.problem)
+    return replace(_taken(slam, adjustment, found.state), readout=found.readout), adjustment, found.state
+
+
+def _with_its_camera(
+    slam: Slam, adjustment: Adjustment, state: State, edges: list[Directed], settings: SlamSettings
+) -> Slam:
+    """The state after a trial whether a given camera is to be refined, or the lens of a guessed one taken out."""
+    again = _solves(settings)
+    if slam.calibrated:
+        found = try_camera(keyframe_pairs(slam, edges), adjustment.problem, state, again)
+        return _taken_camera(slam, adjustment, found, settings)
+    slam, adjustment, state = _with_its_pixels(slam, adjustment, state, again)
+    if slam.lens is not None or not can_undistort(slam):
+        return slam
+    return _taken_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, again))
+
+
+def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
+    """The state after a trial whether the pixels of a guessed camera are square; with what was adjusted last, and its
+    solution.
+    """
+    if adjustment.problem.camera is not SquarePinhole:
+        return slam, adjustment, state
+    found = find_aspect(adjustment.problem, state, solve)
+    if found is None or not found.pays:
+        return slam, adjustment, state
+    adjustment = replace(adjustment, problem=found.problem)
+    slam = _taken(slam, adjustment, found.state)
+    fx, fy = slam.intrinsics[:2]
+    note = f"nobody gave the camera, and its pixels are not square: fx, fy = {fx:.1f}, {fy:.1f} px"
+    return replace(slam, notes=(*slam.notes, note)), adjustment, found.state
+
+
+def camera_of(slam: Slam) -> type[Pinhole | SquarePinhole]:
+    """The model that the last adjustment has of the camera: a guessed one has square pixels, unless a first pass found
+    that they are not.
+    """
+    return Pinhole if slam.calibrated else _of_pixels(slam.given_intrinsics)
+
+
+def _of_pixels(intrinsics: np.ndarray) -> type[Pinhole | SquarePinhole]:
+    return SquarePinhole if are_square(intrinsics) else Pinhole
+
+
+def _edges(slam: Slam, settings: SlamSettings) -> list[Directed]:
+    by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
+    edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
+    return _thin(edges, len(slam.keyframes), settings)
+
+
+def _surfaces(slam: Slam) -> list[Surface]:
+    of = lambda keyframe: Surface.of(keyframe, slam.intrinsics)
+    return map_in_threads(of, slam.keyframes) if slam.metric else []
+
+
+def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
+    """The state of the run with what an adjustment found."""
+    keyframes, intrinsics = write_back(slam.keyframes, adjustment, state)
+    return replace(slam, keyframes=keyframes, intrinsics=intrinsics, solved=None)
+
+
+def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, settings: SlamSettings) -> Slam:
+    """The state of the run with a refined camera, if it pays or is asked for, and what the user should know of it."""
+    if found is None:
+        return slam
+    notes = [*slam.notes, *_lens_note(found, slam.keyframes[0].size)]
+    always = settings.camera.refine_intrinsics == "always"
+    if found.state is not None and (found.pays or always):
+        slam = _taken(slam, adjustment, found.state)
+        if found.change > MUCH:
+            cameras = [", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted)]
+            change = 100 * found.change
+            notes.append(f"the camera was refined by {change:.1f} %: fx, fy, cx, cy = {cameras[0]} -> {cameras[1]} px")
+    return replace(slam, notes=tuple(notes))
+
+
+def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
+    """The state of the run with its lens taken out, if that pays, and a word on it; else with what it would change."""
+    if found is None or np.isinf(found.warp):
+        return replace(slam, focal_with_lens=None)
+    if not found.pays:
+        return replace(slam, focal_with_lens=found.camera.intrinsics[0])
+    without = float(slam.intrinsics[0])
+    adjusted = undistorted(_taken(slam, adjustment, found.state), found.camera)
+    adjusted = replace(adjusted, focal_without_lens=without, focal_with_lens=None)
+    k1, k2, *_ = found.camera.distortion
+    note = (
+        f"nobody gave the camera, and its lens distorts: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "
+        f"{found.camera.intrinsics[0]:.1f} px, {found.warp:.0f} px at most; the images were undistorted by that"
+    )
+    return replace(adjusted, notes=(*adjusted.notes, note))
+
+
+def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
+    """A word on distortion that is sure and moves corners of the image by more than the noise of matches."""
+    (k1, sigma), focal = found.distortion, float(found.given[0])
+    warp = abs(k1) * (float(np.hypot(shape[0], shape[1])) / 2 / focal) ** 3 * focal
+    if abs(k1) < SURE * sigma or warp < MOST_WARP:
+        return []
+    return [f"the lens distorts, and the calibration does not say so: k1 about {k1:.3f}, {warp:.0f} px in the corners"]
+
+
+def _terms(
+    slam: Slam, factors: Sequence[Factor], surfaces: list[Surface], shape: GlobalShape, settings: SlamSettings
+) -> tuple[AbstractTerm, ...]:
+    """What is known about poses beyond matches: factors of the run, and aligned surfaces."""
+    places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
+    terms = factor_terms(factors, places, shape.room, metric=slam.metric)
+    if not surfaces or settings.depth_terms.surface_points <= 0:
+        return terms
+    pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
+    return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth_terms.surface_points, shape.pairs))
+
+
+def _of_any_camera(slam: Slam) -> tuple[Factor, ...]:
+    """The factors that hold whatever the camera is: all but the tracked motions of keyframes that share matches.
+
+    A motion was tracked with the camera of that moment, and would hold that: a lens that bends corners by 12 px was
+    found with 298 px in place of 266 (simulated), and without those motions with 268. The camera once estimated, they
+    are what keeps a map without depth together where it is seen least: corridor-office 4.2 -> 3.1 cm.
+    """
+    matched = {pair.key for pair in slam.pairs if len(pair.points)}
+    tied = lambda factor: isinstance(factor, MeasuredRelativePose) and tuple(sorted(factor.keyframes)) in matched
+    return tuple(factor for factor in slam.factors if not tied(factor))
+
+
+def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:
+    """At most `global_neighbours` edges a host: those with the most matches."""
+    kept = []
+    for host in range(keyframes):
+        own = sorted((edge for edge in edges if edge.host == host), key=lambda edge: -len(edge.slots))
+        kept += own[: settings.refinement.global_neighbours]
+    return kept

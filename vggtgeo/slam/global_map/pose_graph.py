@@ -1,0 +1,151 @@
+"""A pose graph: keyframes as poses alone, between tracked motions and verified loops. For drift that is too large for
+the full adjustment, whose matches pull only within a few pixels.
+
+Tracked motions are a tree: nothing but loops contradicts them, so they have no robust kernel. What they are off by more
+than they state is estimated from the loops: the median over loops of the squared Mahalanobis distance between what a
+loop measured and what the motions on the way add up to, over the median of chi-square (a variance component, robust
+against up to half of the loops being false). So drift is spread over the way; a single motion that is wrong (a slip) is
+spread, too, and not left where it happened. Loops have a Cauchy kernel, widened at first
+(`vggtgeo/bundle/graduation.py`): from metres of drift true loops look as false as the false ones do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import chi2 as chi_square
+
+from vggtgeo.bundle.graduation import Graduation
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.solver_choice import choose_reduced_solver
+from vggtgeo.bundle.terms.relative_pose import RelativePose
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, relative_pose_rows
+from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.solvers.kernels import Cauchy
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.solvers.reduced import DenseCholesky
+
+BELIEF = float(chi_square.ppf(0.9999, 6))
+"""Squared Mahalanobis distance beyond which a loop is false: one true loop in 10,000 is lost."""
+GRADUATION = Graduation(factors=(256.0, 64.0, 16.0, 4.0), iterations=6)
+"""A loop of 2 cm that 10 m of drift contradict is 500 standard deviations off, half of the first width."""
+ITERATIONS = 50
+ROOM = 32
+"""Loops are padded to a multiple of this, so that another graph of as many keyframes compiles nothing."""
+DENSE_POSES = 200
+"""Poses up to which the factor is dense, whatever the loops are; it takes some 20 ms."""
+
+solve_graph_jit = eqx.filter_jit(solve)
+
+
+class LoopClosure(RelativePose):
+    """A relative pose measured between two visits of one place, which may be another place that looks the same."""
+
+    name = "loops"
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """Poses float64 [n, 4, 4], world -> camera, by keyframe; motions: a tree, the later keyframe second; loops: what
+    was measured beside; held: bool [n], one of each piece.
+    """
+
+    poses: np.ndarray
+    motions: tuple[MeasuredRelativePose, ...]
+    loops: tuple[MeasuredRelativePose, ...]
+    held: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Untangled:
+    """Poses after the graph was solved, and which of its loops agree with them, bool [loops]."""
+
+    poses: np.ndarray
+    believed: np.ndarray
+
+
+def solve_pose_graph(graph: PoseGraph) -> Untangled:
+    """The poses that motions and loops agree on; the graph's own, and no loop believed, where the solve fails."""
+    spread = drift_variance(graph)
+    loosened = [replace(motion, information=motion.information / spread) for motion in graph.motions]
+    motions = RelativePose(**relative_pose_rows(loosened))
+    room = -(-max(len(graph.loops), 1) // ROOM) * ROOM
+    loops = LoopClosure(**relative_pose_rows(graph.loops, room), kernel=Cauchy(jnp.asarray(TIE_WIDTH)))
+    problem, initial, _ = pack(
+        _no_observations(),
+        rigid.to_quaternion(graph.poses),
+        np.array([1.0, 1.0, 0.0, 0.0]),
+        np.zeros(0),
+        fixed_pose=graph.held,
+        fixed_intrinsics=True,
+        terms=(motions, loops),
+    )
+    small = len(graph.poses) <= DENSE_POSES
+    reduced = DenseCholesky() if small else choose_reduced_solver(problem)
+    solver = SchurLevenbergMarquardt(max_iterations=ITERATIONS, rtol=1e-6, reduced_solver=reduced)
+    solution = solve_graph_jit(problem, initial, solver=solver, graduation=GRADUATION)
+    poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64))
+    if not np.isfinite(poses).all():
+        return Untangled(graph.poses, np.zeros(len(graph.loops), bool))
+    return Untangled(poses, np.array([distance(loop, poses) < BELIEF for loop in graph.loops], bool))
+
+
+def distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float:
+    """Squared Mahalanobis distance of the poses from a measured motion, 6 degrees of freedom."""
+    found = poses[measured.second] @ rigid.invert(poses[measured.first])
+    off = tangent(found @ rigid.invert(measured.pose))
+    return float(off @ measured.information @ off)
+
+
+def drift_variance(graph: PoseGraph) -> float:
+    """By what the variance of the motions must be multiplied for the loops to be likely; at least 1."""
+    parent = np.full(len(graph.poses), -1)
+    # Errors of a motion as right perturbations of the pose: seen from the world they add up along the way.
+    summed, spread = graph.poses.copy(), np.zeros((len(graph.poses), 6, 6))
+    for motion in sorted(graph.motions, key=lambda motion: motion.second):
+        parent[motion.second] = motion.first
+        summed[motion.second] = motion.pose @ summed[motion.first]
+        carry = rigid.adjoint(rigid.invert(summed[motion.second]))
+        spread[motion.second] = spread[motion.first] + carry @ np.linalg.inv(motion.information) @ carry.T
+    distances = []
+    for loop in graph.loops:
+        meeting = _meeting(parent, loop.first, loop.second)
+        if meeting < 0:
+            continue
+        carry = rigid.adjoint(summed[loop.second])
+        drift = carry @ (spread[loop.first] + spread[loop.second] - 2 * spread[meeting]) @ carry.T
+        off = tangent(loop.pose @ summed[loop.first] @ rigid.invert(summed[loop.second]))
+        distances.append(off @ np.linalg.solve(drift + np.linalg.inv(loop.information), off))
+    if not distances:
+        return 1.0
+    return float(max(np.median(distances) / chi_square.ppf(0.5, 6), 1.0))
+
+
+def _meeting(parent: np.ndarray, first: int, second: int) -> int:
+    """Where the ways of two keyframes to the root of their tree meet; -1 where they have different roots."""
+    while first != second and first >= 0 and second >= 0:
+        if first > second:
+            first = int(parent[first])
+        else:
+            second = int(parent[second])
+    return first if first == second else -1
+
+
+def _no_observations() -> Observations:
+    """No landmark: a graph of poses alone."""
+    none, nowhere = np.zeros(0, int), np.zeros((0, 2))
+    return Observations(
+        edges=np.zeros((0, 2), int),
+        host=none,
+        pixel=nowhere,
+        point_edge=none,
+        point_landmark=none,
+        point_target=nowhere,
+        point_weight=np.zeros(0),
+    )

@@ -1,0 +1,216 @@
+"""How far the poses of a run can be off: the covariances of the last adjustment, carried to every frame.
+
+How true they are is measured: see docs/verdict.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float, Int
+from scipy.spatial.transform import Rotation
+
+from vggtgeo.bundle.analysis.covariances import DENSE_KEYFRAMES, covariances, variance_factor
+from vggtgeo.bundle.analysis.weakest import definite_factor, sparse_matrix
+from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.objective import prepared
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solver_choice import choose_reduced_solver
+from vggtgeo.geometry import lie, rigid
+from vggtgeo.io.kept_program import KeptProgram
+from vggtgeo.slam.sparse_map.connected import pieces_by_size
+from vggtgeo.slam.state import Slam
+from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
+from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
+from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
+from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+
+DEPTH_SCALE = 0.01
+"""Standard deviation of a depth camera's constant factor, which nothing in a run can see: on four clips with truth the
+lengths were 0.2 to 1.8 % off (redkitchen, corridor-office, building-walk, icl-office), 1.1 % in the mean of squares."""
+
+MOMENT = 0.01
+"""Seconds, standard deviation: a pose is that of a moment, and an image is none. Shutters of phones and depth cameras
+roll over it for up to 1/30 s (uniform: 0.0096 s), and on TUM's freiburg1 the times of images and truth are 0.013 s
+apart. Nothing in a run can see that, and no residual shows what every pose has taken up."""
+CALIBRATION = 0.01
+"""Of the angle that the camera has turned since the first pose: standard deviation of the focal length, relative, by
+which every turn that is seen is too large or too small. Makers and calibration tools reach it
+(`slam/camera/calibration.py`); two runs with one camera refined it to 482.6 and 488.4 px."""
+CENTRE = 0.014
+"""Of the images' width and height: root mean square of how far published principal points are from the middle
+(`trust/calibration.py`). Where a calibration puts it there to the pixel nobody has measured it, and it turns every
+camera by one unknown angle: redkitchen's is 4 px aside, and with depth 44 % of its places, 59 % of its rotations lay
+within three standard deviations of COLMAP's, now 80 and 87."""
+MIDDLE = 0.5
+"""Pixels, within which a principal point is the middle, by whichever of the two ways to count pixels."""
+SHARED_ERRORS = 6.0
+"""Matches that count as one in a map without measured depth: each is in the adjustment from either side, those of a
+point share the error of its host, and all share what the camera's model leaves. With every match for itself, the
+squared errors of places were 14 (icl-office), 6 (corridor-office) and 2.8 (building-walk) times what was stated.
+Surfaces have the like: `RgbdAlignment.surface_spread`."""
+FREE_SCALE = 0.02
+"""Of the distance, standard deviation: a unit that is handed on from part to part is not the same everywhere. After the
+best similarity, places were 1.5 to 2.9 % of their distance from the first one off (redkitchen against COLMAP,
+corridor-office, building-walk, medians)."""
+SPREAD = 64
+"""Keyframes, evenly spread, that stand for the others where no band serves: six solves with a sparse factor each."""
+
+FLOOR = 1e-12
+"""Of an information whose diagonal is one: above its rounding errors, far below what a map determines."""
+
+
+class PoseUncertainty(NamedTuple):
+    """Standard deviations of the poses of a piece of the map in their worst direction, relative to its first keyframe.
+
+    timestamps: s. translation: of the camera's place, in the unit of the map (metres where metric). rotation: rad.
+    NaN where tracking said nothing of a frame.
+    """
+
+    timestamps: Float[np.ndarray, " n"]
+    translation: Float[np.ndarray, " n"]
+    rotation: Float[np.ndarray, " n"]
+
+
+def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
+    """Of every frame of `frame_trajectory(slam, piece)`; None before the last adjustment, or where there was none."""
+    if slam.pose_sigma is None or len(slam.pose_sigma) != len(slam.keyframes):
+        return None
+    own = set(pieces_by_size(slam)[piece])
+    records = [record for record in slam.frames if record.tracked and record.reference in own]
+    sigma = slam.pose_sigma[[record.reference for record in records]].reshape(-1, 2)
+    tracked = [(r.evidence.sigma_translation, r.evidence.sigma_rotation) for r in records]
+    # The pose of a keyframe's own frame is the keyframe's: only other frames add the error of their tracking.
+    apart = [not np.array_equal(record.relative, np.eye(4)) for record in records]
+    added = np.where(np.array(apart, bool)[:, None], np.array(tracked).reshape(-1, 2), 0.0)
+    moved, turned = np.sqrt(sigma**2 + added**2).T
+    times = np.array([record.timestamp for record in records])
+    poses = np.array([slam.pose(record) for record in records]).reshape(-1, 4, 4)
+    places = rigid.invert(poses)[:, :3, 3]
+    if not slam.metric:
+        moved, turned = np.sqrt(SHARED_ERRORS) * moved, np.sqrt(SHARED_ERRORS) * turned
+    turn = _unmeasured_turn(slam)
+    scale = np.hypot(DEPTH_SCALE if slam.metric else FREE_SCALE, turn)
+    moved = np.hypot(moved, scale * np.linalg.norm(places - places[:1], axis=1))
+    speed, rate = _speeds(times, poses, places)
+    # What turns while it is read out is sheared and stretched, which looks like a motion at the scene's distance.
+    sheared = rate * median_depths(slam)[[record.reference for record in records]]
+    moved = np.sqrt(moved**2 + MOMENT**2 * (speed**2 + sheared**2))
+    angles = _angles(poses)
+    shared = np.hypot(CALIBRATION * angles, turn * 2 * np.sin(angles / 2))
+    turned = np.sqrt(turned**2 + MOMENT**2 * rate**2 + shared**2)
+    return PoseUncertainty(times, moved, turned)
+
+
+def _unmeasured_turn(slam: Slam) -> float:
+    """Radians, standard deviation of a turn `Q` of all cameras alike, as a principal point makes it that nobody has
+    measured: a motion `T` since the first pose is seen as `Q T Q^-1`, which moves places by `Q` times their distance.
+    """
+    height, width = slam.keyframes[0].size
+    # A given camera that was refined has moved by what its prior allows, which is no measurement of its middle either.
+    fx, fy, cx, cy = slam.given_intrinsics if slam.calibrated else slam.intrinsics
+    aside = np.abs([cx - (width - 0.5) / 2, cy - (height - 0.5) / 2])
+    return CENTRE * max(width / fx, height / fy) if np.all(aside <= MIDDLE) else 0.0
+
+
+def median_depths(slam: Slam) -> np.ndarray:
+    """Of each keyframe's points, float64 [n]; that of all where it has none."""
+    each = [keyframe.points.inverse_depth[np.isfinite(keyframe.points.inverse_depth)] for keyframe in slam.keyframes]
+    every = float(np.median(np.concatenate(each))) if any(map(len, each)) else 1.0
+    return 1 / np.array([float(np.median(values)) if len(values) else every for values in each])
+
+
+def _angles(poses: np.ndarray) -> np.ndarray:
+    """By which each of [n, 4, 4] is turned against the first, rad."""
+    return Rotation.from_matrix(poses[:, :3, :3] @ poses[:1, :3, :3].mT).magnitude() if len(poses) else np.zeros(0)
+
+
+def _speeds(times: np.ndarray, poses: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the camera at each pose: units of the map a second, and rad a second; from the poses before and after."""
+    before, after = np.maximum(np.arange(len(times)) - 1, 0), np.minimum(np.arange(len(times)) + 1, len(times) - 1)
+    seconds = times[after] - times[before]
+    steps = poses[after] @ rigid.invert(poses[before])
+    turned = Rotation.from_matrix(steps[:, :3, :3]).magnitude() if len(steps) else np.zeros(0)
+    moved = np.linalg.norm(places[after] - places[before], axis=1)
+    a_second = lambda path: np.divide(path, seconds, out=np.zeros(len(path)), where=seconds > 0)
+    return a_second(moved), a_second(turned)
+
+
+def keyframe_sigma(problem: Problem, state: State, keyframes: int) -> np.ndarray | None:
+    """Of the first `keyframes` poses at a solution, float64 [n, 2]: translation, rotation in rad, in the worst
+    direction; None where nothing finite comes of it. Where residuals are larger than they should be, so are these.
+
+    On a large graph without a band those of `SPREAD`, evenly spread, stand for the others.
+    """
+    solver = DenseCholesky() if problem.num_keyframes <= DENSE_KEYFRAMES else choose_reduced_solver(problem)
+    if isinstance(solver, ConjugateGradients):
+        asked = np.unique(np.linspace(0, keyframes - 1, SPREAD).astype(int))
+        worst, factor = sparse_worst(problem, state, asked)
+        worst = np.stack([np.interp(np.arange(keyframes), asked, column) for column in worst.T], axis=1)
+    else:
+        every = jnp.arange(problem.num_keyframes)
+        variances, found = sigma_jit(problem, state, solver, every)
+        worst, factor = np.asarray(variances, np.float64), float(found)
+    sigma = np.sqrt(np.maximum(worst[:keyframes] * max(factor, 1.0), 0.0))
+    return sigma if np.isfinite(sigma).all() else None
+
+
+def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.ndarray, float]:
+    """Largest variance of translation and of rotation of the keyframes asked for, float64 [h, 2], and the variance
+    factor, by one sparse factor of the information; outside `jit`.
+
+    Conjugate gradients would solve a system for each column, which had not ended for 957 keyframes after ten minutes.
+    """
+    system, landmarks = _linearised_jit(problem, state)
+    layout = sparse_layout(system)
+    information = sparse_matrix(_reduced_jit(system, layout), layout)
+    if not np.isfinite(information.data).all():
+        return np.full((len(asked), 2), np.nan), 1.0
+    free = np.flatnonzero(np.asarray(system.free))
+    diagonal = information.diagonal()[free]
+    unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scale = sp.diags_array(unit)
+    # What nothing determines comes out as very uncertain, where the factor of a singular matrix would be an error.
+    inverse = definite_factor(scale @ information[free][:, free] @ scale + FLOOR * sp.eye_array(len(free)))
+    worst = np.zeros((len(asked), 2))
+    for row, keyframe in enumerate(asked):
+        at = np.flatnonzero(free // lie.TANGENT == keyframe)
+        if len(at) < lie.TANGENT:  # held, or a part of it: it is where it is said to be
+            continue
+        columns = np.zeros((len(free), lie.TANGENT))
+        columns[at, np.arange(lie.TANGENT)] = unit[at]
+        block = inverse.solve(columns)[at] * unit[at, None]
+        worst[row] = [np.linalg.eigvalsh(block[part, part])[-1] for part in (slice(0, 3), slice(3, 6))]
+    determined = landmarks + np.count_nonzero(diagonal > 0)
+    return worst, float(_factor_jit(problem, state, determined))
+
+
+@eqx.filter_jit
+def _linearised_jit(problem: Problem, state: State) -> tuple[ArrowSystem, Array]:
+    """The system, and how many landmarks it determines."""
+    system = linearise(prepared(problem), state)
+    return system, jnp.sum(moving_landmarks(system))
+
+
+@eqx.filter_jit
+def _factor_jit(problem: Problem, state: State, determined: Array) -> Array:
+    return variance_factor(prepared(problem), state, determined)
+
+
+_reduced_jit = eqx.filter_jit(reduced_blocks)
+
+
+def _sigma(
+    problem: Problem, state: State, solver: AbstractReducedSolver, asked: Int[Array, " h"]
+) -> tuple[Array, Array]:
+    """Largest variance of translation and of rotation of the keyframes asked for [h, 2], and the variance factor."""
+    found = covariances(problem, state, reduced_solver=solver, keyframes=asked)
+    worst = [jnp.linalg.eigvalsh(found.poses[:, part, part])[:, -1] for part in (slice(0, 3), slice(3, 6))]
+    return jnp.stack(worst, axis=1), found.variance_factor
+
+
+sigma_jit = KeptProgram(_sigma, lambda problem, state, solver, asked: (asked, asked))

@@ -1,0 +1,164 @@
+"""Large drift, taken out of a map by its loops before the adjustment: a pose graph, and a graph of units before it
+where lengths are no metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
+
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.global_map.loop_witnesses import witnessed
+from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, distance, solve_pose_graph
+from vggtgeo.slam.global_map.unit_graph import UnitRatio, solve_units
+from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.units import longer, scaled_factor, scaled_keyframe, scaled_motion, scaled_record
+from vggtgeo.slam.start import NOMINAL_DEPTH
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.evidence import tangent
+
+MENDABLE = 20.0
+"""Pixels of the median match beyond which the map is straightened before it is adjusted. An adjustment alone brings
+back 5 cm and 2 degrees, 16 pixels (`tests/test_pipeline.py`)."""
+UNTRACKED = (0.02, np.deg2rad(1.0))
+"""Standard deviation of a motion between keyframes that no tracking has measured, metres and radians: that of two
+views that start a map of free scale."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A verified pair, the relative pose by its matches, and the ratio of the units of both (None = not known)."""
+
+    pair: Pair
+    motion: MeasuredRelativePose
+    ratio: float | None
+
+    def agrees(self, slam: Slam) -> bool:
+        """Whether the map's adjustment can take the matches: half of them reproject within `MENDABLE`."""
+        first, second = (slam.keyframes[number] for number in self.pair.key)
+        matches = self.pair.points
+        inverse = first.points.inverse_depth[matches.index_i]
+        points = rigid.unproject(matches.pixels_i, inverse, first.pose, slam.intrinsics)
+        off = np.linalg.norm(rigid.project(points, second.pose, slam.intrinsics) - matches.pixels_j, axis=1)
+        return bool(np.median(np.where(np.isfinite(off), off, np.inf)) < MENDABLE)
+
+
+def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
+    """The map after a pose graph, if any loop contradicts it by more than its adjustment can mend, and the loops that
+    are believed.
+    """
+    motions, closing = odometry(slam)
+    poses = np.array([keyframe.pose for keyframe in slam.keyframes])
+    drifted = [loop for loop in loops if not loop.agrees(slam)]
+    torn = [tie for tie in closing if distance(tie, poses) > BELIEF and _pixels(tie, slam) > MENDABLE]
+    if not drifted and not torn:
+        return slam, list(loops)
+    units = np.ones(len(poses)) if slam.metric else _units(slam, motions, loops)
+    graph = _graph(slam, motions, (*closing, *(loop.motion for loop in loops)), units)
+    sure = witnessed(graph.loops, graph.motions, BELIEF) | (np.arange(len(graph.loops)) < len(closing))
+    if not sure.any():
+        agreeing = [loop for loop in loops if loop.agrees(slam)]
+        return _noted(slam, len(loops) - len(agreeing)), agreeing
+    found = solve_pose_graph(replace(graph, loops=tuple(compress(graph.loops, sure))))
+    dropped = [tie for tie, true in zip(closing, found.believed[: len(closing)], strict=True) if not true]
+    moved = _taken(slam, found.poses, units, dropped)
+    # A loop without a witness took no part; where the straightened map agrees with it, its matches are used.
+    true = np.zeros(len(graph.loops), bool)
+    true[sure] = found.believed
+    own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
+    believed = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
+    return _noted(moved, len(loops) - len(believed), slam), believed
+
+
+def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelativePose]]:
+    """The motions that make the map a tree, each keyframe after an earlier one, and all other tracked motions.
+
+    A motion is what the adjusted poses say where they agree with what was tracked, else what was tracked.
+    """
+    tree: dict[int, MeasuredRelativePose] = {}
+    others = []
+    for tie in slam.ties:
+        if tie.first < tie.second and tie.second not in tree and tie.second not in slam.origins:
+            tree[tie.second] = tie
+        else:
+            others.append(tie)
+    poses = np.array([keyframe.pose for keyframe in slam.keyframes])
+    between = lambda first, second: rigid.orthonormal(poses[second] @ rigid.invert(poses[first]))
+    loose = np.diag(1.0 / np.repeat(UNTRACKED, 3) ** 2)
+    motions: list[MeasuredRelativePose] = []
+    matched = {pair.key for pair in slam.pairs if len(pair.points)}
+    for number in range(1, len(slam.keyframes)):
+        if number in tree:
+            tie = tree[number]
+            agrees = distance(tie, poses) < BELIEF
+            motions.append(replace(tie, pose=between(tie.first, tie.second)) if agrees else tie)
+        elif (number - 1, number) in matched:
+            motions.append(MeasuredRelativePose(number - 1, number, between(number - 1, number), loose))
+    return motions, others
+
+
+def _pixels(tie: MeasuredRelativePose, slam: Slam) -> float:
+    """How far points at a usual distance are from where a motion would have them, pixels."""
+    first, second = (slam.keyframes[number].pose for number in tie.keyframes)
+    off = tangent(second @ rigid.invert(first) @ rigid.invert(tie.pose))
+    return float(slam.intrinsics[0] * (np.linalg.norm(off[:3]) / NOMINAL_DEPTH + np.linalg.norm(off[3:])))
+
+
+def _graph(
+    slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[MeasuredRelativePose], units: np.ndarray
+) -> PoseGraph:
+    """The graph in the unit of the first keyframe, one keyframe held of each piece that the loops leave."""
+    inside = lambda measured: scaled_motion(measured, float(units[measured.first]))
+    scaled_motions, scaled_loops = tuple(map(inside, motions)), tuple(map(inside, loops))
+    poses = np.array([keyframe.pose for keyframe in slam.keyframes])
+    start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])
+    whole = replace(slam, factors=(*slam.factors, *loops))
+    label = piece_of(whole)
+    held = np.zeros(len(poses), bool)
+    held[np.unique(label, return_index=True)[1]] = True
+    return PoseGraph(start, scaled_motions, scaled_loops, held)
+
+
+def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
+    """By what the lengths of each keyframe must be multiplied, float64 [n]."""
+    ratios = [UnitRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
+    return solve_units(len(slam.keyframes), [tie.keyframes for tie in motions], ratios)
+
+
+def _taken(slam: Slam, poses: np.ndarray, units: np.ndarray, dropped: Sequence[MeasuredRelativePose]) -> Slam:
+    """The map at other poses, its lengths multiplied keyframe by keyframe; tracked motions that are not believed go."""
+    gone = {id(tie) for tie in dropped}
+    unit = lambda number: float(units[number])
+    factors = tuple(scaled_factor(f, unit(f.keyframes[0])) for f in slam.factors if id(f) not in gone)
+    return replace(
+        slam,
+        keyframes=tuple(
+            replace(scaled_keyframe(keyframe, unit(keyframe.number)), pose=rigid.orthonormal(pose))
+            for keyframe, pose in zip(slam.keyframes, poses, strict=True)
+        ),
+        frames=tuple(scaled_record(record, unit(record.reference)) for record in slam.frames),
+        factors=factors,
+        prior=None,
+        solved=None,
+    )
+
+
+def _noted(slam: Slam, refused: int, before: Slam | None = None) -> Slam:
+    """What the user should know."""
+    notes = []
+    if before is not None:
+        moved = max(
+            float(np.linalg.norm(rigid.centre(new.pose) - rigid.centre(old.pose)))
+            for new, old in zip(slam.keyframes, before.keyframes, strict=True)
+        )
+        unit = "m" if slam.metric else "of its unit"
+        notes.append(f"places seen again straightened the map: a keyframe moved by up to {moved:.2f} {unit}")
+    if refused:
+        places = "1 place that looks" if refused == 1 else f"{refused} places that look"
+        notes.append(f"{places} the same as others contradict the rest of the map, and are left out")
+    return replace(slam, notes=(*slam.notes, *notes))

@@ -1,0 +1,1 @@
+"""What a run may be told: the numbers of its stages, who plays which role, presets, tables in files."""

@@ -1,0 +1,164 @@
+"""Settings of the SLAM pipeline, grouped by stage and checked when they are made, and the role objects of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind
+from vggtgeo.models.classical import (
+    BandLineMatcher,
+    LsdDetector,
+    NoDepth,
+    PatchFlow,
+    PnpGeometry,
+    SampleOrder,
+    SensorDepth,
+    SiftMatcher,
+    StructureTensor,
+    in_order,
+)
+from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector, LineMatcher, MetricDepth, PointMatcher
+from vggtgeo.slam.camera.still_parts import StillParts
+from vggtgeo.slam.settings.groups import (
+    CameraSettings,
+    DepthSettings,
+    KeyframeSettings,
+    LineSettings,
+    MatchingSettings,
+    RefinementSettings,
+    TrackingSettings,
+    WeightSettings,
+    WindowSettings,
+)
+from vggtgeo.slam.tracking.rgbd_alignment import RgbdAlignment
+
+_ASKED = {
+    "points": ("describe", "match"),
+    "lines": ("detect",),
+    "line_matches": ("describe", "match"),
+    "depth": ("estimate",),
+    "confidence": ("confidence",),
+    "geometry": ("locate",),
+}
+"""Methods of the protocols of `models/roles.py`."""
+
+
+@dataclass(frozen=True)
+class Roles:
+    """The perception objects of one run.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> from vggtgeo.models.classical import NoDepth, OrbMatcher
+        >>> vg.Roles(points=OrbMatcher(), depth=NoDepth()).metric
+        False
+
+    """
+
+    points: PointMatcher = field(default_factory=SiftMatcher)
+    lines: LineDetector = field(default_factory=LsdDetector)
+    line_matches: LineMatcher = field(default_factory=BandLineMatcher)
+    depth: MetricDepth = field(default_factory=SensorDepth)
+    confidence: DenseConfidence = field(default_factory=StructureTensor)
+    geometry: InitialGeometry = field(default_factory=PnpGeometry)
+    alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
+    """Aligns a frame's picture and depth to a keyframe's as a whole, beside its key points; None leaves that out."""
+    flow: PatchFlow | None = field(default_factory=PatchFlow)
+    """Follows a keyframe's key points into frames that `alignment` then refines, so that most frames need no
+    descriptors; None describes and matches every frame."""
+
+    still_parts: StillParts | None = None
+    """What of the images, as they are read, belongs to the camera and not to the world: nothing is looked for there.
+    `vggtgeo.reconstruct` finds it."""
+
+    def __post_init__(self) -> None:
+        """InputError for what plays no role, which would be found in the middle of a run."""
+        for role, methods in _ASKED.items():
+            given = getattr(self, role)
+            if not all(callable(getattr(given, method, None)) for method in methods):
+                raise InputError(
+                    f"`{role}` is {given!r:.60}; expected an object with the methods {', '.join(methods)}, such as "
+                    f"`vggtgeo.Roles().{role}`"
+                )
+        for role, kind in (("alignment", RgbdAlignment), ("flow", PatchFlow), ("still_parts", StillParts)):
+            check_kind(role, getattr(self, role), kind | None, f"a `{kind.__name__}`, or None")
+
+    def seeded(self, seed: int) -> Roles:
+        """The same roles, whose robust estimators draw other samples; 0: as they draw them by themselves."""
+        return in_order(self, SampleOrder(seed))
+
+    def tracking_depth(self, sensor_depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
+        """What of a frame's own depth is used to track it, metres and relative standard deviation, float32 [H, W].
+
+        Jumps are not looked for: the alignment leaves them out. A network's depth costs too much for every frame.
+        """
+        if sensor_depth is None or not isinstance(self.depth, SensorDepth):
+            return None
+        near, far = self.depth.nearest, self.depth.farthest
+        with np.errstate(invalid="ignore"):
+            depth = np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.float32(np.nan))
+        return depth, self.depth.noise(depth)
+
+    @property
+    def follows(self) -> bool:
+        """Whether frames are followed by flow, and described only where that fails."""
+        return self.flow is not None and self.alignment is not None and isinstance(self.depth, SensorDepth)
+
+    @property
+    def coarse_points(self) -> PointMatcher:
+        """The matcher without sub-pixel refinement, for poses that an alignment of the whole picture refines anyway."""
+        points: Any = self.points
+        coarse: PointMatcher = points
+        if getattr(points, "refinement", None) is not None:
+            coarse = replace(points, refinement=None)
+        return coarse
+
+    @property
+    def metric(self) -> bool:
+        """Whether a metric depth fixes the scale of the world."""
+        return not isinstance(self.depth, NoDepth)
+
+
+@dataclass(frozen=True)
+class SlamSettings:
+    """Numbers of the pipeline by stage; lengths in metres, angles in radians, pixels where named so.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> settings = vg.SlamSettings(window=vg.WindowSettings(size=8), line=vg.LineSettings(manhattan=True))
+        >>> settings.window.size, settings.tracking.least_inliers
+        (8, 50)
+
+    """
+
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    line: LineSettings = field(default_factory=LineSettings)
+    depth_terms: DepthSettings = field(default_factory=DepthSettings)
+    weights: WeightSettings = field(default_factory=WeightSettings)
+    camera: CameraSettings = field(default_factory=CameraSettings)
+    window: WindowSettings = field(default_factory=WindowSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+
+    @property
+    def padded_samples(self) -> int | None:
+        """Samples of a segment in a problem's padded size; None where samples stand alone."""
+        return self.line.segment_samples if self.line.two_ends_lines else None
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            kind: Any = entry.default_factory
+            value = getattr(self, entry.name)
+            if not isinstance(value, kind):
+                raise InputError(f"`{entry.name}` is {value!r}; it must be a `vggtgeo.{entry.type}`")
+        samples = self.padded_samples
+        if samples is not None and self.window.line_slots % samples:
+            raise InputError(
+                f"`window.line_slots` is {self.window.line_slots}; with `line.two_ends_lines` it must be a multiple "
+                f"of `line.segment_samples`, which is {samples}"
+            )

@@ -1,0 +1,131 @@
+"""Settings as text and back: tables of a TOML file (`[tracking]`), assignments (`tracking.least_inliers=20`).
+
+A kernel is its name and its numbers, in the order of its fields: `huber 1.5`, `cauchy 2.0`, `square`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from vggtgeo.io.errors import InputError
+from vggtgeo.slam.settings.checks import CheckedSettings
+from vggtgeo.slam.settings.groups import is_kernel
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
+
+KERNELS: dict[str, Callable[..., AbstractKernel]] = {
+    kind.__name__.lower(): kind for kind in (Barron, Cauchy, GemanMcClure, Huber, Square)
+}
+GROUPS = tuple(entry.name for entry in dataclasses.fields(SlamSettings))
+Tables = Mapping[str, Mapping[str, Any]]
+"""Values by the names of group and field."""
+
+
+def names() -> tuple[str, ...]:
+    """Every setting as `group.field`, in the order of the declaration."""
+    defaults = SlamSettings()
+    return tuple(f"{group}.{entry.name}" for group in GROUPS for entry in dataclasses.fields(getattr(defaults, group)))
+
+
+def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
+    """`settings` with the values of `tables`; all are put in at once, so that they are checked together.
+
+    Raises:
+        InputError: a name that is no setting, or a value that it may not have.
+
+    """
+    groups: dict[str, Any] = {}
+    for group, values in tables.items():
+        if group not in GROUPS:
+            raise InputError(f"`{group}` is no group of settings; it must be one of {', '.join(GROUPS)}")
+        for field in values:
+            _check_name(f"{group}.{field}")
+        plain = {field: _value(f"{group}.{field}", value) for field, value in values.items()}
+        groups[group] = dataclasses.replace(getattr(settings, group), **plain)
+    return dataclasses.replace(settings, **groups)
+
+
+def parsed(assignment: str) -> Tables:
+    """`group.field=value` as a table; the value as in TOML, or a word without quotes.
+
+    Raises:
+        InputError: there is no `=`, or the name is no setting.
+
+    """
+    name, equals, text = (part.strip() for part in assignment.partition("="))
+    if not equals:
+        raise InputError(f"`{assignment}` sets nothing; write `group.field=value`, such as `tracking.least_inliers=20`")
+    _check_name(name)
+    group, field = name.split(".")
+    try:
+        read = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        value = text
+    except (ValueError, RecursionError) as error:  # more digits or brackets than Python reads
+        raise InputError(f"`{name}` cannot be read: {error}") from None
+    else:
+        if len(read) > 1:  # a line break begins another setting
+            raise InputError(f"`{name}` is set beside others, of {len(read)} lines; give each a `--set` of its own")
+        value = read["value"]
+    return {group: {field: value}}
+
+
+def tables_of(settings: SlamSettings) -> dict[str, dict[str, Any]]:
+    """Every value, as `updated` takes them, of types that TOML and JSON know."""
+    return {group: _plain(getattr(settings, group)) for group in GROUPS}
+
+
+def changed(settings: SlamSettings) -> dict[str, dict[str, Any]]:
+    """The same of the values that are not the defaults."""
+    defaults = tables_of(SlamSettings())
+    different = {
+        group: {field: value for field, value in values.items() if value != defaults[group][field]}
+        for group, values in tables_of(settings).items()
+    }
+    return {group: values for group, values in different.items() if values}
+
+
+def _plain(group: CheckedSettings) -> dict[str, Any]:
+    values = {entry.name: getattr(group, entry.name) for entry in dataclasses.fields(group)}
+    texts = {name: _kernel_text(value) for name, value in values.items() if isinstance(value, AbstractKernel)}
+    numbers = {name: value.item() for name, value in values.items() if isinstance(value, np.generic)}
+    return {**values, **texts, **numbers}
+
+
+def _check_name(name: str) -> None:
+    known = names()
+    if name not in known:
+        field = name.rpartition(".")[2]
+        same = [other for other in known if other.endswith(f".{field}")]
+        nearest = (same or difflib.get_close_matches(name, known, 1, 0.0))[0]
+        raise InputError(f"`{name}` is no setting; the nearest is `{nearest}`")
+
+
+def _value(name: str, value: Any) -> Any:
+    return _kernel(name, value) if name.endswith(".kernel") and isinstance(value, str) else value
+
+
+def _kernel(name: str, text: str) -> AbstractKernel:
+    kind, *numbers = text.split() or [""]
+    kernel: AbstractKernel | None
+    try:
+        values = [float(number) for number in numbers]
+        kernel = KERNELS[kind.lower()](*values) if all(map(math.isfinite, values)) else None
+    except (KeyError, TypeError, ValueError):
+        kernel = None
+    if kernel is None or not is_kernel(kernel):
+        expected = f"one of {', '.join(KERNELS)} and its numbers, the width above 0, such as `cauchy 2.0`"
+        raise InputError(f"`{name}` is {text!r}; it must be {expected}")
+    return kernel
+
+
+def _kernel_text(kernel: AbstractKernel) -> str:
+    fields = dataclasses.fields(kernel)
+    return " ".join((type(kernel).__name__.lower(), *(repr(float(getattr(kernel, entry.name))) for entry in fields)))

@@ -1,0 +1,182 @@
+"""A keyframe: an image with everything that was measured in it, and the estimates that hang on it."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
+from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages, array_of
+from vggtgeo.slam.tracking.description import Description
+
+
+@dataclass(frozen=True, eq=False)
+class Slots:
+    """Pixels of one keyframe that carry an inverse depth: key points, or samples of its segments.
+
+    pixels: float [m, 2]. inverse_depth: float [m], 1/m, NaN = not known yet. prior, sigma: float [m], metric inverse
+    depth and its standard deviation, 1/m, NaN = none. prior_confidence: float [m] in [0, 1].
+    confidence: float [m] in [0, 1], how far the image can be trusted there.
+    """
+
+    pixels: np.ndarray
+    inverse_depth: np.ndarray
+    prior: np.ndarray
+    sigma: np.ndarray
+    prior_confidence: np.ndarray
+    confidence: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; its images;
+    what the roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each
+    sample); and place, what it looks like as a whole, float32 [n] of unit length, None = not known.
+    recorded: of a keyframe of a known map its time stamp in the run that made it, s, by the clock of that run.
+
+    A map lives as long as the run, so what it holds is small: see `KeyframeImages`.
+    """
+
+    number: int
+    frame: int
+    timestamp: float
+    pose: np.ndarray
+    images: KeyframeImages
+    features: Features
+    lines: LineFeatures
+    line_depths: np.ndarray
+    points: Slots
+    samples: Slots
+    sample_segment: np.ndarray
+    place: np.ndarray | None = None
+    recorded: float | None = None
+
+    @property
+    def image(self) -> np.ndarray:
+        """uint8 [H, W, 3] RGB."""
+        return array_of(self.images.colour)
+
+    @property
+    def depth(self) -> np.ndarray:
+        """float16 [H, W], metres, NaN = none."""
+        return array_of(self.images.depth)
+
+    @property
+    def depth_sigma(self) -> np.ndarray:
+        """float16 [H, W], relative standard deviation of the depth."""
+        return array_of(self.images.depth_sigma)
+
+    @property
+    def depth_confidence(self) -> np.ndarray:
+        """uint8 [H, W], 255 is 1."""
+        return array_of(self.images.depth_confidence)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the image, pixels."""
+        height, width = self.images.colour.shape[:2]
+        return height, width
+
+    def compressed(self) -> Keyframe:
+        """The keyframe with its images compressed."""
+        return self if self.images.small else replace(self, images=self.images.compressed())
+
+    def expanded(self) -> Keyframe:
+        """The keyframe with its images as arrays, to be looked at often."""
+        return replace(self, images=self.images.expanded()) if self.images.small else self
+
+
+def make_keyframe(
+    number: int,
+    frame: Frame,
+    pose: np.ndarray,
+    description: Description,
+    roles: Roles,
+    settings: SlamSettings,
+    intrinsics: np.ndarray,
+    lines: LineFeatures | None = None,
+) -> Keyframe:
+    """Run the roles that only keyframes need, and read depth and confidence at key points and line samples.
+
+    lines: the frame's segments, where tracking has found them already.
+    """
+    with ThreadPoolExecutor(1, thread_name_prefix="describe") as pool:
+        described = pool.submit(lambda: description.features)  # beside the rest: it takes as long as all of that
+        depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
+        confidence = roles.confidence.confidence(frame.image)
+        lines = find_lines(frame.image, roles, settings) if lines is None else lines
+        features = described.result()
+    ends = lines.segments.endpoints
+    line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
+    segment, pixels, fraction = sample_segments(ends, settings.line.line_spacing)
+    points = _slots_at(features.pixels, depth, confidence)
+    samples = _slots_at(pixels, depth, confidence)
+    on_line = _along_segments(line_depths, segment, fraction)
+    return Keyframe(
+        number=number,
+        frame=frame.index,
+        timestamp=frame.timestamp,
+        pose=pose,
+        images=KeyframeImages(
+            frame.image,
+            depth.depth.astype(np.float16),
+            depth.sigma_rel.astype(np.float16),
+            np.rint(255 * depth.confidence).astype(np.uint8),
+        ),
+        features=features,
+        lines=lines,
+        line_depths=line_depths,
+        points=points,
+        samples=_with_line_depth(samples, on_line),
+        sample_segment=segment,
+        place=place_vector(features),
+    )
+
+
+def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineFeatures:
+    """The described segments of an image; none where the settings leave lines out."""
+    if not settings.line.use_lines:
+        return roles.line_matches.describe(image, Segments(np.zeros((0, 2, 2)), np.zeros(0)))
+    found = roles.lines.detect(image)
+    if roles.still_parts is not None:
+        found = roles.still_parts.without_segments(found)
+    return roles.line_matches.describe(image, found)
+
+
+def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) -> Slots:
+    measured = depth.depth, depth.sigma_rel, depth.confidence
+    z, sigma_rel, trust = (read_at(image, pixels).astype(np.float64) for image in measured)
+    inverse, seen = 1.0 / z, read_at(confidence, pixels).astype(np.float64)
+    return Slots(pixels, inverse, inverse, sigma_rel * inverse, np.nan_to_num(trust), seen)
+
+
+def read_at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """The nearest pixel's value, [m] or [m, 3]; beyond the border, where a lens may have moved it, the border's."""
+    height, width = image.shape[:2]
+    columns, rows = np.rint(pixels).astype(int).T
+    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+
+
+def _along_segments(line_depths: np.ndarray, segment: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Inverse depth of each sample from its segment's ends: affine along the image of a straight line."""
+    inverse = 1.0 / line_depths[segment]
+    return inverse[:, 0] + fraction * (inverse[:, 1] - inverse[:, 0])
+
+
+def _with_line_depth(samples: Slots, on_line: np.ndarray) -> Slots:
+    """An edge of an object lies on a jump of depth, where a single pixel's depth is a coin toss: trust the line fit."""
+    known = np.isfinite(on_line)
+    floor = 0.02 * on_line
+    return Slots(
+        pixels=samples.pixels,
+        inverse_depth=np.where(known, on_line, np.nan),
+        prior=np.where(known, on_line, np.nan),
+        sigma=np.where(known, np.fmax(np.nan_to_num(samples.sigma), floor), np.nan),
+        prior_confidence=np.where(known, np.maximum(samples.prior_confidence, 0.3), 0.0),
+        confidence=samples.confidence,
+    )

@@ -1,0 +1,143 @@
+"""Maps that outlast their run: saved as a file, loaded by another run, which finds itself in it and goes on from there.
+
+A map is a state that no frame has been tracked in: keyframes with all that was measured in them, their matches, what
+ties them, the camera. Its keyframes are of no frame of the run that uses it, so their frames and times (s) count up to
+-1: before the first frame of any run, in their order. Clocks of two runs may show the same time (a video begins at 0),
+so that times alone would not tell their keyframes apart: the one at which a keyframe was recorded is kept beside.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import path_of
+from vggtgeo.io.record_file import Layout
+from vggtgeo.io.records import by_name
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
+from vggtgeo.models.roles import PointMatcher
+from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
+from vggtgeo.slam.window.pending_window import settled
+
+MAP = Layout("map", VERSION, by_name(STATE_CLASSES), UPGRADES)
+LEAST_KNOWN = 0.2
+"""Share of a keyframe's key points that its own picture, described once more as it is kept, must match: 0.71 and more
+of SIFT's, 0.92 of ORB's (13 keyframes of redkitchen and building-walk); descriptors of another kind hardly any."""
+FEW = 20
+"""Key points of which nothing is asked."""
+SAME_CAMERA = 0.02
+"""Relative difference of focal lengths and principal point up to which a calibration is that of a map's camera: two
+calibrations of one camera differ by up to 1.6 % (redkitchen: 525 px as given, 534 as adjusted)."""
+
+
+def as_map(slam: Slam) -> Slam:
+    """What of a run's state is its map."""
+    slam = settled(slam)
+    count = len(slam.keyframes)
+    keyframes = tuple(
+        replace(
+            keyframe.compressed(),
+            frame=keyframe.number - count,
+            timestamp=float(keyframe.number - count),
+            recorded=keyframe.timestamp if keyframe.recorded is None else keyframe.recorded,
+        )
+        for keyframe in slam.keyframes
+    )
+    first = Slam(slam.intrinsics, slam.given_intrinsics, slam.intrinsics_sigma, slam.metric)
+    return replace(
+        first,
+        keyframes=keyframes,
+        pairs=slam.pairs,
+        factors=slam.factors,
+        origins=slam.origins,
+        pose_sigma=slam.pose_sigma,
+        lens=slam.lens,
+    )
+
+
+def save_map(path: str | os.PathLike[str], slam: Slam) -> None:
+    """Writes the map of a state (the last of a run, best after `vggtgeo.finish`), atomically; no pickles.
+
+    Raises:
+        InputError: the state has no keyframe.
+        TypeError: a matcher's descriptors are of a class that files do not know.
+
+    """
+    if not slam.keyframes:
+        raise InputError(f"there is no keyframe to save as a map in `{path}`; track at least one frame")
+    MAP.write(path_of("path", path), as_map(slam))
+
+
+@in_double_precision
+def load_map(path: str | os.PathLike[str]) -> Slam:
+    """The map that `vggtgeo run --save-map` or `Result.save_map` wrote, for `known_map` of `vggtgeo.run` and
+    `vggtgeo.reconstruct`.
+
+    Raises:
+        InputError: the file is missing, damaged, of a version that is not known, or no map.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.load_map("office.map")
+        Traceback (most recent call last):
+            ...
+        vggtgeo.io.errors.InputError: `office.map` is no file; give that of a map
+
+    """
+    found, _ = MAP.read(path_of("path", path))
+    known = checked_state(Path(path), found)
+    if not known.keyframes or known.frames or known.window or any(one.frame >= 0 for one in known.keyframes):
+        raise InputError(f"`{path}` holds no map; expected keyframes alone: save one with `vggtgeo run --save-map`")
+    return known
+
+
+def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
+    """The state before the first frame of a run with this camera and matcher in a known map.
+
+    Raises:
+        InputError: the map is of another camera, or its key points are another matcher's.
+
+    """
+    height, width = known.keyframes[0].size
+    if (width, height) != (camera.width, camera.height):
+        raise InputError(
+            f"`known_map` is of images of {width} x {height} pixels; those of this run are {camera.width} x "
+            f"{camera.height}: a map is used with the camera that it was made with"
+        )
+    given = np.array(camera.intrinsics, np.float64)
+    own = known.given_intrinsics if known.calibrated else known.intrinsics
+    if camera.known and np.abs(given - own).max() > SAME_CAMERA * own[0]:
+        cameras = [", ".join(f"{value:.1f}" for value in values) for values in (own, given)]
+        raise InputError(
+            f"`known_map` is of a camera with fx, fy, cx, cy = {cameras[0]} px; that of this run has {cameras[1]} px: "
+            "a map is used with the camera that it was made with"
+        )
+    _check_matcher(known, points)
+    if known.calibrated:
+        return replace(known, lost=1)
+    # Its own run found it, and its keyframes stand as that camera sees them.
+    return replace(known, lost=1, given_intrinsics=known.intrinsics, camera_found=True)
+
+
+def _check_matcher(known: Slam, points: PointMatcher) -> None:
+    """InputError where a run's matcher does not know a picture of the map by the key points that the map has of it."""
+    keyframe = max(known.keyframes, key=lambda keyframe: len(keyframe.features))
+    if len(keyframe.features) < FEW or getattr(points, "simulated", False):
+        return  # a simulated matcher knows the frames of its own sequence alone, to the bit
+    before, again = keyframe.features, points.describe(keyframe.image)
+    ours, theirs = again.descriptors, before.descriptors
+    alike = type(ours) is type(theirs)
+    if isinstance(ours, PixelDescriptors) and isinstance(theirs, PixelDescriptors):
+        alike = ours.vectors.shape[1] == theirs.vectors.shape[1]
+    if not alike or len(points.match(before, again)) < LEAST_KNOWN * min(len(before), len(again)):
+        raise InputError(
+            "`known_map` has key points of another matcher than this run's, which does not find a picture of the map "
+            "in the map: use it with the points (`--points`, `--preset`) that it was made with, or begin a new map"
+        )

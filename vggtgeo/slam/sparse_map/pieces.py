@@ -1,0 +1,101 @@
+"""Pieces of map: a camera that was lost and not found begins one of its own, which joins the rest when they meet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
+from vggtgeo.slam.sparse_map.units import longer, ratio_of_units, scaled_factor, scaled_keyframe, scaled_record
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.relocalisation import relocalise
+from vggtgeo.slam.tracking.track import Sight, Track
+from vggtgeo.slam.window.window_prior import WindowPrior
+
+TRIED = 2
+"""Keyframes of the other pieces that are verified for each new keyframe."""
+
+
+def join_pieces(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Slam:
+    """Where the newest keyframe, seen as `sight`, shows a place of an earlier piece, move its piece there.
+
+    By a rigid motion where lengths are metres, else by a similarity: each piece of free scale has a unit of its own.
+    """
+    if len(slam.origins) < 2:
+        return slam
+    label = piece_of(slam)
+    others = [keyframe for keyframe in slam.keyframes if label[keyframe.number] != label[-1]]
+    if not others:
+        return slam
+    place = relocalise(sight, others, slam, roles, TRIED)
+    if place is None:
+        return slam
+    if slam.metric:
+        return _joined(slam, place, slam.window[:1])
+    ratio = unit_ratio(slam, place, roles)
+    return slam if ratio is None else _joined(scaled_piece(slam, ratio), place, slam.window[:2])
+
+
+def unit_ratio(slam: Slam, place: Track, roles: Roles) -> float | None:
+    """By what the last piece must be multiplied to have the unit of the keyframe that its newest one was found by."""
+    old, new = place.keyframe, slam.keyframes[-1]
+    matches = roles.points.match(old.features, new.features)
+    return ratio_of_units(old, new, matches.select(matches.index_j >= 0), place.relative, slam.intrinsics)
+
+
+def scaled_piece(slam: Slam, ratio: float) -> Slam:
+    """The state with all lengths of the newest piece multiplied by `ratio`; its own unit, the baseline, is given up."""
+    inside = newest_piece(slam)
+    keyframes = tuple(scaled_keyframe(k, ratio) if inside(k.number) else k for k in slam.keyframes)
+    frames = tuple(scaled_record(record, ratio) if inside(record.reference) else record for record in slam.frames)
+    own = lambda factor: all(inside(number) for number in factor.keyframes)
+    factors = tuple(scaled_factor(factor, ratio) if own(factor) else factor for factor in slam.factors)
+    kept = tuple(f for f in factors if not (isinstance(f, MeasuredBaseline) and own(f)))
+    velocity = longer(slam.velocity, ratio)
+    return replace(slam, keyframes=keyframes, frames=frames, factors=kept, velocity=velocity, prior=None, solved=None)
+
+
+def newest_piece(slam: Slam) -> Callable[[int], bool]:
+    """Whether a keyframe, by its number, hangs together with the newest one."""
+    label = piece_of(slam)
+    return lambda number: bool(label[number] == label[-1])
+
+
+def _joined(slam: Slam, place: Track, held: tuple[int, ...]) -> Slam:
+    """The last piece carried by one rigid motion of the world, so that the newest keyframe is where it was found.
+
+    held: members of the window that stay where they are; of free scale two, which hold the unit.
+    """
+    inside, newest = newest_piece(slam), slam.keyframes[-1]
+    carried = rigid.invert(newest.pose) @ place.pose
+    keyframes = tuple(
+        replace(keyframe, pose=rigid.orthonormal(keyframe.pose @ carried)) if inside(keyframe.number) else keyframe
+        for keyframe in slam.keyframes
+    )
+    began = next(keyframe.frame for keyframe in slam.keyframes if inside(keyframe.number))
+    note = f"the piece of map that began at frame {began} is joined to the one before at frame {newest.frame}"
+    tie = MeasuredRelativePose(place.keyframe.number, newest.number, place.relative, place.information)
+    return replace(
+        slam,
+        keyframes=keyframes,
+        origins=tuple(origin for origin in slam.origins if not inside(origin)),
+        factors=(*slam.factors, tie),
+        held=held,
+        prior=None if slam.prior is None else _carried_prior(slam.prior, carried),
+        solved=None,
+        notes=(*slam.notes, note),
+    )
+
+
+def _carried_prior(known: WindowPrior, carried: np.ndarray) -> WindowPrior:
+    """The window's prior after a rigid motion of the world: left tangents do not see it, linearisation points do."""
+    poses = rigid.to_matrix(np.asarray(known.prior.poses.wxyz_xyz, np.float64)) @ carried
+    moved = eqx.tree_at(lambda p: p.poses.wxyz_xyz, known.prior, jnp.asarray(rigid.to_quaternion(poses)))
+    return WindowPrior(known.keyframes, moved)

@@ -1,0 +1,86 @@
+"""Units of maps without metric depth: how those of two keyframes compare, and a map in another unit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.models.roles import PointMatches
+from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.state import FramePose, SecondMotion
+
+LEAST_SHARED = 20
+"""Key points with a depth in both keyframes that tell the ratio of their units."""
+MOST_SCALE_ERROR = 0.03
+"""Largest standard error of that ratio; at 3 m it moves what is joined by 9 cm, which the adjustment then mends."""
+
+
+def ratio_of_units(
+    old: Keyframe, new: Keyframe, matches: PointMatches, relative: np.ndarray, intrinsics: np.ndarray
+) -> float | None:
+    """By what lengths of `new` must be multiplied to have the unit of `old`; both ends of the matches are key points.
+
+    The median, over key points that both keyframes know the depth of, of depth as the old one has it over depth as the
+    new one has it, in the new camera, which `relative` leads to. None where they are too few, or disagree.
+    """
+    before, after = old.points.inverse_depth[matches.index_i], new.points.inverse_depth[matches.index_j]
+    known = np.isfinite(before) & np.isfinite(after)
+    matches, before, after = matches.select(known), before[known], after[known]
+    local = rigid.unproject(matches.pixels_i, before, np.eye(4), intrinsics)
+    depth = local @ relative[2, :3] + relative[2, 3]
+    ahead = depth > 0
+    if np.count_nonzero(ahead) < LEAST_SHARED:
+        return None
+    logs = np.log(depth[ahead] * after[ahead])
+    middle = float(np.median(logs))
+    # Standard error of a median: 1.25 sigma / sqrt(n), sigma from the median absolute deviation.
+    error = 1.25 * 1.48 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
+    return float(np.exp(middle)) if error < MOST_SCALE_ERROR else None
+
+
+def longer(motion: np.ndarray, ratio: float) -> np.ndarray:
+    """A rigid motion, float64 [4, 4], whose translation is `ratio` times as long."""
+    changed = motion.copy()
+    changed[:3, 3] *= ratio
+    return changed
+
+
+def scaled_keyframe(keyframe: Keyframe, ratio: float) -> Keyframe:
+    """The keyframe in a world whose lengths are `ratio` times as long."""
+    nearer = lambda slots: replace(slots, inverse_depth=slots.inverse_depth / ratio)
+    points: Slots = nearer(keyframe.points)
+    samples: Slots = nearer(keyframe.samples)
+    line_depths = keyframe.line_depths * ratio
+    return replace(keyframe, pose=longer(keyframe.pose, ratio), points=points, samples=samples, line_depths=line_depths)
+
+
+def scaled_record(record: FramePose, ratio: float) -> FramePose:
+    """The record of a frame that hangs on such a keyframe."""
+    arrival = None if record.arrival is None else (record.arrival[0], longer(record.arrival[1], ratio))
+    second = None if record.second is None else scaled_second(record.second, ratio)
+    return replace(record, relative=longer(record.relative, ratio), arrival=arrival, second=second)
+
+
+def scaled_second(second: SecondMotion, ratio: float) -> SecondMotion:
+    """What the second keyframe says of such a frame."""
+    information = _of_longer(second.information, ratio)
+    return replace(second, relative=longer(second.relative, ratio), information=information)
+
+
+def scaled_factor(factor: Factor, ratio: float) -> Factor:
+    """What is known of such keyframes; a baseline stays what it is."""
+    return scaled_motion(factor, ratio) if isinstance(factor, MeasuredRelativePose) else factor
+
+
+def scaled_motion(motion: MeasuredRelativePose, ratio: float) -> MeasuredRelativePose:
+    """A measured motion whose translation is `ratio` times as long, and its information."""
+    return replace(motion, pose=longer(motion.pose, ratio), information=_of_longer(motion.information, ratio))
+
+
+def _of_longer(information: np.ndarray, ratio: float) -> np.ndarray:
+    """The information [6, 6], translation first, of a motion that is `ratio` times as long."""
+    by = np.repeat([1.0 / ratio, 1.0], 3)
+    return np.asarray(information * np.outer(by, by))

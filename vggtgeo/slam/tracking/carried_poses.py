@@ -1,0 +1,58 @@
+"""The pose of every frame, carried along with the keyframe that it hangs on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vggtgeo.geometry import lie, rigid
+from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.tracking.frame_refinement import by_both
+from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
+
+GROSS = SHARED_ERRORS * AGREEMENT_GATE
+"""Of the squared Mahalanobis distance between a keyframe's pose as it was tracked and as it was adjusted: above, that
+frame alone was tracked wrongly, and its error is none of those before it. Healthy keyframes of the clips have 121 and
+less; one of building-walk 670 to 790, 21 cm, of which the frame before it took half."""
+
+
+def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
+    """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known.
+
+    A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and the
+    next is shared out over the frames in between, in proportion to time, so that the path has no steps, unless it is
+    the gross error of one (`GROSS`). What a second keyframe says of a frame is averaged with that
+    (`frame_refinement.py`). The frame that a keyframe was made of has the keyframe's pose, whether it was tracked there
+    (`arrival`) or began a piece of map.
+    """
+    poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
+    times = np.array([record.timestamp for record in slam.frames])
+    ties = {(tie.first, tie.second): tie for tie in slam.ties}
+    last = 0
+    for row, record in enumerate(slam.frames):
+        if not _made_its_keyframe(record):
+            continue
+        if record.arrival is not None:
+            reference, tracked = record.arrival
+            arrived = tracked @ slam.keyframes[reference].pose
+            change = poses[row] @ rigid.invert(arrived)
+            tie = ties.get((reference, record.reference))
+            gross = tie is not None and _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
+            between = [] if gross else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
+            span = max(times[row] - times[last], 1e-9)
+            for k in between:
+                poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
+        last = row
+    return times, by_both(slam, poses)
+
+
+def _is_gross(arrived: np.ndarray, adjusted: np.ndarray, tie: MeasuredRelativePose) -> bool:
+    """Whether an adjustment moved a keyframe [4, 4] by more than its tracking left open."""
+    off = lie.steps(arrived[None], adjusted[None])[0]
+    return bool(off @ tie.information @ off > GROSS)
+
+
+def _made_its_keyframe(record: FramePose) -> bool:
+    """By its pose, exactly: keyframes of a known map may have the same number of a frame."""
+    return record.tracked and np.array_equal(record.relative, np.eye(4))

@@ -1,0 +1,108 @@
+"""One motion from a keyframe to a frame out of what points, picture, lines and the motion so far know: means by
+information, in the tangent space of the motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2 as chi_square
+
+from vggtgeo.geometry import rigid
+from vggtgeo.models.rigid_motion import exponential
+from vggtgeo.models.roles import LineFeatures, LineMatcher
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.tracking.evidence import Evidence, tangent
+from vggtgeo.slam.tracking.line_alignment import align_lines
+from vggtgeo.slam.tracking.rgbd_alignment import Aligned
+
+SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
+"""What no number of samples removes (calibration, rolling shutter, clocks): metres, radians, share of the motion.
+Measured on pairs of frames, the dense alignment against the truth by the squared Mahalanobis distance, whose median
+should be 5.3: where the truth is exact (icl-office) the samples' own information is right (3.7 to 5.4, 1 to 8 frames
+apart). On the HoloLens clips, whose truth and camera are off by a pixel, it is 30 to 80 times that; with this floor 4.1
+to 5.7 (1 and 3 frames apart)."""
+AGREEMENT_GATE = float(chi_square.ppf(0.9999, 6))
+"""Of the squared Mahalanobis distance between the poses by points and by the picture, below which they are averaged."""
+LARGEST_DISAGREEMENT = 0.15
+"""Metres between them, beyond which many points are believed rather than the picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Keyframe camera -> frame camera, float64 [4, 4], and its information [6, 6] over the left tangent."""
+
+    motion: np.ndarray
+    information: np.ndarray
+
+
+def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) -> Motion | None:
+    """The mean of both where they agree to within their noise, else the one with the better evidence."""
+    if dense is None:
+        return by_points
+    by_picture = Motion(dense.motion, dense.information)
+    if by_points is None:
+        return by_picture
+    off = tangent(by_points.motion @ rigid.invert(dense.motion))
+    noise = [np.linalg.inv(with_systematic(one.information, one.motion)) for one in (by_points, by_picture)]
+    if off @ np.linalg.solve(noise[0] + noise[1], off) < AGREEMENT_GATE:
+        both = by_points.information + dense.information
+        mean = np.linalg.solve(both + 1e-9 * np.eye(6), by_points.information @ off)
+        return Motion(exponential(mean) @ dense.motion, both)
+    # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
+    near = np.linalg.norm(off[:3]) < LARGEST_DISAGREEMENT or not evidence.points_strong
+    return by_picture if evidence.dense_fair and near else by_points
+
+
+def drawn_to(found: Motion, prior: Motion) -> Motion:
+    """The mean of a measured motion and the expected one.
+
+    A direction that is seen badly goes on as the motion did; the information is that of what was measured alone.
+    """
+    off = tangent(prior.motion @ rigid.invert(found.motion))
+    step = np.linalg.solve(found.information + prior.information, prior.information @ off)
+    return Motion(exponential(step) @ found.motion, found.information)
+
+
+def wanting(found: Motion) -> bool:
+    """Whether, in some direction, a motion is known worse than to within what no number of samples removes.
+
+    Elsewhere neither lines nor the points of other keyframes change anything for the better (docs/lines.md), and
+    finding lines costs as much as the alignment.
+    """
+    floor = _floor(found.motion)
+    return bool(np.linalg.eigvalsh(found.information * np.outer(floor, floor))[0] < 1.0)
+
+
+def with_lines(
+    found: Motion | None,
+    prior: Motion | None,
+    evidence: Evidence,
+    keyframe: Keyframe,
+    seen: LineFeatures,
+    intrinsics: np.ndarray,
+    matcher: LineMatcher,
+) -> tuple[Motion | None, Evidence]:
+    """What was found (drawn to the prior) with what segments know of it; where nothing was, from the prior by lines."""
+    measured = np.zeros((6, 6)) if found is None else found.information
+    start = prior if found is None else found
+    assert start is not None
+    known = measured if prior is None else measured + prior.information
+    lines = align_lines(keyframe, seen, matcher, start.motion, known, intrinsics)
+    if lines is None:
+        return found, evidence
+    evidence = replace(evidence, lines=lines.agreed, visible_lines=lines.visible)
+    return Motion(lines.motion, measured + lines.information), evidence
+
+
+def with_systematic(information: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """What is left of an information where the errors that no sample removes are counted in."""
+    return np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + np.diag(_floor(motion) ** 2))
+
+
+def _floor(motion: np.ndarray) -> np.ndarray:
+    """Standard deviations float64 [6] of a motion that no number of samples removes."""
+    length, angle = (np.linalg.norm(part) for part in np.split(tangent(motion), 2))
+    metres, radians, share = SYSTEMATIC
+    return np.repeat([metres + share * length, radians + share * angle], 3)

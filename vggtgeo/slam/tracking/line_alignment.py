@@ -1,0 +1,237 @@
+"""A pose by line segments: those of a keyframe, as segments in space, against those that a frame shows.
+
+With `T` the motion keyframe camera -> frame camera, `X` an end of a segment in the keyframe's camera, and
+`l = (a, b, c)`, `a^2 + b^2 = 1`, the line of the segment that it is matched to:
+
+    r = l . (pi(T X), 1)      pixels, one for each end
+
+Its variance has three parts: the observed line at the place `u` where the end falls (0 and 1 at the observed ends, each
+of which is off by `s` across the segment), the end in the keyframe, and its inverse depth `d`, which moves the
+projection along the epipolar line:
+
+    sigma^2 = s^2 ((1 - u)^2 + u^2) + s^2 + ((a, b) . d pi / d d)^2 sigma_d^2
+
+So an end that is carried far beyond the observed segment says little, and one that slides along it says nothing: what
+lines do not determine is missing in the information. Each iteration solves the 6 x 6 normal equations over the left
+tangent (`T <- exp(xi) T`, translation first), together with what is known of `T` before, weighted by Tukey's biweight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.models import pinhole
+from vggtgeo.models.classical import line_coefficients
+from vggtgeo.models.rigid_motion import exponential
+from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.tracking.evidence import tangent, worst_sigma
+
+END_SIGMA = 0.7
+"""Standard deviation of a segment's end across it, pixels."""
+TUKEY = 4.685
+"""Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
+LEAST_LINES = 3
+"""Three lines in general position determine a pose."""
+NEAREST = 0.1
+"""Metres; what is nearer to the camera is not projected."""
+ITERATIONS, ROUNDS = 8, 3
+"""Steps between two matchings, and matchings: the next has the better pose."""
+SMALL = 2e-3
+"""Metres and radians; a matching from a pose that was so near is not done again."""
+WIDEST_MISS = 80.0
+"""Pixels; a pose that may be farther off than this is searched for no farther: there, other segments are as near."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceSegments:
+    """Segments of a keyframe whose depth is known.
+
+    index: int [l], in the keyframe's own list. rays: float64 [l, 2, 3] of their ends, z = 1. inverse_depth, sigma:
+    float64 [l, 2], of their ends and its standard deviation, 1/m.
+    """
+
+    index: np.ndarray
+    rays: np.ndarray
+    inverse_depth: np.ndarray
+    sigma: np.ndarray
+
+    @classmethod
+    def of(cls, keyframe: Keyframe, intrinsics: np.ndarray) -> SpaceSegments:
+        """Ends by the current inverse depths of the samples, which the adjustment improves: affine along a segment."""
+        count, samples, segment = len(keyframe.lines), keyframe.samples, keyframe.sample_segment
+        known = np.isfinite(samples.inverse_depth) & np.isfinite(samples.sigma)
+        start, along = _ends_of(keyframe, count)
+        fraction = ((samples.pixels - start[segment]) * along[segment]).sum(1) / (along**2).sum(1)[segment]
+        total = lambda values: np.bincount(segment[known], values[known], count)
+        n, t, tt = total(np.ones_like(fraction)), total(fraction), total(fraction**2)
+        d, td, s = total(samples.inverse_depth), total(fraction * samples.inverse_depth), total(samples.sigma)
+        spread = n * tt - t * t
+        index = np.nonzero((n >= 2) & (spread > 1e-9))[0]
+        n, t, tt, d, td, spread = (values[index] for values in (n, t, tt, d, td, spread))
+        offset, slope = (tt * d - t * td) / spread, (n * td - t * d) / spread
+        inverse = np.stack([offset, offset + slope], 1)
+        good = (inverse > 1e-3).all(1)
+        index = index[good]
+        rays = pinhole.rays(keyframe.lines.segments.endpoints[index], intrinsics)
+        sigma = np.repeat((s[index] / n[good])[:, None], 2, 1)
+        return cls(index, rays, inverse[good], sigma)
+
+
+def _ends_of(keyframe: Keyframe, count: int) -> tuple[np.ndarray, np.ndarray]:
+    ends = keyframe.lines.segments.endpoints.reshape(count, 2, 2)
+    return ends[:, 0], ends[:, 1] - ends[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedLines:
+    """The result of an alignment.
+
+    motion: float64 [4, 4], keyframe camera -> frame camera. information: float64 [6, 6] of the lines alone over its
+    left tangent. agreed: matched segments whose ends both lie on their lines to within three standard deviations.
+    visible: segments of the keyframe that should be in the frame's image at that pose.
+    """
+
+    motion: np.ndarray
+    information: np.ndarray
+    agreed: int
+    visible: int
+
+
+def align_lines(
+    source: Keyframe,
+    seen: LineFeatures,
+    matcher: LineMatcher,
+    start: np.ndarray,
+    known: np.ndarray,
+    intrinsics: np.ndarray,
+) -> AlignedLines | None:
+    """The motion keyframe -> frame by their segments, from `start` float64 [4, 4] with information `known` [6, 6].
+
+    None where fewer than three segments are matched, or none of them lies before the camera in the end.
+    """
+    segments = SpaceSegments.of(source, intrinsics)
+    if len(segments.index) < LEAST_LINES or len(seen) < LEAST_LINES:
+        return None
+    depths = np.full((len(source.lines), 2), np.nan)
+    depths[segments.index] = 1.0 / segments.inverse_depth
+    place = np.full(len(source.lines), -1)
+    place[segments.index] = np.arange(len(segments.index))
+    motion, rows = start, None
+    believed = known
+    for _ in range(ROUNDS):
+        error = _miss(believed, segments, intrinsics)
+        found = matcher.match(source.lines, seen, RelativeView(motion, intrinsics, depths, error))
+        has_depth = place[found.index_i] >= 0
+        if np.count_nonzero(has_depth) < LEAST_LINES:
+            return None
+        own, theirs = place[found.index_i[has_depth]], seen.segments.endpoints[found.index_j[has_depth]]
+        before = motion
+        for _ in range(ITERATIONS):
+            rows = _rows(segments, own, theirs, motion, intrinsics)
+            step = _step(rows, motion, start, known)
+            motion = exponential(step) @ motion
+            if np.abs(step).max() < 1e-4:
+                break
+        rows = _rows(segments, own, theirs, motion, intrinsics)
+        believed = known + _normal(rows.jacobian, _weights(rows.residual))
+        if np.abs(tangent(motion @ rigid.invert(before))).max() < SMALL:
+            break
+    assert rows is not None
+    weight = _weights(rows.residual)
+    if not weight.any():
+        return None
+    agreed = int(np.count_nonzero((np.abs(rows.residual) < 3.0).all(1)))
+    information = _without_chance(_normal(rows.jacobian, weight), _normal(rows.sliding, weight))
+    return AlignedLines(motion, information, agreed, _visible(segments, motion, intrinsics, source))
+
+
+def _miss(known: np.ndarray, segments: SpaceSegments, intrinsics: np.ndarray) -> float:
+    """How far a pose of information `known` may move segments of middling depth in the image, pixels."""
+    shift, turn = worst_sigma(known)
+    return min(float(intrinsics[0]) * float(np.hypot(turn, shift * np.median(segments.inverse_depth))), WIDEST_MISS)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """jacobian: [m, 2, 6] and residual: [m, 2], in standard deviations; a residual behind the camera is infinite.
+    sliding: [m, 2, 6], a standard deviation of the Jacobian: the observed line turns by its noise, and then an end that
+    moves along it seems to leave it.
+    """
+
+    jacobian: np.ndarray
+    residual: np.ndarray
+    sliding: np.ndarray
+
+
+def _rows(
+    segments: SpaceSegments, own: np.ndarray, theirs: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray
+) -> _Rows:
+    turned = segments.rays[own] @ motion[:3, :3].T
+    inverse = segments.inverse_depth[own][..., None]
+    local = turned / inverse + motion[:3, 3]
+    front = local[..., 2] > NEAREST
+    safe = np.where(front[..., None], local, [0.0, 0.0, 1.0])
+    line = line_coefficients(theirs)
+    pixels = pinhole.project(safe, intrinsics)
+    row_x, row_y = (r.T.reshape(*safe.shape[:2], 6) for r in pinhole.projection_rows(safe.reshape(-1, 3), intrinsics))
+    jacobian = line[:, None, :1] * row_x + line[:, None, 1:2] * row_y
+    residual = (pixels * line[:, None, :2]).sum(2) + line[:, None, 2]
+    # d X / d d = -ray / d^2, turned: the projection's derivative by X is the first three columns.
+    by_depth = -(jacobian[..., :3] * turned).sum(2) / inverse[..., 0] ** 2
+    along = theirs[:, 1] - theirs[:, 0]
+    squared = (along**2).sum(1)[:, None]
+    u = ((pixels - theirs[:, :1]) * along[:, None]).sum(2) / squared
+    variance = END_SIGMA**2 * ((1 - u) ** 2 + u**2 + 1.0) + (by_depth * segments.sigma[own]) ** 2
+    sigma = np.sqrt(variance)
+    sliding = (along[:, None, :1] * row_x + along[:, None, 1:] * row_y) * (np.sqrt(2.0) * END_SIGMA / squared)[
+        ..., None
+    ]
+    return _Rows(jacobian / sigma[..., None], np.where(front, residual / sigma, np.inf), sliding / sigma[..., None])
+
+
+def _without_chance(hessian: np.ndarray, by_chance: np.ndarray) -> np.ndarray:
+    """The information that is left where that of the noise in the Jacobian, `E[J' J] - J0' J0`, is taken off.
+
+    Parallel lines, each turned a little by noise, would else seem to determine the motion along them.
+    """
+    root = np.linalg.cholesky(hessian + 1e-12 * np.trace(hessian) * np.eye(6))
+    half = np.linalg.solve(root, by_chance)
+    share, basis = np.linalg.eigh(np.linalg.solve(root, half.T))
+    left = root @ basis
+    return (left * np.maximum(1.0 - share, 0.0)) @ left.T
+
+
+def _weights(residual: np.ndarray) -> np.ndarray:
+    """Tukey's biweight, wide enough for a start that is off; a residual larger than expected is also known less."""
+    finite = np.isfinite(residual)
+    scale = max(1.4826 * float(np.median(np.abs(residual[finite]))), 1.0) if finite.any() else 1.0
+    inside = np.where(finite, residual / (TUKEY * scale), 1.0)
+    return np.maximum(1.0 - inside**2, 0.0) ** 2 / scale**2
+
+
+def _step(rows: _Rows, motion: np.ndarray, start: np.ndarray, known: np.ndarray) -> np.ndarray:
+    weight = _weights(rows.residual)
+    safe = np.where(np.isfinite(rows.residual), rows.residual, 0.0)
+    hessian = _normal(rows.jacobian, weight) + known
+    gradient = np.einsum("mec,me->c", rows.jacobian, weight * safe) + known @ tangent(motion @ rigid.invert(start))
+    return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
+
+
+def _normal(jacobian: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    flat = jacobian.reshape(-1, 6)
+    return (flat * weight.reshape(-1, 1)).T @ flat
+
+
+def _visible(segments: SpaceSegments, motion: np.ndarray, intrinsics: np.ndarray, source: Keyframe) -> int:
+    """Segments of which the middle and one end at least fall into an image of the keyframe's size."""
+    local = segments.rays / segments.inverse_depth[..., None] @ motion[:3, :3].T + motion[:3, 3]
+    points = np.concatenate([local, local.mean(1, keepdims=True)], 1)
+    height, width = source.image.shape[:2]
+    with np.errstate(invalid="ignore"):
+        x, y = np.moveaxis(pinhole.project(points, intrinsics, NEAREST), -1, 0)
+        inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
+    return int(np.count_nonzero(inside[:, 2] & inside[:, :2].any(1)))

@@ -1,0 +1,195 @@
+"""A pose by the points of several keyframes: projected to where the pose says they are, searched there, and fused.
+
+Each keyframe `k` gives normal equations `H_k, g_k` over the left tangent of the frame's pose, weighted by Tukey's
+biweight. What its points say is no better than its own place is known: the information that counts is
+`(H_k^-1 + F_k)^-1`, with `F_k` the covariance of the motion between it and the keyframe the pose hangs on. A keyframe
+that contradicts what is known already (chi-square, 6 degrees of freedom), one that has drifted, is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import chi2 as chi_square
+
+from vggtgeo.geometry import rigid
+from vggtgeo.models import pinhole
+from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
+from vggtgeo.models.rigid_motion import exponential
+from vggtgeo.models.roles import Features
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.tracking.evidence import tangent
+
+MOST_KEYFRAMES = 4
+MOST_POINTS = 300
+"""Of a keyframe, spread over its image: more cost time and share their keyframe's error."""
+WIDEST_TURN = np.deg2rad(45.0)
+"""Between a keyframe and a frame: descriptors of key points change too much beyond."""
+LEAST_POINTS = 8
+GATE = float(chi_square.ppf(0.9999, 6))
+TUKEY = 4.685
+"""Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
+STEPS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """pose: float64 [4, 4], world -> camera. information: float64 [6, 6] of the points, over its left tangent.
+    points, keyframes: how many took part.
+    """
+
+    pose: np.ndarray
+    information: np.ndarray
+    points: int
+    keyframes: int
+
+
+Bound = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(information [6, 6], motion [4, 4]) -> the information that is left where the motion's own error is counted in."""
+
+
+def refine_by_map(
+    features: Features,
+    keyframes: Sequence[Keyframe],
+    reference: Keyframe,
+    pose: np.ndarray,
+    known: np.ndarray,
+    intrinsics: np.ndarray,
+    bound: Bound,
+    *,
+    radius: float,
+    sigma: float,
+) -> Refined | None:
+    """The frame's pose with what the points of `keyframes` add to it; None where they add nothing.
+
+    pose: world -> camera, with information `known` [6, 6] over its left tangent. radius: of the search, pixels; sigma:
+    standard deviation of a match, pixels.
+    """
+    if not can_search(features):
+        return None
+    tree = search_tree(features)
+    parts = []
+    for keyframe in in_view(keyframes, pose, reference.number):
+        part = _matched(keyframe, features, tree, pose, intrinsics, radius)
+        if part is not None and _agrees(part.equations(pose, intrinsics, sigma), known, bound):
+            parts.append(part)
+    current, information = pose, np.zeros((6, 6))
+    for _ in range(STEPS if parts else 0):
+        equations = [part.equations(current, intrinsics, sigma) for part in parts]
+        limited = [bound(own.hessian, own.motion) for own in equations]
+        information = np.sum(limited, axis=0)
+        gradient = known @ tangent(current @ rigid.invert(pose))
+        gradient -= np.sum([known @ own.step() for known, own in zip(limited, equations, strict=True)], axis=0)
+        step = -_solve(information + known, gradient)
+        current = exponential(step) @ current
+        if np.abs(step).max() < 1e-4:
+            break
+    return Refined(current, information, sum(len(part.points) for part in parts), len(parts)) if parts else None
+
+
+def joint_matches(
+    features: Features, keyframes: Sequence[Keyframe], pose: np.ndarray, intrinsics: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of all keyframes in view, matched within `radius` of where a rough `pose` puts them.
+
+    World points float64 [n, 3], pixels [n, 2], confidence [n]. A key point of the frame may have a point of each
+    keyframe.
+    """
+    found = [(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))]
+    for keyframe in in_view(keyframes, pose) if can_search(features) else []:
+        if can_search(keyframe.features):
+            index, points, pixels = _should_show(keyframe, pose, intrinsics)
+            matches = search_around(keyframe.features, index, pixels, features, radius=radius)
+            found.append((points[np.searchsorted(index, matches.index_i)], matches.pixels_j, matches.confidence))
+    points, pixels, confidence = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return points, pixels, confidence
+
+
+def in_view(keyframes: Sequence[Keyframe], pose: np.ndarray, but: int = -1) -> list[Keyframe]:
+    """Those that stand nearest to the frame and look the same way, nearest first, without the keyframe `but`."""
+    others = [keyframe for keyframe in keyframes if keyframe.number != but]
+    poses = np.array([keyframe.pose for keyframe in others]).reshape(-1, 4, 4)
+    away = np.linalg.norm(rigid.invert(poses)[:, :3, 3] - rigid.centre(pose), axis=1)
+    cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1) / 2
+    turned = np.arccos(np.clip(cosine, -1.0, 1.0))
+    order = [i for i in np.argsort(away + turned, kind="stable") if turned[i] < WIDEST_TURN]
+    return [others[i] for i in order[:MOST_KEYFRAMES]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations `H, g` of one keyframe's points at a pose, and the motion keyframe -> frame there."""
+
+    hessian: np.ndarray
+    gradient: np.ndarray
+    motion: np.ndarray
+
+    def step(self) -> np.ndarray:
+        """Where these points alone would move the pose."""
+        return -_solve(self.hessian, self.gradient)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Points of one keyframe in the world, [n, 3], and where the frame shows them, [n, 2]."""
+
+    keyframe: Keyframe
+    points: np.ndarray
+    pixels: np.ndarray
+
+    def equations(self, pose: np.ndarray, intrinsics: np.ndarray, sigma: float) -> _Equations:
+        local = self.points @ pose[:3, :3].T + pose[:3, 3]
+        front = local[:, 2] > 0.1
+        local = local[front]
+        residual = (pinhole.project(local, intrinsics) - self.pixels[front]) / sigma
+        rows = pinhole.projection_rows(local, intrinsics)
+        size = np.linalg.norm(residual, axis=1)
+        weight = np.maximum(1.0 - (size / TUKEY) ** 2, 0.0) ** 2
+        hessian = sum((row * weight) @ row.T for row in rows) / sigma**2
+        gradient = sum(row @ (weight * residual[:, axis]) for axis, row in enumerate(rows)) / sigma
+        return _Equations(np.asarray(hessian), np.asarray(gradient), pose @ rigid.invert(self.keyframe.pose))
+
+
+def _matched(
+    keyframe: Keyframe, features: Features, tree: cKDTree, pose: np.ndarray, intrinsics: np.ndarray, radius: float
+) -> _Part | None:
+    """Some of the keyframe's points with known depth that the image should show, where it shows them."""
+    if not can_search(keyframe.features):
+        return None
+    index, points, pixels = _should_show(keyframe, pose, intrinsics)
+    # Key points come strongest first, spread over the image.
+    index, points, pixels = index[:MOST_POINTS], points[:MOST_POINTS], pixels[:MOST_POINTS]
+    found = search_near(keyframe.features, index, pixels, features, tree, radius=radius)
+    if len(found) < LEAST_POINTS:
+        return None
+    return _Part(keyframe, points[np.searchsorted(index, found.index_i)], found.pixels_j)
+
+
+def _should_show(
+    keyframe: Keyframe, pose: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Key points with known depth that fall into the image: their numbers (ascending), world points, pixels."""
+    known = np.nonzero(np.isfinite(keyframe.points.inverse_depth))[0]
+    points = rigid.unproject(
+        keyframe.features.pixels[known], keyframe.points.inverse_depth[known], keyframe.pose, intrinsics
+    )
+    height, width = keyframe.image.shape[:2]
+    pixels = rigid.project(points, pose, intrinsics)
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels > 0) & (pixels < [width - 1, height - 1])).all(1)
+    return known[inside], points[inside], pixels[inside]
+
+
+def _agrees(own: _Equations, known: np.ndarray, bound: Bound) -> bool:
+    """Whether these points and what is known already place the frame alike, to within what both know."""
+    tiny = 1e-9 * np.eye(6)
+    noise = np.linalg.inv(bound(own.hessian, own.motion) + tiny) + np.linalg.inv(known + tiny)
+    step = own.step()
+    return float(step @ np.linalg.solve(noise, step)) < GATE
+
+
+def _solve(hessian: np.ndarray, right: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6) + 1e-12 * np.eye(6), right)

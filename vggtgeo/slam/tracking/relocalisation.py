@@ -1,0 +1,130 @@
+"""Finding a lost camera again: the map is asked by appearance, and a place is believed on strict evidence only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import rigid
+from vggtgeo.models.classical import place_vector
+from vggtgeo.models.roles import Features
+from vggtgeo.slam.settings.slam_settings import Roles
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.state import FramePose, Slam, Waiting
+from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.tracking.rgbd_view import RgbdView
+from vggtgeo.slam.tracking.track import Expectation, Sight, Track, track
+
+CANDIDATES = 5
+"""Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
+MOST_DRIFT = 0.05
+"""Share of the way that drift may have moved a place by, to be looked for while the run goes on; RGB-D tracking alone
+drifts by 1 to 2 %."""
+
+
+def relocalise(
+    sight: Sight, candidates: Iterable[Keyframe], slam: Slam, roles: Roles, most: int = CANDIDATES
+) -> Track | None:
+    """The frame's pose by the most similar of `candidates`, where one of the first `most` is certain."""
+    for keyframe in most_similar(sight.features, tuple(candidates))[:most]:
+        found = track(sight, keyframe, view_of(keyframe, slam, roles), None, slam.intrinsics, roles)
+        if found.evidence.certain:
+            return found
+    return None
+
+
+def revisit(slam: Slam, sight: Sight, pose: np.ndarray, roles: Roles) -> Track | None:
+    """The frame's pose by an old keyframe that shows the same place, wherever drift has put it: a loop that is closed
+    while the run goes on. The camera goes on from there, and the last adjustment spreads what the loop was off.
+
+    pose: where the frame is by the current estimate, world -> camera. One keyframe is verified at most, as that costs
+    as much as a tracked frame: one that looks as much like the frame as those of the window do, and that drift may have
+    put here. Without metric depth the unit drifts, too, and loops wait for the end.
+    """
+    recent = slam.window[0] if slam.window else 0
+    centres = np.array([rigid.centre(keyframe.pose) for keyframe in slam.keyframes])
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    way = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # from each keyframe to the newest
+    within = np.linalg.norm(centres - rigid.centre(pose), axis=1) < MOST_DRIFT * way
+    old = [k for k in slam.keyframes[:recent] if k.place is not None and within[k.number]]
+    place = place_vector(sight.features) if slam.metric and old else None
+    if place is None:
+        return None
+    near = [slam.keyframes[number].place for number in slam.window]
+    usual = np.median([known @ place for known in near if known is not None] or [1.0])
+    similarity = [float(k.place @ place) for k in old if k.place is not None]
+    best = int(np.argmax(similarity))
+    if similarity[best] < usual:
+        return None
+    found = track(sight, old[best], view_of(old[best], slam, roles), None, slam.intrinsics, roles)
+    return found if found.accepted and found.evidence.certain else None
+
+
+def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Keyframe, ...]:
+    """The keyframes that look most like the frame, best first; the newest, where descriptors do not tell."""
+    place = place_vector(features)
+    known = [keyframe for keyframe in keyframes if keyframe.place is not None]
+    if place is None or not known:
+        return tuple(reversed(keyframes[-CANDIDATES:]))
+    similarity = np.array([keyframe.place @ place for keyframe in known])
+    return tuple(known[i] for i in np.argsort(-similarity, kind="stable")[:CANDIDATES])
+
+
+def view_of(keyframe: Keyframe, slam: Slam, roles: Roles) -> RgbdView | None:
+    """What the alignment needs of a keyframe; that of the reference is at hand, any other is made again."""
+    if roles.alignment is None:
+        return None
+    if slam.reference is not None and slam.reference[0] == keyframe.number:
+        return slam.reference[1]
+    depth = keyframe.depth.astype(np.float32), keyframe.depth_sigma.astype(np.float32)
+    return RgbdView.of(keyframe.image, depth, slam.intrinsics)
+
+
+def wait(slam: Slam, frame: Frame, features: Features, most: int) -> tuple[Waiting, ...]:
+    """The waiting frames with this one, the oldest forgotten beyond `most`."""
+    return (*slam.waiting, Waiting(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
+
+
+def place_waiting(slam: Slam, roles: Roles) -> Slam:
+    """Give the frames that waited while tracking was lost their poses, from the newest back, each by the next one's."""
+    placed: dict[int, FramePose] = {}
+    pose, step = slam.last_pose, np.eye(4)
+    keyframe = slam.keyframes[slam.frames[-1].reference]
+    source = view_of(keyframe, slam, roles)
+    for number, waiting in enumerate(reversed(slam.waiting)):
+        frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
+        sight = sight_of(frame, Description.of(waiting.features), slam, roles)
+        expected = Expectation(step @ pose, step, waited=min(number, 3))
+        found = track(sight, keyframe, source, expected, slam.intrinsics, roles)
+        if not found.accepted:
+            continue
+        step, pose = found.pose @ rigid.invert(pose), found.pose
+        placed[waiting.frame] = record_of(frame, found)
+    frames = tuple(placed.get(record.frame, record) for record in slam.frames)
+    return replace(slam, frames=frames, waiting=())
+
+
+def sight_of(frame: Frame, description: Description, slam: Slam, roles: Roles) -> Sight:
+    """The frame as it is tracked."""
+    view = None
+    if roles.alignment is not None and slam.metric:
+        view = description.view_by(slam.intrinsics)
+        view = view or RgbdView.of(frame.image, roles.tracking_depth(frame.depth), slam.intrinsics)
+    return Sight(frame, description, view)
+
+
+def record_of(frame: Frame, found: Track) -> FramePose:
+    """The record of a tracked frame that hangs on its keyframe."""
+    return FramePose(
+        frame.index,
+        frame.timestamp,
+        found.keyframe.number,
+        found.relative,
+        True,
+        found.evidence.inliers,
+        found.evidence,
+        seen=found.seen,
+    )

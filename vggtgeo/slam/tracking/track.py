@@ -1,0 +1,315 @@
+"""Placing a frame in the map: key points with known depths and the picture as a whole, fused into one pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import rigid
+from vggtgeo.models.classical import pose_information
+from vggtgeo.models.roles import (
+    Features,
+    GeometryResult,
+    LineFeatures,
+    PointMatcher,
+    PoseGuess,
+    PoseQuery,
+)
+from vggtgeo.slam.settings.slam_settings import Roles
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.state import SeenPoints
+from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.tracking.evidence import Evidence, step_chi2, step_information, worst_sigma
+from vggtgeo.slam.tracking.following import Located, located_by_flow
+from vggtgeo.slam.tracking.fusion import Motion, agreed, drawn_to, wanting, with_lines, with_systematic
+from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
+from vggtgeo.slam.tracking.rgbd_alignment import Aligned
+from vggtgeo.slam.tracking.rgbd_view import RgbdView
+
+PIXEL_SIGMA = 2.0
+"""Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
+SEARCH_RADIUS = 8.0
+"""Pixels around the place where a point of the map must be: four standard deviations of a match."""
+ROUGH_RADIUS = 60.0
+"""The same where only the motion so far tells the place: its 6 degrees are 52 px at a focal length of 500."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A frame as it is tracked. view: None where its picture as a whole plays no part. find_lines: finds and describes
+    its segments; None where they play no part.
+    """
+
+    frame: Frame
+    description: Description
+    view: RgbdView | None
+    find_lines: Callable[[], LineFeatures] | None = None
+
+    @cached_property
+    def lines(self) -> LineFeatures | None:
+        """The segments, found when they are first asked for."""
+        return None if self.find_lines is None else self.find_lines()
+
+    @property
+    def found_lines(self) -> LineFeatures | None:
+        """The segments, where they were asked for."""
+        found: LineFeatures | None = self.__dict__.get("lines")
+        return found
+
+    @property
+    def features(self) -> Features:
+        """Its key points, found when they are first asked for."""
+        return self.description.features
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Where motion so far leads. pose: float64 [4, 4], world -> camera. step: the last motion, camera -> camera.
+    waited: frames since it was last confirmed.
+    """
+
+    pose: np.ndarray
+    step: np.ndarray
+    waited: int = 0
+
+    def motion_from(self, keyframe: Keyframe) -> Motion:
+        """The expected motion from a keyframe, and how well it is known."""
+        information = step_information(self.step) / (self.waited + 1)
+        return Motion(self.pose @ rigid.invert(keyframe.pose), information)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A frame's pose against one keyframe.
+
+    pose: float64 [4, 4], world -> camera. measured: float64 [6, 6], what all samples know of the motion from the
+    keyframe to the frame, over its left tangent, translation first. result: why there is no pose, where there is none.
+    seen: points of the keyframe that it came from, where the picture as a whole took no part.
+    """
+
+    keyframe: Keyframe
+    pose: np.ndarray
+    measured: np.ndarray
+    evidence: Evidence
+    result: GeometryResult
+    alone: Track | None = None
+    seen: SeenPoints | None = None
+
+    @property
+    def accepted(self) -> bool:
+        return self.result is GeometryResult.SUCCESS and self.evidence.accepted
+
+    @property
+    def relative(self) -> np.ndarray:
+        """Keyframe camera -> frame camera."""
+        return self.pose @ rigid.invert(self.keyframe.pose)
+
+    @property
+    def information(self) -> np.ndarray:
+        """What is left of `measured` where the errors that no sample removes are counted in."""
+        return with_systematic(self.measured, self.relative)
+
+
+def track(
+    sight: Sight,
+    keyframe: Keyframe,
+    source: RgbdView | None,
+    expected: Expectation | None,
+    intrinsics: np.ndarray,
+    roles: Roles,
+    window: Iterable[Keyframe] = (),
+) -> Track:
+    """The pose of a frame from one keyframe: by its points, then by its picture and surface from there.
+
+    source: the keyframe's view, where there is one. expected: None where nothing is known of the motion.
+    window: keyframes that a model which looks at images may place the frame among.
+    """
+    views = None if source is None or sight.view is None else (source, sight.view)
+    aligner = roles.alignment if views is not None else None
+    located = None
+    if aligner is not None and expected is not None and roles.flow is not None and roles.follows:
+        located = located_by_flow(sight.frame.image, keyframe, expected.pose, intrinsics, roles.flow, roles.geometry)
+    if located is None:
+        matcher = roles.points if aligner is None else roles.coarse_points
+        located = _by_descriptors(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
+    return _placed(sight, keyframe, views, expected, located, intrinsics, roles)
+
+
+def track_by_map(
+    sight: Sight,
+    keyframes: Iterable[Keyframe],
+    reference: Keyframe,
+    source: RgbdView | None,
+    expected: Expectation,
+    intrinsics: np.ndarray,
+    roles: Roles,
+) -> Track:
+    """The pose of a frame from the points of all keyframes in view together, where no keyframe alone has enough.
+
+    They are searched around where the motion so far leads. Picture and lines are those of `reference`.
+    """
+    points, pixels, confidence = joint_matches(
+        sight.features, tuple(keyframes), expected.pose, intrinsics, ROUGH_RADIUS
+    )
+    query = PoseQuery(sight.frame.image, intrinsics, points, pixels, confidence, expected.pose)
+    located = Located(roles.geometry.locate(query), len(points), points, PIXEL_SIGMA)
+    views = None if source is None or sight.view is None else (source, sight.view)
+    return _placed(sight, reference, views, expected, located, intrinsics, roles)
+
+
+def _placed(
+    sight: Sight,
+    keyframe: Keyframe,
+    views: tuple[RgbdView, RgbdView] | None,
+    expected: Expectation | None,
+    located: Located,
+    intrinsics: np.ndarray,
+    roles: Roles,
+) -> Track:
+    """The pose by key points, then by picture, surface and lines from there, or from where the motion so far leads."""
+    guess = located.guess
+    known = guess.result is GeometryResult.SUCCESS
+    aligner, dense = roles.alignment, None
+    if aligner is not None and views is not None and (known or expected):
+        dense = aligner.align(*views, guess.pose @ rigid.invert(keyframe.pose))
+    by_points = None
+    if known:
+        information = pose_information(guess.pose, located.points[guess.inliers], intrinsics, located.sigma)
+        by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
+    evidence = _seen(guess, located.matches, by_points, dense)
+    prior = None if expected is None else expected.motion_from(keyframe)
+    found = agreed(by_points, dense, evidence)
+    if found is not None and prior is not None:
+        found = drawn_to(found, prior)
+    needed = prior is not None if found is None else wanting(found)
+    if needed and sight.lines is not None:
+        found, evidence = with_lines(found, prior, evidence, keyframe, sight.lines, intrinsics, roles.line_matches)
+    if found is None:
+        return Track(keyframe, guess.pose, np.zeros((6, 6)), evidence, guess.result)
+    pose = rigid.orthonormal(found.motion @ keyframe.pose)
+    track = _judged(pose, found.information, evidence, keyframe, expected)
+    return replace(track, seen=located.seen) if known and dense is None else track
+
+
+def refined_by_map(
+    found: Track,
+    sight: Sight,
+    keyframes: Iterable[Keyframe],
+    expected: Expectation | None,
+    intrinsics: np.ndarray,
+) -> Track:
+    """The same with what the points of all other keyframes in view know of the pose, where something is wanting."""
+    if not wanting(Motion(found.relative, found.measured)):
+        return found
+    refined = refine_by_map(
+        sight.features,
+        tuple(keyframes),
+        found.keyframe,
+        found.pose,
+        found.information,
+        intrinsics,
+        with_systematic,
+        radius=SEARCH_RADIUS,
+        sigma=PIXEL_SIGMA,
+    )
+    if refined is None:
+        return found
+    # What no sample removes is common to all keyframes, and counted once.
+    measured = found.measured + refined.information
+    evidence = replace(found.evidence, map_points=refined.points)
+    better = _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, expected)
+    return replace(better, alone=found, seen=found.seen)
+
+
+def moved_with(found: Track, keyframe: Keyframe) -> Track:
+    """The same track once its keyframe has been adjusted: what was measured is the motion from there."""
+    alone = None if found.alone is None else moved_with(found.alone, keyframe)
+    return replace(found, keyframe=keyframe, pose=rigid.orthonormal(found.relative @ keyframe.pose), alone=alone)
+
+
+def tie_to(found: Track, number: int) -> MeasuredRelativePose:
+    """What the track of a frame that is now keyframe `number` says of its motion from the one it was tracked against.
+
+    What other keyframes know of it enters by their own edges: in the tie it would count twice.
+    """
+    own = found.alone or found
+    return MeasuredRelativePose(own.keyframe.number, number, own.relative, own.information)
+
+
+def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
+    """What two tracks of one frame say of the motion between their keyframes."""
+    first, second = first.alone or first, second.alone or second
+    motion = rigid.invert(second.relative) @ first.relative
+    # Both errors are tangents at the frame; carried to the second keyframe by the adjoint of its motion.
+    carry = rigid.adjoint(rigid.invert(second.relative))
+    noise = np.linalg.inv(first.information) + np.linalg.inv(second.information)
+    return MeasuredRelativePose(
+        first.keyframe.number, second.keyframe.number, motion, np.linalg.inv(carry @ noise @ carry.T)
+    )
+
+
+def _by_descriptors(
+    sight: Sight,
+    keyframe: Keyframe,
+    expected: Expectation | None,
+    intrinsics: np.ndarray,
+    matcher: PointMatcher,
+    roles: Roles,
+    window: tuple[Keyframe, ...],
+) -> Located:
+    """The pose by key points that match in their descriptors, as far as their depth is known."""
+    matches = matcher.match(keyframe.features, sight.features)
+    inverse_depth = keyframe.points.inverse_depth[matches.index_i]
+    known = np.isfinite(inverse_depth)
+    matches = matches.select(known)
+    points = rigid.unproject(matches.pixels_i, inverse_depth[known], keyframe.pose, intrinsics)
+    query = PoseQuery(
+        sight.frame.image,
+        intrinsics,
+        points,
+        matches.pixels_j,
+        matches.confidence,
+        None if expected is None else expected.pose,
+        window_images=tuple(member.image for member in window),
+        window_poses=tuple(member.pose for member in window),
+        window_depths=tuple(member.depth for member in window) if roles.metric else (),
+    )
+    guess = roles.geometry.locate(query)
+    return Located(guess, len(matches), points, PIXEL_SIGMA, matches.index_i, matches.pixels_j)
+
+
+def _judged(
+    pose: np.ndarray, measured: np.ndarray, evidence: Evidence, keyframe: Keyframe, expected: Expectation | None
+) -> Track:
+    """A pose with how well it is known in its worst direction, and how far it is from what was expected."""
+    track = Track(keyframe, pose, measured, evidence, GeometryResult.SUCCESS)
+    sigma_translation, sigma_rotation = worst_sigma(track.information)
+    evidence = replace(
+        evidence,
+        sigma_translation=sigma_translation,
+        sigma_rotation=sigma_rotation,
+        chi2=float("nan") if expected is None else step_chi2(pose, expected.pose, expected.step, expected.waited),
+    )
+    return replace(track, evidence=evidence)
+
+
+def _seen(guess: PoseGuess, matches: int, by_points: Motion | None, dense: Aligned | None) -> Evidence:
+    evidence = Evidence(matches=matches, inliers=guess.inlier_count, error=guess.error)
+    if dense is None:
+        return evidence
+    apart = float("nan")
+    if by_points is not None:
+        apart = float(np.linalg.norm(by_points.motion[:3, 3] - dense.motion[:3, 3]))
+    return replace(
+        evidence,
+        correlation=dense.correlation,
+        edges=dense.edges,
+        surface=dense.surface,
+        overlap=dense.overlap,
+        agreement=apart,
+    )

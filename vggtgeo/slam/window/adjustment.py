@@ -1,0 +1,282 @@
+"""From keyframes and their matches to a bundle-adjustment problem, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.padding import PaddedSize, SlotIndex
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
+from vggtgeo.models.classical import line_coefficients
+from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.sparse_map.covisibility import Directed
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.window.line_support import sample_shares, supported
+from vggtgeo.slam.window.selection import Selection
+
+LEAST_INVERSE_DEPTH = 1e-3
+"""1/m; a landmark starts no farther than a kilometre away."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPrior:
+    """What is known of the camera before an adjustment. mean, sigma: float64 [4] of fx, fy, cx, cy, pixels. kind: its
+    model, a pinhole; that of a guessed camera has square pixels.
+    """
+
+    mean: np.ndarray
+    sigma: np.ndarray
+    kind: type[Pinhole | SquarePinhole] = Pinhole
+
+    def parameters(self, intrinsics: np.ndarray) -> np.ndarray:
+        """Those of the model, of fx, fy, cx, cy (or their deviations)."""
+        return np.array([np.mean(intrinsics[:2]), *intrinsics[2:]]) if self.kind is SquarePinhole else intrinsics
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """A packed problem and the way back: local host and slot number of each landmark (points, then line samples)."""
+
+    keyframes: tuple[int, ...]
+    """Numbers of the keyframes, in the order of the problem's."""
+    problem: Problem
+    initial: State
+    index: SlotIndex
+    host: np.ndarray
+    slot: np.ndarray
+    is_line: np.ndarray
+    informed: np.ndarray
+    """Whether measurements determine the landmark's depth well enough to be used elsewhere, `[D]`."""
+
+
+def build(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    intrinsics: np.ndarray,
+    settings: SlamSettings,
+    *,
+    size: PaddedSize | None,
+    camera: CameraPrior,
+    fixed_pose: np.ndarray,
+    terms: Sequence[AbstractTerm] = (),
+) -> Adjustment:
+    """Pack `keyframes` (at most `size.keyframes`) and the directed edges between them.
+
+    terms: what else is known, of poses and pairs, by the position of a keyframe in `keyframes`. camera: where its prior
+    holds it; it starts from `intrinsics`, fx, fy, cx, cy.
+
+    Of each host at most `point_slots` key points (those with the most observations) and `line_slots` line samples
+    (of the segments with the most) take part.
+    """
+    local = {keyframe.number: i for i, keyframe in enumerate(keyframes)}
+    points = Selection.points(keyframes, edges, local, settings)
+    lines = Selection.lines(keyframes, edges, local, settings)
+    observations, depths, informed = _observed(keyframes, edges, local, (points, lines), intrinsics, settings)
+    problem, initial, index = pack(
+        observations,
+        rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
+        camera.parameters(intrinsics),
+        np.maximum(depths, LEAST_INVERSE_DEPTH),
+        size=size,
+        intrinsics_mean=camera.parameters(camera.mean),
+        intrinsics_sigma=camera.parameters(camera.sigma),
+        camera=camera.kind,
+        fixed_pose=fixed_pose,
+        kernel=settings.window.kernel,
+        terms=terms,
+    )
+    return Adjustment(
+        keyframes=tuple(keyframe.number for keyframe in keyframes),
+        problem=problem,
+        initial=initial,
+        index=index,
+        host=observations.host,
+        slot=np.concatenate([points.slot, lines.slot]),
+        is_line=np.arange(len(observations.host)) >= len(points.host),
+        informed=informed,
+    )
+
+
+def _observed(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    selected: tuple[Selection, Selection],
+    intrinsics: np.ndarray,
+    settings: SlamSettings,
+) -> tuple[Observations, np.ndarray, np.ndarray]:
+    """Matches and depth priors of the selected points and line samples, where their inverse depths start, and for which
+    of them anything tells it.
+    """
+    points, lines = selected
+    depths, informed = _initial_depths(keyframes, edges, local, points, intrinsics)
+    key_points, samples = [keyframe.points for keyframe in keyframes], [keyframe.samples for keyframe in keyframes]
+    read = lambda name: np.concatenate([points.read(key_points, name), lines.read(samples, name)])
+    prior, sigma = read("prior"), read("sigma")
+    has_prior = np.isfinite(prior) & np.isfinite(sigma)
+    depths = np.concatenate([depths, read("inverse_depth")[len(points.host) :]])
+    weight = np.where(has_prior, _prior_trust(read("prior_confidence"), read("confidence"), settings), 0.0)
+    observations = Observations(
+        edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),
+        host=np.concatenate([points.host, lines.host]),
+        pixel=read("pixels").reshape(-1, 2),
+        **_point_rows(keyframes, edges, local, points, settings),
+        **_line_rows(keyframes, edges, local, lines, settings, len(points.host), intrinsics),
+        depth_mean=np.where(has_prior, prior, 1.0),
+        depth_sigma=np.where(has_prior, sigma, 1.0),
+        depth_weight=weight if settings.depth_terms.depth_weight > 0 else np.zeros_like(weight),
+        alpha=settings.depth_terms.depth_weight,
+        segment=_segments(keyframes, points, lines) if settings.line.two_ends_lines else None,
+    )
+    return observations, depths, np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
+
+
+def write_back(
+    keyframes: Sequence[Keyframe], adjustment: Adjustment, state: State
+) -> tuple[tuple[Keyframe, ...], np.ndarray]:
+    """The keyframes with adjusted poses and inverse depths, and the adjusted intrinsics."""
+    poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
+    depths = adjustment.index.gather(state.inverse_depth)
+    updated = []
+    for i, keyframe in enumerate(keyframes):
+        here = (adjustment.host == i) & adjustment.informed
+        points = _updated(keyframe.points, adjustment, depths, here & ~adjustment.is_line)
+        samples = _updated(keyframe.samples, adjustment, depths, here & adjustment.is_line)
+        updated.append(replace(keyframe, pose=poses[i], points=points, samples=samples))
+    parameters = np.asarray(state.intrinsics, np.float64)
+    square = adjustment.problem.camera is SquarePinhole
+    return tuple(updated), np.array([parameters[0], *parameters]) if square else parameters
+
+
+def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.ndarray) -> Slots:
+    inverse = slots.inverse_depth.copy()
+    inverse[adjustment.slot[here]] = depths[here]
+    return replace(slots, inverse_depth=inverse)
+
+
+def _segments(keyframes: Sequence[Keyframe], points: Selection, lines: Selection) -> np.ndarray:
+    """Segment of each landmark, numbered over all keyframes; -1 for points."""
+    first = np.cumsum([0, *(len(keyframe.lines) for keyframe in keyframes)])
+    own = [first[h] + keyframes[h].sample_segment[s] for h, s in zip(lines.host, lines.slot, strict=True)]
+    return np.concatenate([np.full(len(points.host), -1), np.array(own, int)])
+
+
+def _point_rows(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    points: Selection,
+    settings: SlamSettings,
+) -> dict[str, np.ndarray]:
+    edge_ids, landmarks = [np.zeros(0, int)], [np.zeros(0, int)]
+    targets, weights = [np.zeros((0, 2))], [np.zeros(0)]
+    for number, edge in enumerate(edges):
+        host = local[edge.host]
+        landmark = points.table[host][edge.slots]
+        chosen = landmark >= 0
+        # A slot is matched once on an edge; a matcher that gives two targets keeps the last.
+        edge_ids.append(np.full(np.count_nonzero(chosen), number))
+        landmarks.append(landmark[chosen])
+        targets.append(edge.pixels[chosen])
+        omega = keyframes[host].points.confidence[edge.slots[chosen]]
+        weights.append(_weight(edge.confidence[chosen] * omega, settings))
+    return {
+        "point_edge": np.concatenate(edge_ids),
+        "point_landmark": np.concatenate(landmarks),
+        "point_target": np.concatenate(targets),
+        "point_weight": np.concatenate(weights),
+    }
+
+
+def _line_rows(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    lines: Selection,
+    settings: SlamSettings,
+    offset: int,
+    intrinsics: np.ndarray,
+) -> dict[str, np.ndarray]:
+    edge_ids, landmarks, coefficients, weights = (
+        [np.zeros(0, int)],
+        [np.zeros(0, int)],
+        [np.zeros((0, 3))],
+        [np.zeros(0)],
+    )
+    for number, edge in enumerate(edges):
+        host, target = local[edge.host], keyframes[local[edge.target]]
+        matched = np.full(len(keyframes[host].lines), -1)
+        matched[edge.line_slots] = np.arange(len(edge.line_slots))
+        of_sample = matched[keyframes[host].sample_segment]
+        chosen = np.nonzero((of_sample >= 0) & (lines.table[host] >= 0))[0]
+        if not len(chosen):
+            continue
+        samples = keyframes[host].samples
+        ends = target.lines.segments.endpoints
+        own_ends = ends[edge.line_targets[of_sample[chosen]]]
+        places = rigid.unproject(
+            samples.pixels[chosen], samples.inverse_depth[chosen], keyframes[host].pose, intrinsics
+        )
+        near = supported(
+            places, target.pose, own_ends, intrinsics, reach=settings.line.line_spacing, gate=settings.line.line_gate
+        )
+        edge_ids.append(np.full(len(chosen), number))
+        landmarks.append(offset + lines.table[host][chosen])
+        coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
+        weight = _weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen], settings)
+        if settings.line.two_ends_lines:
+            weight = weight * sample_shares(keyframes[host].sample_segment, settings.line.segment_samples)[chosen]
+        weights.append(np.where(near, weight * settings.line.line_weight, 0.0))
+    return {
+        "line_edge": np.concatenate(edge_ids),
+        "line_landmark": np.concatenate(landmarks),
+        "line_coefficients": np.concatenate(coefficients),
+        "line_weight": np.concatenate(weights),
+    }
+
+
+def _prior_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
+    if not settings.weights.use_confidence:
+        return np.ones_like(own)
+    return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth_terms.depth_trust]
+
+
+def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:
+    if not settings.weights.use_confidence:
+        return np.ones_like(confidence)
+    return settings.weights.confidence_gain * confidence + settings.weights.confidence_floor
+
+
+def _initial_depths(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    points: Selection,
+    intrinsics: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth of each point landmark: its estimate, else triangulated; and whether views determine it."""
+    current = points.read([keyframe.points for keyframe in keyframes], "inverse_depth")
+    weighted, information = np.zeros(len(current)), np.zeros(len(current))
+    for edge in edges:
+        host, target = keyframes[local[edge.host]], keyframes[local[edge.target]]
+        landmark = points.table[local[edge.host]][edge.slots]
+        chosen = landmark >= 0
+        relative = target.pose @ rigid.invert(host.pose)
+        value, weight = rigid.triangulate(
+            host.features.pixels[edge.slots[chosen]], edge.pixels[chosen], relative, intrinsics
+        )
+        np.add.at(weighted, landmark[chosen], weight * value)
+        np.add.at(information, landmark[chosen], weight)
+    triangulated = weighted / np.maximum(information, 1e-12)
+    good = (information > 0) & (triangulated > LEAST_INVERSE_DEPTH) & (triangulated * np.sqrt(information) > 5.0)
+    known = np.isfinite(current)
+    typical = np.median(current[known]) if np.any(known) else (np.median(triangulated[good]) if np.any(good) else 1.0)
+    depths = np.where(known, current, np.where(good, triangulated, typical))
+    return depths.astype(np.float64), good

@@ -1,0 +1,104 @@
+"""Depth of segments by the map: where nothing measured it, two and more other views of a segment tell it.
+
+The segment matched in another view, with line `l`, spans a plane through that camera, of normal `m = K^T l`. A ray `r`
+of an end in the host, carried there by `q = R r`, meets it at the inverse depth
+
+    d = -(m . q) / (m . t)      with weight    (m . t)^2 / (z^2 sigma^2),   z = (q + d t)_z
+
+(the plane form of line triangulation, Hartley and Zisserman 2004, section 14.2). One view explains any end exactly, so
+two at least must agree (chi-square). Lines along the motion meet their planes nowhere: their weight is small, and their
+depth stays unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2 as chi_square
+
+from vggtgeo.geometry import rigid
+from vggtgeo.models import pinhole
+from vggtgeo.models.classical import line_coefficients
+from vggtgeo.slam.sparse_map.covisibility import Directed
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+
+PIXELS = 1.0
+"""Standard deviation of an end from its line in another view: the ends of both segments, in pixels."""
+LARGEST_SIGMA = 0.05
+"""Relative standard deviation of a depth beyond which it is not known."""
+LEAST_VIEWS = 2
+CHANCE = 0.99
+
+
+def with_segment_depths(
+    keyframes: Mapping[int, Keyframe], edges: Sequence[Directed], intrinsics: np.ndarray
+) -> dict[int, Keyframe]:
+    """The keyframes with the depths of segments that had none and that their edges tell, by the current poses."""
+    updated = dict(keyframes)
+    for number, keyframe in keyframes.items():
+        blank = np.isnan(keyframe.line_depths).any(1)
+        own = [edge for edge in edges if edge.host == number and len(edge.line_slots)]
+        if len(own) < LEAST_VIEWS or not blank.any():
+            continue
+        inverse, sigma = _triangulated(keyframe, own, keyframes, intrinsics)
+        new = blank & np.isfinite(inverse).all(1)
+        if new.any():
+            updated[number] = _taken(keyframe, new, inverse, sigma)
+    return updated
+
+
+def _triangulated(
+    host: Keyframe, edges: Sequence[Directed], keyframes: Mapping[int, Keyframe], intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth of the ends of each segment and its standard deviation, [l, 2], NaN where the views do not tell."""
+    count = len(host.lines)
+    rays = pinhole.rays(host.lines.segments.endpoints, intrinsics)
+    total, first, second, views = (np.zeros((count, 2)) for _ in range(4))
+    for edge in edges:
+        target = keyframes[edge.target]
+        value, weight = _meeting(rays[edge.line_slots], edge, host, target, intrinsics)
+        total[edge.line_slots] += weight
+        first[edge.line_slots] += weight * value
+        second[edge.line_slots] += weight * value**2
+        views[edge.line_slots] += weight > 0
+    mean = first / np.maximum(total, 1e-18)
+    sigma = 1.0 / np.sqrt(np.maximum(total, 1e-18))
+    spread = second - total * mean**2
+    agree = spread < chi_square.ppf(CHANCE, np.maximum(views - 1, 1))
+    known = (views >= LEAST_VIEWS) & agree & (mean > 1e-3) & (sigma < LARGEST_SIGMA * mean)
+    both = known.all(1, keepdims=True)
+    return np.where(both, mean, np.nan), np.where(both, sigma, np.nan)
+
+
+def _meeting(
+    rays: np.ndarray, edge: Directed, host: Keyframe, target: Keyframe, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays `[m, 2, 3]` of segments meet the planes of their matches: inverse depths and weights, [m, 2]."""
+    relative = target.pose @ rigid.invert(host.pose)
+    turned = rays @ relative[:3, :3].T
+    lines = line_coefficients(target.lines.segments.endpoints[edge.line_targets])
+    normal = lines @ pinhole.matrix(intrinsics)
+    lever = normal @ relative[:3, 3]
+    safe = np.where(np.abs(lever) > 1e-9, lever, np.inf)[:, None]
+    value = -(turned * normal[:, None]).sum(2) / safe
+    z = turned[..., 2] + value * relative[2, 3]
+    weight = np.where((z > 0.05) & (value > 0), (lever[:, None] / np.where(z > 0.05, z, 1.0) / PIXELS) ** 2, 0.0)
+    return value, weight
+
+
+def _taken(keyframe: Keyframe, new: np.ndarray, inverse: np.ndarray, sigma: np.ndarray) -> Keyframe:
+    """The keyframe with the depths of the segments `new` at their ends and, in between, at their samples."""
+    depths = np.where(new[:, None], 1.0 / inverse, keyframe.line_depths)
+    ends, samples, segment = keyframe.lines.segments.endpoints, keyframe.samples, keyframe.sample_segment
+    along = ends[:, 1] - ends[:, 0]
+    fraction = ((samples.pixels - ends[segment, 0]) * along[segment]).sum(1) / (along**2).sum(1)[segment]
+    on_line = inverse[segment, 0] + fraction * (inverse[segment, 1] - inverse[segment, 0])
+    here = new[segment]
+    own = replace(
+        samples,
+        inverse_depth=np.where(here, on_line, samples.inverse_depth),
+        sigma=np.where(here, sigma[segment].mean(1), samples.sigma),
+    )
+    return replace(keyframe, line_depths=depths, samples=own)
