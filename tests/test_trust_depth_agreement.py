@@ -11,9 +11,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from trust_checks import found_by_depth
-from witness import Walk, walk, with_depth
+from vggtgeo.models import pinhole
+from witness import K, Walk, walk, with_depth
 
-from vggtgeo.slam.trust.depth_agreement import CONTRADICTIONS, MOST_OFF, MUCH, PART, DepthRatios, agree, depth_ratios
+from vggtgeo.slam.trust.depth_agreement import (
+    CONTRADICTIONS,
+    MOST_OFF,
+    MUCH,
+    PART,
+    DepthRatios,
+    agree,
+    depth_ratios,
+    share_of_distance,
+)
 from vggtgeo.slam.trust.evidence import FrameEvidence
 
 KINDS = pytest.mark.parametrize(
@@ -48,6 +58,17 @@ def test_depth_of_another_world_is_told(healthy: Walk, name: str, check: str) ->
     assert all(f.scale for f in found), "such depth gives no metres"
 
 
+def test_distances_in_the_place_of_depth_are_told(healthy: Walk) -> None:
+    """How far a point is from the camera's centre is not how far it lies along the axis; oracle: lengths of rays."""
+    length = lambda frame: np.linalg.norm(pinhole.rays(frame.pixels.astype(np.float64), K), axis=1)
+    for power, share in ((0.0, 0.0), (1.0, 1.0), (-1.0, -1.0)):
+        evidence = with_depth(healthy.evidence, lambda frame, power=power: frame.depth * length(frame) ** power)
+        found, sigma = share_of_distance(depth_ratios(healthy.estimate, evidence))
+        assert abs(found - share) < 5 * sigma < 0.1
+        texts = [one.text for one in found_by_depth(healthy.estimate, evidence)]
+        assert any("distances from the camera's centre" in text for text in texts) == (power == 1.0)
+
+
 @pytest.fixture(scope="module")
 def long() -> Walk:
     """Six times as long as what is looked at together."""
@@ -79,7 +100,7 @@ def test_frozen_depth_is_asked_of_where_it_froze() -> None:
     rows = np.repeat(np.arange(6 * PART), 20)
     tracks, frozen = np.arange(len(rows)), (rows >= 100) & (rows < 125)
     off = np.where(frozen & (tracks % 2 == 0), 2 * MUCH, 0.0)
-    ratios = DepthRatios(rows, tracks, off, rows, np.zeros(len(rows)))
+    ratios = DepthRatios(rows, tracks, off, np.zeros(len(rows)), rows, np.zeros(len(rows)))
     assert agree(ratios, 0, 6 * PART)
     assert not agree(ratios, 100, 124)
     assert agree(ratios, 180, 200)
