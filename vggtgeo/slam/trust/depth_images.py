@@ -19,7 +19,7 @@ import numpy as np
 
 from vggtgeo.datasets.check import PLAUSIBLE
 from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.evidence import Evidence, FrameEvidence, common
+from vggtgeo.slam.trust.evidence import Evidence, flow
 from vggtgeo.slam.trust.finding import Finding, spans
 
 MOVED = 2.0
@@ -49,7 +49,7 @@ def check_frozen(estimate: Estimate, evidence: Evidence, harmless: Callable[[int
     """
     if not estimate.metric:  # all beyond its range, say, which is the same all the time
         return []
-    moved = np.array([0.0, *(_flow(a, b) for a, b in pairwise(evidence))])
+    moved = np.array([0.0, *(flow(a, b) for a, b in pairwise(evidence))])
     with np.errstate(invalid="ignore"):
         changed = np.array([frame.depth_changed for frame in evidence])
         frozen = (changed < LEAST_CHANGED) & (moved > MOVED)
@@ -104,10 +104,3 @@ def check_range(estimate: Estimate, evidence: Evidence) -> list[Finding]:
         "depth images right?"
     )
     return [Finding("depth range", "degraded", text, scale=True)]
-
-
-def _flow(first: FrameEvidence, second: FrameEvidence) -> float:
-    rows, others = common(first, second)
-    if len(rows) < 8:
-        return 0.0
-    return float(np.median(np.linalg.norm(second.pixels[others] - first.pixels[rows], axis=1)))

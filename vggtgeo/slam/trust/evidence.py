@@ -51,6 +51,8 @@ STRIDE = 8
 """Pixels between the depths that are kept of the last frame."""
 MOST_WAITING = 4
 """Frames that wait to be looked at; they hold their images."""
+LEAST_COMMON = 8
+"""Corners, if their median is to say how far the picture moved."""
 _PATCH = (15, 15)
 _FLOW = {
     "winSize": _PATCH,
@@ -329,6 +331,14 @@ def common(first: FrameEvidence, second: FrameEvidence) -> tuple[np.ndarray, np.
     """Rows of the tracks that both frames saw."""
     _, rows, others = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
     return rows, others
+
+
+def flow(first: FrameEvidence, second: FrameEvidence) -> float:
+    """The median way of the corners that both frames saw, pixels; NaN where they are fewer than `LEAST_COMMON`."""
+    rows, others = common(first, second)
+    if len(rows) < LEAST_COMMON:
+        return np.nan
+    return float(np.median(np.linalg.norm(second.pixels[others] - first.pixels[rows], axis=1)))
 
 
 Evidence = Sequence[FrameEvidence]

@@ -23,6 +23,7 @@ from vggtgeo.slam.trust.evidence import Evidence
 from vggtgeo.slam.trust.extent import check_extent
 from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
 from vggtgeo.slam.trust.focal_length import check_focal_length
+from vggtgeo.slam.trust.frozen_pictures import check_frozen_pictures
 from vggtgeo.slam.trust.islands import check_islands
 from vggtgeo.slam.trust.own_points import check_own_points
 from vggtgeo.slam.trust.pace import pace
@@ -104,6 +105,7 @@ def _images(slam: Slam, estimate: Estimate, evidence: Evidence, size: tuple[int,
     ratios = depth_ratios(estimate, evidence, pace(estimate, evidence))
     yield from check_depth(estimate, ratios)
     yield from check_frozen(estimate, evidence, harmless=partial(agree, ratios))
+    yield from check_frozen_pictures(estimate, evidence)
     yield from check_range(estimate, evidence)
     yield from check_edges(estimate, np.array([noted.edges_elsewhere for noted in evidence], np.float64))
     sound = np.ones(len(estimate), bool)
