@@ -9,7 +9,8 @@ followed corners is smooth (by at most 8 % of the width, 3.4 degrees and 5 %; de
 picture over depth that is not (without depth it is a video of the mirrored room); a focus that breathes (2 and 5 % of
 the focal length); writing all over it that shines through; fifteen frames of a title before it; a beginning that comes
 out of the dark; sides filled with an enlarged, blurred copy; a second picture in its corner; a screen that was filmed
-(moire, bands of light). ATE after SE(3) with depth, after Sim(3) without.
+(moire, bands of light); a recorder that hangs for twelve frames and repeats its picture (depth goes on). ATE after
+SE(3) with depth, after Sim(3) without.
 """
 
 from __future__ import annotations
@@ -64,6 +65,16 @@ def mirrored(recording: Recording, rng: np.random.Generator) -> Recording:
     return with_images(recording, lambda image, row: np.ascontiguousarray(image[:, ::-1]))
 
 
+def hangs(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Twelve pictures in the middle are the one before them."""
+    del rng
+    last = len(recording.frames) // 2
+    held = recording.frames[last - HANGS].image
+    return with_images(recording, lambda image, row: held if last - HANGS < row <= last else image)
+
+
+HANGS = 12
+"""Frames."""
 SMOOTH = 12
 """Frames, standard deviation."""
 
@@ -200,7 +211,7 @@ CHANGES: dict[str, Degradation] = {
     "breathes by 5 %": breathing(0.05),
     **{
         change.__name__.replace("_", " "): change
-        for change in (watermark, title, out_of_the_dark, blurred_sides, second_picture, filmed_screen)
+        for change in (watermark, title, out_of_the_dark, blurred_sides, second_picture, filmed_screen, hangs)
     },
 }
 
