@@ -28,7 +28,7 @@ from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.sparse_map.connected import pieces_by_size
-from vggtgeo.slam.sparse_map.known_map import as_map, save_map
+from vggtgeo.slam.sparse_map.known_map import as_map, entered, save_map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
 from vggtgeo.slam.trust.estimate import Estimate
@@ -142,6 +142,16 @@ def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: P
     assert list(differences(plain, old)) == []
     with pytest.raises(vg.InputError, match="is no map that vggtgeo wrote, or was changed since"):
         vg.load_map(rewritten(tmp_path / "both.map", lambda header: header.update(version=1, classes=5)))
+
+
+def test_the_state_of_a_run_is_a_map(known: Slam) -> None:
+    """A run goes on in the map of another that is still in memory, whose frames and clock are not its own: it yielded
+    nothing before, as no time came after theirs. Oracle: the map that was saved and read.
+    """
+    camera = sequence().camera
+    assert list(differences(entered(first_half(), camera, ROLES.points), entered(known, camera, ROLES.points))) == []
+    with pytest.raises(vg.InputError, match="`known_map` has no keyframe"):
+        entered(replace(known, keyframes=()), camera, ROLES.points)
 
 
 def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:

@@ -66,7 +66,7 @@ def run(
         end: frame to stop before.
         stride: take every n-th frame.
         clock: adds up seconds by stage.
-        known_map: what `vggtgeo.load_map` gave; the frames are placed in it, and extend it.
+        known_map: what `vggtgeo.load_map` gave, or a state of another run; the frames are placed in it, and extend it.
 
     Yields:
         The state: poses are world -> camera, lengths metres where `metric`. The newest keyframe's window is adjusted
@@ -96,7 +96,7 @@ def check_run_arguments(roles: Any, settings: Any, camera: Any, known_map: Any) 
     check_kind(
         "camera", camera, Camera | None, "a `vggtgeo.Camera`, as `vggtgeo.Camera((fx, fy, cx, cy), width, height)`"
     )
-    check_kind("known_map", known_map, Slam | None, "what `vggtgeo.load_map` gives")
+    check_kind("known_map", known_map, Slam | None, "what `vggtgeo.load_map` gives, or a state of `vggtgeo.run`")
 
 
 def default_roles(has_depth: bool) -> Roles:

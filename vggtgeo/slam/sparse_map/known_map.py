@@ -99,12 +99,16 @@ def load_map(path: str | os.PathLike[str]) -> Slam:
 
 
 def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
-    """The state before the first frame of a run with this camera and matcher in a known map.
+    """The state before the first frame of a run with this camera and matcher in a known map, or in that of the state of
+    a run that is still in memory, whose frames and times are not of this run.
 
     Raises:
-        InputError: the map is of another camera, or its key points are another matcher's.
+        InputError: there is no keyframe, the map is of another camera, or its key points are another matcher's.
 
     """
+    if not known.keyframes:
+        raise InputError("`known_map` has no keyframe; give a map, or the state of a run that has tracked some frames")
+    known = as_map(known)
     height, width = known.keyframes[0].size
     if (width, height) != (camera.width, camera.height):
         raise InputError(
