@@ -83,6 +83,7 @@ DEPTH = rows(
         ("half an `.npy`", depths(".npy", bytes_of.npy(METRES)[:1000])),
         ("an `.npy` that declares 70 TiB", depths(".npy", bytes_of.npy_header((10**7, 10**6)))),
         ("floats of 1e10, which renderers write where there is nothing", depths(".tiff", 1e10 * METRES)),
+        ("floats in millimetres", depths(".tiff", 1e3 * METRES)),
         ("a folder `depth` of other files", other_depth),
         ("a PFM with a scale of 0.5", depths(".pfm", pfm(-0.5))),
         ("half a PFM", depths(".pfm", pfm(-1.0)[:1000])),

@@ -11,7 +11,7 @@ import tiny_sequences
 from layout_checks import checked
 
 from vggtgeo.datasets import open_sequence, with_depth_scale, with_rate
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, UnusableDepthWarning
 
 
 @pytest.mark.parametrize(
@@ -56,6 +56,21 @@ def test_depth_of_floats_is_in_metres(tmp_path: Path, suffix: str) -> None:
     assert [frame.depth[3, 7] for frame in frames] == pytest.approx([1.007, 1.017, 1.027])
     assert np.isnan(frames[0].depth[0, :5]).all()
     assert next(iter(with_depth_scale(sequence, 2.0).frames())).depth[3, 7] == pytest.approx(1.007 / 2)
+
+
+def test_depth_of_floats_in_millimetres_is_read_with_its_scale(tmp_path: Path) -> None:
+    # Proves that depth beyond every room as metres is used in the unit that is given, and told without one; it could
+    # not be given. Oracle: what was written.
+    folder = tiny.rgbd(tmp_path / "own")
+    for file in sorted((folder / "depth").iterdir()):
+        millimetres = np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float32)
+        np.save(file.with_suffix(".npy"), 1001 + millimetres)
+        file.unlink()
+    with pytest.warns(UnusableDepthWarning, match="none of it is from 0.001 to 1000 m: `--depth-scale` says"):
+        sequence = open_sequence(folder)
+    assert not sequence.has_depth
+    frames = list(with_depth_scale(sequence, 1000.0).frames())
+    assert [frame.depth[3, 7] for frame in frames] == pytest.approx([2.008, 2.018, 2.028])
 
 
 def test_depth_of_a_phone_is_enlarged_to_the_images(tmp_path: Path) -> None:

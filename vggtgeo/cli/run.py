@@ -15,7 +15,7 @@ from vggtgeo.cli import run_options as options
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.io.checkpoint_pace import EVERY
-from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning
 from vggtgeo.io.warned import collected_warnings
 
 if TYPE_CHECKING:
@@ -238,6 +238,8 @@ def open_input(
     with warnings.catch_warnings():
         if intrinsics is not None:  # then nothing is guessed
             warnings.simplefilter("ignore", GuessedCameraWarning)
+        if depth_scale is not None:  # then the unit is not that of the layout
+            warnings.simplefilter("ignore", UnusableDepthWarning)
         sequence = open_sequence(path, kind, fps)
     if depth_scale is not None:
         sequence = with_depth_scale(sequence, depth_scale)

@@ -16,6 +16,7 @@ from vggtgeo.datasets.image_files import (
     MILLIMETRES,
     DepthFormat,
     ImageFile,
+    floats_out_of_range,
     is_there,
     read_depth,
     read_image,
@@ -24,7 +25,7 @@ from vggtgeo.datasets.image_files import (
 from vggtgeo.datasets.image_orientation import not_turned
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning, UnusableDepthWarning
 
 LATEST = 1e11
 """Seconds of a time stamp, 3,000 years: nanoseconds since 1970 are 1e18."""
@@ -203,8 +204,9 @@ def depth_is_usable(
     them.
 
     Looks at the first, middle and last file, and at the others only while no valid pixel has been seen.
-    InputError where the depth has another size than the images; an InputWarning where no pixel of any file is
-    valid. of_fewer_pixels: depth of fewer pixels will do, if it has the shape of the images; an InputWarning says so.
+    InputError where the depth has another size than the images; an UnusableDepthWarning where no pixel of any file
+    is valid. of_fewer_pixels: depth of fewer pixels will do, if it has the shape of the images; an InputWarning says
+    so.
     """
     with_depth = [file for file in files if file.depth is not None]
     reason = ""
@@ -235,8 +237,10 @@ def depth_is_usable(
             return True
     if with_depth:
         gone = not any(file.depth is not None and is_there(file.depth) for file in with_depth)
+        reason = reason if gone or reason else floats_out_of_range(next(f.depth for f in with_depth if f.depth))
         what = f"is there: `{with_depth[0].depth}`, ..." if gone else f"has a valid pixel{reason}"
-        _warn(f"`{name}`: none of the {len(with_depth)} depth images {what}; reading the images only")
+        text = f"`{name}`: none of the {len(with_depth)} depth images {what}; reading the images only"
+        _warn(text, InputWarning if gone else UnusableDepthWarning)
     return False
 
 

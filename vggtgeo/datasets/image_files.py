@@ -125,6 +125,18 @@ def metres_of_floats(codes: np.ndarray, per_metre: float = 1.0) -> Float[np.ndar
         return np.where((depth >= NEAREST) & (depth <= FARTHEST), depth, np.float32(np.nan))
 
 
+def floats_out_of_range(path: Path) -> str:
+    """What to say of a file of floats that has depth and none that is one, of millimetres, say; nothing of another."""
+    codes = read_codes(path)
+    there = codes[np.isfinite(codes) & (codes > 0)] if np.issubdtype(codes.dtype, np.floating) else codes[:0]
+    if not there.size:
+        return ""
+    return (
+        f" (`{path}`: its depth goes from {there.min():g} to {there.max():g}, and none of it is from {NEAREST:g} to "
+        f"{FARTHEST:g} m: `--depth-scale` says how many there are in a metre: 1000 are millimetres)"
+    )
+
+
 def read_codes(path: Path) -> np.ndarray:
     """The numbers in an image or an array of NumPy, as they are stored; InputError where it cannot be read."""
     if path.suffix.lower() == ".npy":

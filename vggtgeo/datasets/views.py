@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from vggtgeo.datasets.folder import FolderSequence
+from vggtgeo.datasets.folder import FolderSequence, depth_is_usable
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.in_memory import copied
@@ -92,11 +92,15 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
             f"(kilometres) to {MOST_UNITS:g} (micrometres): 1000 is millimetres, 5000 TUM's"
         )
     plain = isinstance(sequence, FolderSequence) and type(sequence).load_depth is FolderSequence.load_depth
-    if not plain or not sequence.has_depth:
+    files = sequence.files if isinstance(sequence, FolderSequence) and plain else ()
+    if not any(file.depth is not None for file in files):
         raise InputError(f"`{sequence.name}` has no depth files whose unit could be another")
     assert isinstance(sequence, FolderSequence)
     coding = replace(sequence.depth_format, units_per_metre=units_per_metre, floats_per_metre=units_per_metre)
-    return replace(sequence, depth_format=coding)
+    # Floats in millimetres are beyond every room as the metres that they are by convention.
+    size, fewer = (sequence.camera.width, sequence.camera.height), sequence.depth_of_fewer_pixels
+    usable = sequence.has_depth or depth_is_usable(sequence.name, files, coding, *size, fewer)
+    return replace(sequence, depth_format=coding, has_depth=usable)
 
 
 def without_depth(sequence: Sequence) -> Sequence:

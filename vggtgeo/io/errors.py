@@ -34,6 +34,10 @@ class GuessedCameraWarning(InputWarning):
     """Nobody gave the camera: a guess is where the run starts."""
 
 
+class UnusableDepthWarning(InputWarning):
+    """None of the depth that is there is from where a room's can be, in the unit that its files have by convention."""
+
+
 class LeftOutWarning(InputWarning):
     """Frames of the input were left out; `frames` counts them."""
 
