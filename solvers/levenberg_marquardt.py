@@ -190,6 +190,9 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             if not isinstance(given, int | float | np.floating | np.integer) or not 0 <= given <= highest:
                 until = "" if highest > 1 else f", at most {highest:g}"
                 raise ValueError(f"`{name}` is {given!r:.60}; it must be a number, at least 0{until}")
+        ends: tuple[Any, Any] = (self.min_damping, self.max_damping)
+        if not any(isinstance(end, jax.Array) for end in ends) and ends[0] > ends[1]:
+            raise ValueError(f"`min_damping` is {ends[0]:g} and `max_damping` {ends[1]:g}; it must not be larger")
         parts: tuple[Any, Any] = (self.norm, self.reduced_solver)
         if not callable(parts[0]) or not isinstance(parts[1], AbstractReducedSolver):
             raise ValueError("`norm` must be a function, and `reduced_solver` one of `vggtgeo.solvers.reduced`")
@@ -206,6 +209,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         finite = jnp.isfinite(energy)
         # Of another function this solver would minimise something else without a word.
         same = jnp.isclose(_value(fn(y, args)), energy, rtol=1e-3, atol=0.0) | ~finite
+        begun = _CODES.running if self.max_iterations else _CODES.max_iterations
         history = jnp.full(self.max_iterations + 1, jnp.nan, energy.dtype).at[0].set(energy)
         return LevenbergMarquardtState(
             energy=energy,
@@ -216,9 +220,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             linearisations=jnp.asarray(0),
             gradient_norm=jnp.asarray(jnp.inf, energy.dtype),
             history=history,
-            termination=_CODES.where(
-                same, _CODES.where(finite, _CODES.running, _CODES.nonfinite_input), _CODES.other_function
-            ),
+            termination=_CODES.where(same, _CODES.where(finite, begun, _CODES.nonfinite_input), _CODES.other_function),
             polished=jnp.asarray(False),
             gradient_residual=jnp.asarray(jnp.inf, energy.dtype),
             record=self._start_record(args.recorded(y), history) if self.record_iterations else None,

@@ -177,6 +177,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`frame_trajectory` of nothing", lambda _: vg.frame_trajectory(None)),
     ("`SurfaceFusion.update` of nothing", lambda _: vg.SurfaceFusion([50.0, 50.0, 32.0, 24.0]).update(None)),
     ("`SurfaceFusion`: three intrinsics", lambda _: vg.SurfaceFusion([50.0, 50.0, 32.0])),
+    ("`SurfaceFusion`: a focal length of 0", lambda _: vg.SurfaceFusion([0.0, 50.0, 32.0, 24.0])),
     (
         "`with_depth_scale` of a text",
         lambda made: with_depth_scale(open_sequence(tiny_sequences.tum(made)), "5000"),
@@ -230,6 +231,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("checkpoints of nothing", lambda _: vg.Checkpoints(None)),
     ("a map of nothing", lambda _: vg.load_map(None)),
     ("a batch of nothing", lambda _: vg.bench(None, "runs/none")),
+    ("a batch of one sequence, its name in no list", lambda _: vg.bench("quick", "runs/none", sequences="office")),
     ("a batch to nowhere", lambda _: vg.bench("quick", "")),
     ("`simulate`: frames that are a text", simulated("room", "3")),
     ("`simulate`: half a frame", simulated("room", 2.5)),

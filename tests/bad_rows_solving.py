@@ -158,6 +158,7 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a measured rotation with the root of a pose", with_prior(vg.RotationPrior, measured=UPRIGHT, root=ROOT_OF_POSE)),
     ("a kernel whose width is a text", lambda _: vg.Huber("1.5")),
     ("`pack`: Barron's kernel of shape 3", pack(kernel=vg.Barron(1.5, 3.0))),
+    ("a solver whose damping ends before it begins", lambda _: vg.SchurLevenbergMarquardt(max_damping=1e-20)),
     ("a solver with damping below zero", lambda _: vg.SchurLevenbergMarquardt(initial_damping=-1.0)),
     ("a derivative of half a step", lambda _: vg.ArrowAdjoint(polish=1.5)),
     ("`pack`: a size of texts", lambda _: SCENE.pack(size=vg.PaddedSize("3", 40, 9, 2))),

@@ -225,6 +225,7 @@ def test_without_jit_it_is_the_same(solved: Solve) -> None:
     assert int(two.iterations) == 2
     assert not bool(two.converged)
     np.testing.assert_allclose(two.history, compiled.history[:3], rtol=1e-12)
+    assert solve(problem, start, solver=SchurLevenbergMarquardt(max_iterations=0)).result == "max_iterations"
 
 
 def test_a_jitted_function_may_close_over_the_problem(solved: Solve) -> None:

@@ -134,7 +134,7 @@ def bench(
 
     """
     chosen = suite if isinstance(suite, Suite) else load_suite(path_of("suite", suite))
-    chosen = limited(chosen, _names(sequences), _names(settings), seeds, first_seed, frames)
+    chosen = limited(chosen, _names("sequences", sequences), _names("settings", settings), seeds, first_seed, frames)
     chosen = replace(
         chosen,
         recordings=chosen.recordings if recordings is None else recordings,
@@ -204,5 +204,7 @@ def all_rows(
     return [rows[job.name] for job in jobs]
 
 
-def _names(names: Iterable[str] | None) -> tuple[str, ...] | None:
+def _names(what: str, names: Iterable[str] | None) -> tuple[str, ...] | None:
+    if isinstance(names, str):  # a text is an iterable of its letters
+        raise InputError(f"`{what}` is {names!r}; expected a list of names, as [{names!r}]")
     return None if names is None else tuple(names)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.camera import check_intrinsics
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_positive, check_real, check_whole, real_array
@@ -102,7 +103,8 @@ class SurfaceFusion:
         if not bound >= 0:
             raise InputError(f"`bound` is {bound}; it must be voxels, 0 or more")
         check_whole("least_views", least_views, 1)
-        self._intrinsics = real_array("intrinsics", intrinsics, (4,)).astype(np.float64)
+        given = real_array("intrinsics", intrinsics, (4,)).astype(np.float64)
+        self._intrinsics = np.array(check_intrinsics(given.tolist()))
         self._voxel, self._least_views, self._bound = voxel, least_views, bound
         self._fused: dict[int, _Fused] = {}
         self._touched: dict[Block, set[int]] = defaultdict(set)
