@@ -1,5 +1,6 @@
 """Runs in processes of their own: limits, crashes, killed workers, a killed driver, resuming."""
 
+import errno
 import json
 import os
 import random
@@ -15,10 +16,13 @@ import pytest
 import tiny_suites as tiny
 from conftest import ROOT
 
+from vggtgeo.benchmark import worker
 from vggtgeo.benchmark.processes import Limits, run_limited, shares
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.runner import all_rows
+from vggtgeo.benchmark.scheduling import worker_command
 from vggtgeo.benchmark.store import Store
+from vggtgeo.benchmark.worker import NO_SPACE
 from vggtgeo.io.errors import InputError
 
 LIMITS = Limits(seconds=20.0, memory_gb=2.0)
@@ -207,6 +211,84 @@ def test_a_fault_of_the_caller_leaves_no_process(tmp_path: Path) -> None:
             command=tiny.worker("time.sleep(0 if job['seed'] == 0 and job['setting'] == 'full' else 15)"),
         )
     assert time.monotonic() - began < 8
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_full_disk_ends_the_batch_and_costs_no_run(tmp_path: Path, workers: int) -> None:
+    # Proves that a run that a full disk ended is no row but the end of the batch, with its reason (also where other
+    # runs are stopped for it), that what is finished stays, and that a second call does the rest. Oracle: a worker made
+    # to end so, and the list of starts.
+    jobs = [job for job in tiny.jobs() if job.sequence == "walk" and job.setting == "full"]
+    store = Store(tmp_path, "tiny", "s")
+    full = tiny.worker(f"""
+if job["seed"] == 2: sys.exit(print("No space left on device: 'map.ply'") or {NO_SPACE})
+if job["seed"] == 0: time.sleep({15 if workers == 2 else 0})
+""")
+    with pytest.raises(InputError, match=r"no space left for the run `.*walk.full.2` \(No space left on device: 'map"):
+        all_rows(jobs, store, LIMITS, workers=workers, command=full)
+    finished = {path.parent.name for path in tmp_path.glob("runs/*/row.json")}
+    assert finished == ({"walk.full.0", "walk.full.1"} if workers == 1 else {"walk.full.1"})
+    rows = all_rows(jobs, store, LIMITS, command=tiny.worker())
+    assert {row["status"] for row in rows} == {"ok"}
+    starts = Counter((tmp_path / "starts.txt").read_text().split())
+    assert all(starts[name] == 1 for name in finished)
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_worker_tells_a_full_disk_from_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: bool) -> None:
+    # Proves the exit code of a run whose disk is full, also where an error of the input says so, and that it leaves no
+    # row; any other error of the system is a fault of the program. Oracle: errors by their numbers.
+    (job,) = tiny.jobs()[:1]
+    place = Store(tmp_path, "tiny", "s").begin(job)
+
+    def run(number: int) -> None:
+        def fails(*_: object) -> None:
+            try:
+                raise OSError(number, os.strerror(number), "map.ply")
+            except OSError as error:
+                if told:
+                    raise InputError("`out` cannot be written") from None
+                raise error
+
+        monkeypatch.setattr(worker, "_run", fails)
+        monkeypatch.setattr(worker, "end_with_parent", lambda parent: None)
+        worker.main([str(place), str(tmp_path), "1"])
+
+    with pytest.raises(SystemExit) as ended:
+        run(errno.ENOSPC)
+    assert ended.value.code == NO_SPACE
+    assert not (place / worker.ROW).exists()
+    if told:
+        run(errno.EACCES)
+        assert json.loads((place / worker.ROW).read_text())["status"] == "error"
+    else:
+        with pytest.raises(PermissionError):
+            run(errno.EACCES)
+
+
+def test_a_worker_ends_whose_driver_is_gone_already(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a run ends whose driver was killed while it was importing, which takes seconds: it knows the driver's
+    # number from its command line. Oracle: this process's number, and parents that are told to the worker.
+    command = worker_command(Path("run"), Path("scratch"))
+    assert command[-1] == str(os.getpid())
+    for parents in ([1], [7, 7, 1]):
+        ended, asked = threading.Event(), iter(parents)
+        monkeypatch.setattr(os, "_exit", lambda code, ended=ended: ended.set())
+        monkeypatch.setattr(os, "getppid", lambda asked=asked: next(asked))
+        worker.end_with_parent(7, 0.01)
+        assert ended.wait(10)
+        assert next(asked, None) is None
+
+
+def test_what_a_killed_batch_left_is_taken_away(tmp_path: Path) -> None:
+    # Proves that rendered walks, of a hundred megabytes each, do not pile up where batches are killed. Oracle: a folder
+    # as a killed batch leaves it.
+    (tmp_path / ".scratch").mkdir()
+    (tmp_path / ".scratch/old.walk").write_text("a walk")
+    seen = tiny.worker("assert not (folder.parent.parent / '.scratch/old.walk').exists()")
+    rows = all_rows(tiny.jobs()[:1], Store(tmp_path, "tiny", "s"), LIMITS, command=seen)
+    assert [row["status"] for row in rows] == ["ok"]
+    assert not (tmp_path / ".scratch").exists()
 
 
 def test_a_walk_is_rendered_by_one_run_and_goes_with_the_last(tmp_path: Path) -> None:

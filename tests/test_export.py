@@ -8,12 +8,14 @@ import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
 import pytest
 from recorded_run import recorded_run
 from scipy.spatial.transform import Rotation
+from small_disk import small_disk
 from test_stereo import keyframe_of, slots_of
 from typer.testing import CliRunner
 from vggtgeo.models.roles import LineMatches, PointMatches
@@ -249,6 +251,25 @@ def test_an_export_again_replaces_what_an_export_wrote(folder: Path, tmp_path: P
     with pytest.raises(vg.InputError, match="was not written by an export"):
         export(copy, "tum", tmp_path / "out")
     assert (tmp_path / "out/trajectory.txt").read_text() == "somebody's"
+
+
+def test_a_full_disk_leaves_the_record_of_what_exports_wrote(folder: Path, tmp_path: Path) -> None:
+    # Proves that an export that cannot note its files any more names the folder, and that the next one still knows the
+    # files of the one before as its own. Oracle: the record's bytes, and that next export.
+    target = tmp_path / "out"
+    export(folder, "tum", target)
+    before = (target / ".vggtgeo-export").read_bytes()
+
+    def other(source: Path, stage: Path) -> dict[str, float]:
+        (stage / f"{'x' * 200}.txt").touch()
+        return {}
+
+    with patch.dict(FORMATS, tum=other), small_disk(100), pytest.raises(OSError, match=r"out/\.vggtgeo-export"):
+        export(folder, "tum", target)
+    assert (target / ".vggtgeo-export").read_bytes() == before
+    with patch.dict(FORMATS, tum=other), small_disk(0), pytest.raises(vg.InputError, match="out` cannot be written"):
+        export(folder, "tum", target)
+    export(folder, "tum", target)
 
 
 def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) -> None:

@@ -1,13 +1,17 @@
 """Atomic writes: all or nothing."""
 
+import errno
 import json
 import math
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
+from small_disk import small_disk
 
 from vggtgeo.io.files import atomic_open, atomic_path, write_json, write_text
+from vggtgeo.io.pictures import write_picture
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
@@ -38,6 +42,32 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, interruption: 
         write_half()
     assert file.read_text() == "old"
     assert os.listdir(tmp_path) == ["map.ply"]
+
+
+def test_an_error_names_the_file_that_was_to_be_written(tmp_path: Path) -> None:
+    # Proves that an error names the file's own name, which somebody knows, not that of the temporary file, which is
+    # gone, whether the system names that one or none. Oracle: the error.
+    def write(names: bool) -> None:
+        with atomic_path(tmp_path / "map.ply") as temporary:
+            raise OSError(errno.ENOSPC, "No space left on device", *([str(temporary)] if names else []))
+
+    for names in (True, False):
+        with pytest.raises(OSError, match="No space left on device") as failed:
+            write(names)
+        assert (failed.value.errno, failed.value.filename) == (errno.ENOSPC, str(tmp_path / "map.ply"))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_picture_is_written_as_a_whole_or_not_at_all(tmp_path: Path, suffix: str) -> None:
+    # Proves that a disk that gets full is an error with the picture's name, and leaves the one before (OpenCV writes a
+    # part, and says that all is well). Oracle: the file's bytes.
+    file = tmp_path / f"rgb/1{suffix}"
+    write_picture(file, np.zeros((4, 4, 3), np.uint8))
+    before = file.read_bytes()
+    with small_disk(4096), pytest.raises(OSError, match=f"rgb/1{suffix}"):
+        write_picture(file, np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8))
+    assert file.read_bytes() == before
+    assert os.listdir(file.parent) == [file.name]
 
 
 def test_the_temporary_file_lies_beside_and_keeps_the_suffix(tmp_path: Path) -> None:

@@ -310,6 +310,25 @@ def test_a_broken_file_of_the_cache_is_computed_again(tmp_path: Path, session: S
     assert [file.name for file in (tmp_path / "cache").rglob("*") if file.is_file()] == [path.name]
 
 
+def test_a_full_disk_costs_the_answer_s_place_only(
+    tmp_path: Path, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Proves that a run whose answers cannot be kept goes on, is told of it once, and leaves no part of a file. Oracle:
+    # the answer, and the folder.
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("vggtgeo.models.onnx.cache.os.fsync", full)
+    cache = FolderCache(tmp_path / "cache")
+    compute, calls = _counted({"a": np.arange(5.0)})
+    ask = lambda: cache.get((session,), (), (), compute)["a"]
+    with pytest.warns(UserWarning, match=r"cannot be kept in `.*cache` \(No space left on device\)"):
+        np.testing.assert_array_equal(ask(), np.arange(5.0))
+    np.testing.assert_array_equal(ask(), np.arange(5.0))  # of which no other warning tells: that would be an error
+    assert len(calls) == 2
+    assert not [file for file in (tmp_path / "cache").rglob("*") if file.is_file()]
+
+
 def test_a_failed_computation_leaves_nothing(tmp_path: Path, session: Session) -> None:
     # Proves that an interrupted run leaves no half answer. Oracle: the folder after an interruption.
     def interrupted() -> Outputs:

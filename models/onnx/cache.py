@@ -13,6 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from vggtgeo.models.onnx.file_checks import UNREADABLE
+from vggtgeo.models.onnx.providers import warn_once
 from vggtgeo.models.onnx.session import Session
 
 Outputs = dict[str, np.ndarray]
@@ -64,7 +65,8 @@ class MemoryCache:
 class FolderCache:
     """Answers in a folder, one `.npz` file each, written atomically: an interrupted run leaves whole files only.
 
-    A file that cannot be read is computed and written again.
+    A file that cannot be read is computed and written again; one that cannot be written, on a full disk say, is told
+    once, and costs time alone.
     """
 
     folder: Path
@@ -82,7 +84,11 @@ class FolderCache:
         found = _read(path)
         if found is None:
             found = compute()
-            _write(path, found)
+            try:
+                _write(path, found)
+            except OSError as error:
+                reason = error.strerror or error
+                warn_once(f"answers of networks cannot be kept in `{self.folder}` ({reason}): the run goes on without")
         return found
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ from vggtgeo.benchmark.processes import Ending, Limits, run_limited, shares
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.table import Row
-from vggtgeo.benchmark.worker import LOG
+from vggtgeo.benchmark.worker import LOG, NO_SPACE
+from vggtgeo.io.errors import InputError
 
 Command = Callable[[Path, Path], Sequence[str]]
 """The command line of a run, given its folder and the scratch folder."""
@@ -28,7 +31,7 @@ _LAST = 2000  # characters of a log that are looked at for its last line
 
 def worker_command(folder: Path, scratch: Path) -> list[str]:
     """The command line of a run."""
-    return [sys.executable, "-m", "vggtgeo.benchmark.worker", str(folder), str(scratch)]
+    return [sys.executable, "-m", "vggtgeo.benchmark.worker", str(folder), str(scratch), str(os.getpid())]
 
 
 def run_jobs(
@@ -41,17 +44,17 @@ def run_jobs(
 ) -> None:
     """Run `jobs`, `workers` at a time, and store their rows; a crash, a hang, too much memory is a row.
 
-    Walks that are rendered are kept in a folder of this process as long as a run waits for them. After Ctrl-C, or an
-    exception of `finished`, no process is left; what was finished is stored.
+    Walks that are rendered are kept in a folder of this batch as long as a run waits for them. After Ctrl-C, a full
+    disk, or an exception of `finished`, no process is left; what was finished is stored.
     """
-    with tempfile.TemporaryDirectory(prefix="vggtgeo-bench-") as scratch:
-        queue = _Queue(list(jobs), Path(scratch))
+    with _scratch(store.folder) as scratch:
+        queue = _Queue(list(jobs), scratch)
         stop = threading.Event()
 
         def work(cores: Sequence[int]) -> None:
             while (job := queue.take(stop)) is not None:
                 try:
-                    row = run_one(job, store, limits, cores, command, Path(scratch), stop)
+                    row = run_one(job, store, limits, cores, command, scratch, stop)
                 finally:
                     queue.give_back(job)
                 if finished is not None:
@@ -68,8 +71,9 @@ def run_jobs(
             finally:
                 if not all(future.done() and not future.exception() for future in futures):
                     stop.set()
-            for future in futures:
-                future.result()
+            errors = [error for future in futures if (error := future.exception()) is not None]
+            for error in sorted(errors, key=lambda error: isinstance(error, KeyboardInterrupt)):
+                raise error  # the first of all: those that were stopped for it tell of no more
 
 
 def run_one(
@@ -81,11 +85,16 @@ def run_one(
     scratch: Path,
     stop: threading.Event | None = None,
 ) -> Row:
-    """One run and its row."""
+    """One run and its row; InputError where the disk is full, and so would be for those that follow."""
     place = store.begin(job)
     began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     log = place / LOG
     ending = run_limited(command(place, scratch), log, limits, cores, stop)
+    if ending.code == NO_SPACE:
+        raise InputError(
+            f"there is no space left for the run `{place}` ({_last_line(log.read_bytes())}); give it some and call "
+            "again: what is finished is kept"
+        )
     return store.complete(job, **described(ending, log.read_bytes()), started=began, cpus=len(cores))
 
 
@@ -93,8 +102,7 @@ def described(ending: Ending, log: bytes) -> dict[str, Any]:
     """The columns of a row that tell how its process ended, and where; the status is that of a run that left no row."""
     message = ending.message
     if ending.status == "ended" and ending.code > 0:
-        lines = log[-_LAST:].decode(errors="replace").splitlines()
-        message = f"{message}: {next((line.strip() for line in reversed(lines) if line.strip()), '')}"
+        message = f"{message}: {_last_line(log)}"
     return {
         "status": "crash" if ending.status in ("ended", "killed") else ending.status,
         "message": message,
@@ -103,6 +111,23 @@ def described(ending: Ending, log: bytes) -> dict[str, Any]:
         "tries": ending.tries,
         **provenance(),
     }
+
+
+def _last_line(log: bytes) -> str:
+    lines = log[-_LAST:].decode(errors="replace").splitlines()
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """A new folder below that of a batch, gone afterwards; of a batch that was killed the next one takes it away."""
+    place = folder / ".scratch"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(mode=0o700, parents=True)  # nobody else may write there: a walk is a pickle
+    try:
+        yield place
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
 
 
 class _Queue:

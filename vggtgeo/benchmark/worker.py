@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,19 +34,23 @@ from vggtgeo.viewing.target import open_target
 
 JOB, ROW, LOG, RECORDING = "job.json", "row.json", "log.txt", "run.rrd"
 """Files in the folder of a run."""
+NO_SPACE = 75
+"""Exit code of a run that a full disk ended, which says nothing of the run: it leaves no row."""
 
 
 def run_job(folder: Path, scratch: Path | None = None) -> None:
     """The run that `folder`/job.json describes; its row is there as a whole or not at all.
 
     scratch: see `open_input`. What the user gave wrong makes a row with the status "error"; a fault of the program
-    leaves by its exception.
+    leaves by its exception, and so does a full disk.
     """
     job = json.loads((folder / JOB).read_text(encoding="utf-8"))
     began = time.perf_counter()
     try:
         row = {"status": "ok", **_run(folder, job["spec"], job["seed"], scratch)}
     except InputError as error:
+        if _is_full(error):
+            raise
         row = {"status": "error", "message": str(error)}
     cost = {"seconds_process": time.perf_counter() - began, "peak_memory_gb": _peak_gb()}
     write_json(folder / ROW, {**identity(job), **row, **cost, **provenance()})
@@ -78,7 +84,7 @@ def _peak_gb() -> float:
 def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None) -> dict[str, Any]:
     with collected_warnings() as warned:
         given = open_input(spec, seed, scratch)
-    with recorded(folder, spec["recordings"]) as callbacks:
+    with recorded(folder, spec["recordings"], scratch) as callbacks:
         result = reconstruct(
             given.sequence,
             given.perception,
@@ -100,14 +106,14 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
 
 
 @contextmanager
-def recorded(folder: Path, wanted: bool) -> Iterator[tuple[Callback, ...]]:
-    """What logs the run to `folder`/run.rrd for the Rerun viewer, where that is wanted. The file comes at the end: what
-    a result writes takes away what an earlier run left, recordings among it.
+def recorded(folder: Path, wanted: bool, scratch: Path | None = None) -> Iterator[tuple[Callback, ...]]:
+    """What logs the run to `folder`/run.rrd for the Rerun viewer, where that is wanted. The file comes at the end, and
+    grows in `scratch`: what a result writes takes away what an earlier run left, recordings among it.
     """
     if not wanted:
         yield ()
         return
-    with tempfile.TemporaryDirectory(prefix="vggtgeo-bench-") as made:
+    with tempfile.TemporaryDirectory(prefix="vggtgeo-bench-", dir=scratch) as made:
         path = Path(made) / RECORDING
         stream = open_target(str(path), folder.name, path).stream
         yield (RerunCallback(stream),)
@@ -123,9 +129,10 @@ def _save(folder: Path, result: Result, truth: Trajectory | None, spec: Mapping[
         truth.save_tum(folder / "truth.txt")
 
 
-def end_with_parent(seconds: float = 1.0) -> None:
-    """End this process soon after the one that started it has ended: a run that nobody waits for must not go on."""
-    parent = os.getppid()
+def end_with_parent(parent: int, seconds: float = 1.0) -> None:
+    """End this process soon after the one that started it, `parent`, has ended: a run that nobody waits for must not go
+    on. That may have ended already, while this one was importing.
+    """
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -136,12 +143,25 @@ def end_with_parent(seconds: float = 1.0) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """`python -m vggtgeo.benchmark.worker FOLDER [SCRATCH]`."""
-    end_with_parent()
-    run_job(Path(arguments[0]), Path(arguments[1]) if len(arguments) > 1 else None)
+    """`python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT`, the last the number of the process that waits."""
+    folder, scratch, parent = arguments
+    end_with_parent(int(parent))
+    try:
+        run_job(Path(folder), Path(scratch))
+    except (OSError, InputError) as error:
+        if not _is_full(error):
+            raise
+        with suppress(OSError):  # the log may lie on that disk
+            sys.stderr.write(f"{error}\n")
+        sys.exit(NO_SPACE)
+
+
+def _is_full(error: BaseException) -> bool:
+    """Whether a disk without space is behind it."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return True
+    return error.__context__ is not None and _is_full(error.__context__)
 
 
 if __name__ == "__main__":
-    import sys
-
     main(sys.argv[1:])

@@ -17,7 +17,7 @@ from vggtgeo.export.nerfstudio import write_nerfstudio
 from vggtgeo.export.paths import write_kitti, write_tum
 from vggtgeo.export.surfaces import write_glb, write_las, write_ply
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import whole_path
+from vggtgeo.io.files import whole_path, write_text
 from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import LockedError, locked, not_written
 from vggtgeo.io.text_files import whole_text
@@ -67,31 +67,50 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     _check_target(output, place)
     verdict = read_summary(place)[1]
     failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""
-    made = [folder for folder in (output, *output.parents) if not folder.exists()]
-    output.mkdir(parents=True, exist_ok=True)
-    stage = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=output))
-    try:  # what is there already stays until all is written
-        written = FORMATS[to](place, stage)
-        names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
-        with _in_turn(output):
-            _claim(output, names, ours=whole_path(output) == whole_path(place / "export" / to))
-            for name in names:
-                (output / name).parent.mkdir(parents=True, exist_ok=True)
-                (stage / name).replace(output / name)
+    try:
+        with _staged(output) as stage:  # what is there already stays until all is written
+            written = FORMATS[to](place, stage)
+            names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
+            with _in_turn(output):
+                _claim(output, names, ours=whole_path(output) == whole_path(place / "export" / to))
+                for name in names:
+                    (output / name).parent.mkdir(parents=True, exist_ok=True)
+                    (stage / name).replace(output / name)
     except EmptyRunError as error:
         raise InputError(f"{error} ({failed})" if failed else str(error)) from None
-    except OSError as error:
-        if error.filename is not None and Path(error.filename).is_relative_to(stage):  # which will be gone
-            raise not_written(output, error) from None
-        raise
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
-        for folder in made:  # innermost first
-            if not any(folder.iterdir()):
-                folder.rmdir()
     if failed:
         warnings.warn(f"`{place}`: {failed}", InputWarning, stacklevel=2)
     return written
+
+
+@contextmanager
+def _staged(output: Path) -> Iterator[Path]:
+    """A folder in `output` for the files of an export, which is gone afterwards, as are folders that were made for it
+    and stayed empty. InputError where it cannot be written.
+    """
+    made = [folder for folder in (output, *output.parents) if not folder.exists()]
+    try:
+        stage = _new_stage(output)
+        try:
+            yield stage
+        except OSError as error:
+            if error.filename is not None and Path(error.filename).is_relative_to(stage):  # which will be gone
+                raise not_written(output, error) from None
+            raise
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
+    finally:
+        for folder in made:  # innermost first
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+
+
+def _new_stage(output: Path) -> Path:
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix=".unfinished-", dir=output))
+    except OSError as error:
+        raise not_written(output, error) from None
 
 
 @contextmanager
@@ -110,6 +129,8 @@ def _in_turn(output: Path) -> Iterator[None]:
                         f"`{output}` is in use by another export ({error}); give another folder with `-o`"
                     ) from None
                 time.sleep(_WAIT)
+            except OSError as error:
+                raise not_written(output, error) from None
         yield
 
 
@@ -141,4 +162,4 @@ def _claim(output: Path, names: list[str], ours: bool) -> None:
             f"`{output / strange[0]}` is there and was not written by an export, which would replace it; give a new "
             "folder with `-o`"
         )
-    record.write_text("\n".join(sorted({*known, *names})) + "\n", encoding="utf-8")
+    write_text(record, "\n".join(sorted({*known, *names})) + "\n")

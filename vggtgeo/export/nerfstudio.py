@@ -10,7 +10,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from vggtgeo.datasets.image_files import read_codes
@@ -20,6 +19,7 @@ from vggtgeo.export.pictures import copy_pictures, picture_mask
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_path, write_json
+from vggtgeo.io.pictures import write_picture
 from vggtgeo.results.files import DEPTH_UNIT
 
 MILLI = 1000.0
@@ -66,6 +66,5 @@ def _depth(file: Path, size: tuple[int, int], target: Path, name: str) -> str:
             f"`{file}` is {counts.dtype} of shape {counts.shape}; expected depth of {size[0]} x {size[1]} pixels in 16 "
             "bits, as `vggtgeo run --save-depth` writes it"
         )
-    with atomic_path(target / name) as temporary:
-        cv2.imwrite(str(temporary), np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16))
+    write_picture(target / name, np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16))
     return name

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from vggtgeo.datasets.image_defects import declared_size, defect
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import MASK, Scene
 
 
@@ -36,4 +37,5 @@ def copy_pictures(scene: Scene, source: Path, target: Path) -> None:
                 f"`{file}` is no picture of {scene.size[0]} x {scene.size[1]} pixels (found {width} x {height}); run "
                 f"again, with `-o {source}`"
             )
-        (target / "images" / file.name).write_bytes(content)
+        with atomic_open(target / "images" / file.name, "wb") as handle:
+            handle.write(content)

@@ -47,7 +47,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         _flush_to_disk(temporary)
         os.replace(temporary, target)
     except OSError as error:
-        if error.filename is None:  # a full disk names no file
+        if error.filename is None or str(error.filename) == str(temporary):  # a full disk names no file, or that one
             raise type(error)(error.errno, error.strerror or str(error), str(target)) from error
         raise
     finally:

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import tomli_w
 
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import atomic_open, write_text
+from vggtgeo.io.files import write_text
+from vggtgeo.io.pictures import write_picture
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -105,9 +105,7 @@ def write_depth_maps(folder: Path, depth_maps: Iterable[tuple[int, DepthMap | No
         counts = np.where(counts <= MOST_COUNTS, counts, 0).astype(np.uint16)  # farther than 13.1 m: none, not 13.1 m
         confidence = np.rint(255 * depth_map.confidence).astype(np.uint8)
         for name, image in (("depth", counts), ("confidence", confidence)):
-            # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
-            with atomic_open(folder / "depth" / f"{frame:06d}.{name}.png", "wb") as file:
-                file.write(cv2.imencode(".png", image)[1].tobytes())
+            write_picture(folder / "depth" / f"{frame:06d}.{name}.png", image)
     if not written:
         warnings.warn("no keyframe has dense depth: there is none to save", InputWarning, stacklevel=3)
         return

@@ -19,6 +19,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
+from vggtgeo.io.pictures import write_picture
 from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.results.frames_again import read_again
 from vggtgeo.slam.sparse_map.connected import pieces_by_size
@@ -230,8 +231,7 @@ def write_scene(folder: Path, slam: Slam, seen: np.ndarray | None = None, frames
     if frames is not None:
         scene = scene.with_frames(list(_other_frames(folder / "images", slam, scene, frames)))
     if seen is not None:
-        with atomic_open(folder / MASK, "wb") as handle:
-            handle.write(cv2.imencode(".png", np.where(seen, 255, 0).astype(np.uint8))[1].tobytes())
+        write_picture(folder / MASK, np.where(seen, 255, 0).astype(np.uint8))
     tracks = scene.tracks
     with atomic_open(folder / "scene.npz", "wb") as handle:
         np.savez_compressed(
@@ -266,6 +266,4 @@ def _other_frames(folder: Path, slam: Slam, scene: Scene, frames: Frames) -> Ite
 
 def _write_picture(path: Path, image: np.ndarray) -> None:
     bgr = np.ascontiguousarray(image[..., ::-1])
-    # Encoded first: OpenCV's own writing of a file does not tell that a disk is full.
-    with atomic_open(path, "wb") as handle:
-        handle.write(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes())
+    write_picture(path, bgr, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))

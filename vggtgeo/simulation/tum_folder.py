@@ -15,6 +15,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
+from vggtgeo.io.pictures import write_picture
 from vggtgeo.simulation.sequence import SyntheticSequence
 
 _DEPTH_UNITS = 5000.0
@@ -41,9 +42,9 @@ def write_tum_folder(sequence: SyntheticSequence, folder: str | os.PathLike[str]
         write_text(target / f"{part}.txt", f"# {sequence.name} (simulated)\n# timestamp filename\n{lines}")
     for frame in sequence.frames():
         name = _name(frame.timestamp)
-        _write(target / "rgb" / name, np.ascontiguousarray(frame.image[..., ::-1]))
+        write_picture(target / "rgb" / name, np.ascontiguousarray(frame.image[..., ::-1]), _FAST)
         if frame.depth is not None:
-            _write(target / "depth" / name, _depth_code(frame.depth))
+            write_picture(target / "depth" / name, _depth_code(frame.depth), _FAST)
         yield frame
 
 
@@ -62,8 +63,3 @@ def check_new(folder: Path) -> None:
 def _depth_code(depth: np.ndarray) -> np.ndarray:
     code = np.nan_to_num(depth * _DEPTH_UNITS, nan=0.0, posinf=0.0)
     return np.where(code < 65535, np.rint(code), 0).astype(np.uint16)
-
-
-def _write(path: Path, image: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), image, _FAST):
-        raise InputError(f"`{path}` could not be written; check that the disk has space and the folder allows it")
