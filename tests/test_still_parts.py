@@ -255,7 +255,7 @@ def test_a_lens_that_was_found_undistorts_the_mask(monkeypatch: pytest.MonkeyPat
     parts = StillParts(np.tile(np.arange(HEIGHT)[:, None] < 30, (1, WIDTH)))
     settings, given = vg.SlamSettings(), {}
     known = replace(begin(CAMERA, vg.Roles(), settings), lens=lens)
-    described = lambda frames, camera, roles, clock, last: given.update(camera=camera, roles=roles) or iter(())
+    described = lambda frames, camera, roles, clock, waiting: given.update(camera=camera, roles=roles) or iter(())
     monkeypatch.setattr("vggtgeo.slam.run._described", described)
     assert not list(run_frames(iter(()), CAMERA, vg.Roles(still_parts=parts), settings, Clock(), known))
     assert given["camera"] == lens

@@ -74,11 +74,15 @@ def reconstruct(
     """Track and map every frame, adjust the whole map, judge the result.
 
     Ctrl-C (in a notebook: the stop button) ends the run early with the result of the frames so far, whose `summary`
-    says `interrupted`: after the frame at hand, or in place of the last adjustment. A second one ends it at once.
+    says `interrupted`: after the frame at hand, while none comes, or in place of the last adjustment. A second one
+    ends it at once.
 
     Compiled code is kept in the user's cache folder, as by the program: the first call takes half a minute longer than
     those of later processes. A folder that JAX was given (`jax_compilation_cache_dir`) is taken in its place, and with
     JAX's `JAX_ENABLE_COMPILATION_CACHE=0` nothing is kept.
+
+    Of runs in several threads of one process each counts the warnings about the input of all of them, as Python shows
+    warnings for the process: give each a process where that matters.
 
     Args:
         frames: a folder or a video file, a sequence (`vggtgeo.read`, `vggtgeo.simulate`), or any iterable of `Frame`,
@@ -114,7 +118,8 @@ def reconstruct(
     _check_arguments(roles, settings, camera, known_map, callbacks, facts, warned, checkpoints, title, seed)
     settings = settings or SlamSettings()
     with program_settings(), interruption() as stop, collected_warnings() as collected:
-        source = opened(frames, camera, settings)
+        with stop.at_once():  # a camera may give no frame
+            source = opened(frames, camera, settings)
         source.check(start, end, stride)
         perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric, perception.roles.depth)

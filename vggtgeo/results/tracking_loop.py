@@ -61,7 +61,7 @@ class TrackingLoop:
             keeper.close()
 
     def track(self, keeper: Keeper | None) -> Tracked:
-        """Ctrl-C ends it after a whole frame, an input error of the sequence without a result."""
+        """Ctrl-C ends it after a whole frame, or while none comes, an input error of the sequence without a result."""
         known = self.first if self.before is None else self.before.slam
         slam, frame, interrupted = known, None, False
         self.hooks.each("on_begin", self.source.name, self.source.count(*self.selection))
@@ -70,7 +70,10 @@ class TrackingLoop:
             before, rest = self._frames(keeper)
             frames = FramesInHand(rest)
             roles, clock = self.perception.roles, self.hooks.clock
-            for slam in run_frames(frames, self.source.camera, roles, self.settings, clock, known, before):
+            run = run_frames(
+                frames, self.source.camera, roles, self.settings, clock, known, before, waiting=self.stop.at_once
+            )
+            for slam in run:
                 frame = read_only(frames.take(slam.frames[-1]))
                 self.hooks.each("on_frame", slam, frame)
                 if keeper is not None:

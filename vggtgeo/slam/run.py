@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import deque
-from collections.abc import Collection, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from itertools import chain
 from typing import Any
@@ -26,6 +25,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.loops import close_loops
+from vggtgeo.slam.made_ahead import made_ahead
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -40,6 +40,7 @@ from vggtgeo.slam.window.pending_window import settled
 
 AHEAD = 3
 """Frames that are prepared before they are needed."""
+Waiting = Callable[[], AbstractContextManager[Any]]
 
 
 def run(
@@ -112,10 +113,12 @@ def run_frames(
     clock: Clock,
     known: Slam | None = None,
     before: Collection[Frame] = (),
+    waiting: Waiting = nullcontext,
 ) -> Iterator[Slam]:
     """The same over any iterable of frames of one camera, on from a state that is known.
 
     before: the last frames of that state, of which the run that goes on asks whether the next depth image is new.
+    waiting: entered while a frame is waited for.
     """
     slam = begin(camera, roles, settings) if known is None else known
     # Frames of a map whose camera's lens was found are as that lens drew them.
@@ -123,7 +126,8 @@ def run_frames(
     if roles.still_parts is not None:
         roles = replace(roles, still_parts=roles.still_parts.undistorted(seen_by))
     last = slam.frames[-1].timestamp if slam.frames else -math.inf
-    for frame, description in _described(frames, seen_by, roles, clock, last, before):
+    source = with_own_depth(in_order(frames, seen_by, last), before)
+    for frame, description in _described(source, seen_by, roles, clock, waiting):
         slam = step(slam, frame, description, roles, settings, clock)
         yield slam
 
@@ -234,10 +238,10 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _described(
-    frames: Iterable[Frame], camera: Camera, roles: Roles, clock: Clock, last: float, before: Collection[Frame]
+    frames: Iterator[Frame], camera: Camera, roles: Roles, clock: Clock, waiting: Waiting
 ) -> Iterator[tuple[Frame, Description]]:
     """Undistorted frames, prepared in a thread of their own while earlier ones are tracked; where every frame needs its
-    key points, with them. last: time of the frame before the first.
+    key points, with them.
     """
     undistorter, intrinsics = camera.undistorter(), np.array(camera.intrinsics, np.float64)
 
@@ -262,18 +266,7 @@ def _described(
 
     def read_and_prepare() -> tuple[Frame, Description] | None:
         with clock.measure("read (own thread)"):
-            frame = next(source, None)
+            frame = next(frames, None)
         return None if frame is None else prepare(frame)
 
-    source = with_own_depth(in_order(frames, camera, last), before)
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames") as pool:
-        queue: deque[Future[tuple[Frame, Description] | None]] = deque(
-            pool.submit(read_and_prepare) for _ in range(AHEAD)
-        )
-        try:
-            while (ready := queue.popleft().result()) is not None:
-                queue.append(pool.submit(read_and_prepare))
-                yield ready
-        finally:
-            for waiting in queue:
-                waiting.cancel()
+    yield from made_ahead(read_and_prepare, AHEAD, waiting)
