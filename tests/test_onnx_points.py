@@ -296,13 +296,16 @@ def test_another_file_is_another_network(tmp_path: Path, session: Session) -> No
 
 
 def test_a_broken_file_of_the_cache_is_computed_again(tmp_path: Path, session: Session) -> None:
-    # Proves that damage costs a computation, never the run, and that nothing temporary stays. Oracle: cut files.
+    # Proves that damage costs a computation, never the run, and that nothing temporary stays. Oracle: cut files, and
+    # one whose first bit of the flags says that it is encrypted.
     cache = FolderCache(tmp_path / "cache")
     compute, calls = _counted({"a": np.arange(5.0)})
     cache.get((session,), (), (), compute)
     (path,) = (tmp_path / "cache").rglob("*.npz")
     whole = path.read_bytes()
-    for count, content in enumerate((b"", whole[: len(whole) // 2], b"PK" + bytes(30)), start=2):
+    encrypted, flags = bytearray(whole), whole.index(b"PK\x01\x02") + 8
+    encrypted[flags] |= 1
+    for count, content in enumerate((b"", whole[: len(whole) // 2], b"PK" + bytes(30), encrypted), start=2):
         path.write_bytes(content)
         np.testing.assert_array_equal(cache.get((session,), (), (), compute)["a"], np.arange(5.0))
         assert len(calls) == count
