@@ -62,16 +62,21 @@ def folder_of_run(summary: str, unfinished: bool = False) -> Any:
     return make
 
 
-def run_that_counts(poses: int) -> Any:
-    """A run's folder of sixty poses, whose summary counts others."""
+def folder_with_poses(summary: str) -> Any:
+    """A run's folder of sixty poses, with this summary."""
 
     def make(folder: Path) -> Path:
-        counted = json.loads(summary_of("good")) | {"pieces": [{"poses": poses, "keyframes": 60}]}
         for name in ("trajectory.txt", "keyframes.txt"):
             bad.walk(folder / name, 0)
-        return folder_of_run(json.dumps(counted))(folder)  # type: ignore[no-any-return]
+        return folder_of_run(summary)(folder)  # type: ignore[no-any-return]
 
     return make
+
+
+def run_that_counts(poses: int) -> Any:
+    """A run's folder of sixty poses, whose summary counts others."""
+    counted = json.loads(summary_of("good")) | {"pieces": [{"poses": poses, "keyframes": 60}]}
+    return folder_with_poses(json.dumps(counted))
 
 
 def run_with_views(change: Callable[[Path], Any]) -> Any:
@@ -176,6 +181,11 @@ TRAJECTORIES = rows(
         ("times out of order", None, evaluated(backwards, walk())),
         ("each pose twice", None, evaluated(twice, walk())),
         ("commas, a byte order mark and CR LF", None, evaluated(from_a_spreadsheet, walk())),
+        (
+            "a run whose summary is damaged",
+            folder_with_poses("{"),
+            {"argv": lambda made: ["evaluate", made, made / "trajectory.txt"]},
+        ),
     ],
 )
 

@@ -85,12 +85,18 @@ def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
 
 def load_scale(path: Path) -> str | None:
     """What the summary of a run says of its scale, the run's folder or a file of poses in it; None for any other file,
-    whose scale nobody knows.
+    whose scale nobody knows, and with a warning where the summary cannot be used.
     """
-    folder = path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path
+    from vggtgeo.results.summary_file import lack
+
+    file = (path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path) / "summary.json"
+    if not file.is_file():
+        return None
     try:
-        return str(json.loads(whole_text(folder / "summary.json", errors="strict"))["scale"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return str(json.loads(whole_text(file, errors="strict"))["scale"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        text = f"`{file}` cannot be used ({lack(error)}): what it says of scale and verdict is not known"
+        warnings.warn(InputWarning(text), stacklevel=2)
         return None
 
 

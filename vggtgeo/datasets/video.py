@@ -287,6 +287,8 @@ def _is_text(path: Path) -> bool:
 def _capture(path: Path) -> Iterator[Any]:
     if _is_text(path):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(f"`{path}` is empty; copy or record it again")
     try:
         capture = cv2.VideoCapture(_ffmpeg_name(path))
     except cv2.error as error:

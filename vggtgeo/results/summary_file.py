@@ -24,7 +24,20 @@ def read_summary(folder: Path) -> tuple[dict[str, Any], Verdict]:
 
 def unusable(folder: Path, error: Exception) -> InputError:
     """What is said of a summary that lacks something."""
-    return InputError(f"`{folder}` has no usable `summary.json` ({error}); give a folder that `vggtgeo run` wrote")
+    return InputError(
+        f"`{folder}` has no usable `summary.json` ({lack(error)}); give a folder that `vggtgeo run` wrote"
+    )
+
+
+def lack(error: Exception) -> str:
+    """What a summary lacks that reading it raised this of: Python's own words name none of its entries."""
+    if isinstance(error, KeyError):
+        return f"no `{error.args[0]}` in it"
+    if isinstance(error, TypeError | AttributeError):
+        return "an entry of it is of another kind"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return "brackets in brackets without end" if isinstance(error, RecursionError) else str(error)
 
 
 POSES = {"trajectory.txt": "poses", "keyframes.txt": "keyframes"}
