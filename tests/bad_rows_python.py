@@ -21,6 +21,7 @@ import numpy as np
 import tiny_sequences
 from bad_row import Row, nothing
 from bad_rows_solving import SOLVING
+from vggtgeo.models.classical import SiftMatcher
 
 import vggtgeo as vg
 from vggtgeo import evaluation
@@ -43,6 +44,13 @@ EYE = np.eye(4)
 def reconstruct(frames: Any = None, **options: Any) -> Callable[[Path], Any]:
     """`vg.reconstruct` of three images, or of something else."""
     return lambda _: vg.reconstruct(IMAGES if frames is None else frames(), **options)
+
+
+class Forgetful(SiftMatcher):
+    """A matcher that returns nothing."""
+
+    def describe(self, image: np.ndarray) -> Any:
+        """Of any image."""
 
 
 def frame(number: int, **changes: Any) -> vg.Frame:
@@ -294,6 +302,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a setting of 10^400", lambda _: vg.WeightSettings(confidence_gain=10**400)),
     ("a number as matcher", lambda _: vg.Roles(points=5)),
     ("a name as depth", lambda _: vg.Roles(depth="moge2-small")),
+    ("a matcher of one's own that forgets to return", lambda _: next(vg.run(IMAGES, roles=vg.Roles(Forgetful())))),
     ("a result saved to nothing", lambda _: result().save(None)),
     ("a result saved to an empty name", lambda _: result().save("")),
     ("`export` to a list", lambda folder: export(folder, ["ply"])),

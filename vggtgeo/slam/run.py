@@ -28,7 +28,7 @@ from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.made_ahead import made_ahead
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.sparse_map.known_map import entered
 from vggtgeo.slam.state import Slam
@@ -248,6 +248,7 @@ def _described(
     def describe(image: np.ndarray, stage: str) -> Features:
         with clock.measure(stage):
             features = roles.points.describe(image)
+            check_answer("points.describe", features, Features)
             return features if roles.still_parts is None else roles.still_parts.without_points(features)
 
     def prepare(frame: Frame) -> tuple[Frame, Description]:

@@ -123,6 +123,11 @@ class Roles:
         return not isinstance(self.depth, NoDepth)
 
 
+def check_answer(method: str, found: Any, kind: type) -> None:
+    """InputError unless what a method of a role gave, an object of one's own say, is of the kind that it promises."""
+    check_kind(f"{method}(...)", found, kind, f"`{kind.__name__}`, see `vggtgeo.models.roles`")
+
+
 @dataclass(frozen=True)
 class SlamSettings:
     """Numbers of the pipeline by stage; lengths in metres, angles in radians, pixels where named so.

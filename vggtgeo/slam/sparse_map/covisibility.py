@@ -9,7 +9,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
 from vggtgeo.models.roles import LineMatches, PointMatches, RelativeView
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 
@@ -79,6 +79,7 @@ def match_keyframes(
             break
     relative = second.pose @ rigid.invert(first.pose)
     points = roles.points.match(first.features, second.features, None)
+    check_answer("points.match", points, PointMatches)
     points = points.select(_consistent(points, first, relative, intrinsics, settings))
     view = RelativeView(relative, intrinsics, first.line_depths)
     lines = roles.line_matches.match(first.lines, second.lines, view) if settings.line.in_edges else _NO_LINES

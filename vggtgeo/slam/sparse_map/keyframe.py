@@ -10,7 +10,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages, array_of
 from vggtgeo.slam.tracking.description import Description
 
@@ -108,7 +108,9 @@ def make_keyframe(
     with ThreadPoolExecutor(1, thread_name_prefix="describe") as pool:
         described = pool.submit(lambda: description.features)  # beside the rest: it takes as long as all of that
         depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
+        check_answer("depth.estimate", depth, DepthEstimate)
         confidence = roles.confidence.confidence(frame.image)
+        check_answer("confidence.confidence", confidence, np.ndarray)
         lines = find_lines(frame.image, roles, settings) if lines is None else lines
         features = described.result()
     ends = lines.segments.endpoints
@@ -143,6 +145,7 @@ def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineF
     if not settings.line.use_lines:
         return roles.line_matches.describe(image, Segments(np.zeros((0, 2, 2)), np.zeros(0)))
     found = roles.lines.detect(image)
+    check_answer("lines.detect", found, Segments)
     if roles.still_parts is not None:
         found = roles.still_parts.without_segments(found)
     return roles.line_matches.describe(image, found)
