@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from vggtgeo.io import process_settings
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.process_settings import ENABLED, FOLDER, SHORTEST, program_settings
 
 
@@ -81,3 +84,15 @@ def test_matrix_products_take_one_thread(
         with program_settings():
             assert blas_threads() == expected
         assert blas_threads() == {2}
+
+
+def test_a_process_that_was_forked_from_one_that_computed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a run in such a process is an error with what to do, where it waited for ever for threads that a fork
+    # leaves behind. Oracle: a set that holds the number of another process, as a forked one finds it.
+    monkeypatch.setattr(process_settings, "_been_here", {os.getpid() + 1})
+    with pytest.raises(InputError, match=r"was forked from one that has computed.*spawn"), program_settings():
+        pass
+    monkeypatch.setattr(process_settings, "_been_here", set())
+    for _ in range(2):
+        with program_settings():
+            pass
