@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import pytest
 import rerun as rr
 
 import vggtgeo as vg
+from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.viewing.callback import RerunCallback
 
 
@@ -24,3 +26,21 @@ def test_a_run_with_everything_compiled_and_recorded(tmp_path: Path) -> None:
         assert not jax.config.jax_enable_x64
     assert len(result.keyframes) > 2
     assert vg.read(tmp_path / "run").to_dict()["frames"] == len(result.trajectory)
+
+
+def test_what_callers_set_to_find_their_faults_does_not_reach_a_run() -> None:
+    """NaN that means none, compiled programs and mixed types were errors of JAX in a session with its switches for
+    debugging; those are as before afterwards. Oracle: each switch inside and after.
+    """
+
+    @in_double_precision
+    def inside() -> tuple[bool, bool]:
+        mixed = jnp.arange(3) * jnp.full(3, jnp.nan)  # integers and numbers, and no error of either kind
+        return jax.config.jax_disable_jit, bool(jnp.isnan(mixed + jnp.inf).all())
+
+    with jax.debug_nans(True), jax.debug_infs(True), jax.disable_jit(), jax.numpy_dtype_promotion("strict"):
+        assert inside() == (False, True)
+        assert jax.config.jax_debug_nans
+        assert jax.config.jax_debug_infs
+        assert jax.config.jax_disable_jit
+        assert jax.config.jax_numpy_dtype_promotion == "strict"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
@@ -17,11 +18,17 @@ def in_double_precision(function: Callable[_Given, _Result]) -> Callable[_Given,
 
     The prior of the keyframes that have left is a product of many solves, and in single precision its weakest
     directions (scale, drift) are lost in the rounding of its strongest.
+
+    What callers set to find faults of their own is off as well: here NaN means none, compiled programs are called that
+    cannot be run line by line, and types are mixed.
     """
 
     @wraps(function)
     def wrapped(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
-        with jax.enable_x64(True):
+        own = jax.enable_x64(True), jax.numpy_dtype_promotion("standard"), jax.debug_nans(False), jax.debug_infs(False)
+        with ExitStack() as settings:
+            for setting in (*own, jax.disable_jit(False)):
+                settings.enter_context(setting)
             return function(*args, **kwargs)
 
     return wrapped
