@@ -53,6 +53,14 @@ class Forgetful(SiftMatcher):
         """Of any image."""
 
 
+class Half:
+    """A confidence of half the size."""
+
+    def confidence(self, image: np.ndarray) -> np.ndarray:
+        """All the same."""
+        return np.ones((image.shape[0] // 2, image.shape[1] // 2), np.float32)
+
+
 def frame(number: int, **changes: Any) -> vg.Frame:
     """A good frame with other fields."""
     fields = {"timestamp": number / 30, "image": IMAGES[number], "depth": None, "name": f"frame {number}"}
@@ -302,6 +310,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a setting of 10^400", lambda _: vg.WeightSettings(confidence_gain=10**400)),
     ("a number as matcher", lambda _: vg.Roles(points=5)),
     ("a name as depth", lambda _: vg.Roles(depth="moge2-small")),
+    ("a confidence of one's own of another size", lambda _: next(vg.run(IMAGES, roles=vg.Roles(confidence=Half())))),
     ("a matcher of one's own that forgets to return", lambda _: next(vg.run(IMAGES, roles=vg.Roles(Forgetful())))),
     ("a result saved to nothing", lambda _: result().save(None)),
     ("a result saved to an empty name", lambda _: result().save("")),

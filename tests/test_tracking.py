@@ -28,11 +28,12 @@ from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.sparse_map.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking import relocalisation
 from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
 from vggtgeo.slam.tracking.rgbd_view import RgbdView
-from vggtgeo.slam.tracking.track import Expectation, Sight, Track, relocalisation, track
+from vggtgeo.slam.tracking.track import Expectation, Sight, Track, track
 from vggtgeo.slam.window.pending_window import settled
 
 SIZE = (320, 240)

@@ -128,6 +128,12 @@ def check_answer(method: str, found: Any, kind: type) -> None:
     check_kind(f"{method}(...)", found, kind, f"`{kind.__name__}`, see `vggtgeo.models.roles`")
 
 
+def check_size(method: str, found: Any, image: np.ndarray) -> None:
+    """InputError unless what a method of a role gave has a value for each pixel of the image."""
+    if np.shape(found) != image.shape[:2]:
+        raise InputError(f"`{method}(...)` has the shape {np.shape(found)}; expected {image.shape[:2]}, the image's")
+
+
 @dataclass(frozen=True)
 class SlamSettings:
     """Numbers of the pipeline by stage; lengths in metres, angles in radians, pixels where named so.

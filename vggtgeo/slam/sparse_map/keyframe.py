@@ -10,7 +10,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer, check_size
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages, array_of
 from vggtgeo.slam.tracking.description import Description
 
@@ -110,7 +110,8 @@ def make_keyframe(
         depth = roles.depth.estimate(frame.image, frame.depth, tuple(intrinsics))
         check_answer("depth.estimate", depth, DepthEstimate)
         confidence = roles.confidence.confidence(frame.image)
-        check_answer("confidence.confidence", confidence, np.ndarray)
+        for method, found in (("depth.estimate", depth.depth), ("confidence.confidence", confidence)):
+            check_size(method, found, frame.image)
         lines = find_lines(frame.image, roles, settings) if lines is None else lines
         features = described.result()
     ends = lines.segments.endpoints
