@@ -353,6 +353,17 @@ def test_a_still_camera_has_an_ate() -> None:
         assert absolute_error(still, still, kind).statistics.rmse == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("still", ["estimate", "truth"])
+def test_a_scale_that_means_nothing_is_said(still: str) -> None:
+    # Proves that a report warns where one of the two does not move: its scale of 1 is no finding. Oracle: a trajectory
+    # whose poses are all one.
+    moving = _truth()
+    fixed = Trajectory(moving.timestamps, np.repeat(moving.poses[:1], len(moving), axis=0))
+    found = vg.evaluate(fixed, moving) if still == "estimate" else vg.evaluate(moving, fixed)
+    assert found.warnings == (f"all poses of the {still} are at one place: the scale says nothing",)
+    assert not vg.evaluate(moving, moving).warnings
+
+
 def test_rotation_angle_is_accurate_at_both_ends() -> None:
     # Proves the angle from 1e-9 rad to pi - 1e-9. Oracle: scipy's rotation vectors.
     angles = np.array([0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-9])

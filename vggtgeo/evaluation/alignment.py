@@ -63,7 +63,8 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], 
     flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * flip) @ vt
     variance, covariance = float((centred**2).sum() / len(source)), float(d @ flip)
-    scale = covariance / variance if with_scale and variance > 0 and covariance > 0 else 1.0
+    spread = np.ptp(source, axis=0).any() and np.ptp(target, axis=0).any()  # a mean is rounded: `variance` may be 1e-33
+    scale = covariance / variance if with_scale and spread and variance > 0 and covariance > 0 else 1.0
     return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)
 
 

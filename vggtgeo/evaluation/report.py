@@ -27,7 +27,7 @@ class TrajectoryReport:
     """Fields: matched, estimated, true: poses compared, in the estimate, in the truth; coverage: share of the truth's
     duration that the estimate follows, gaps above a second left out; se3 and sim3, unaligned, yaw: ATE after either
     alignment, after none, and after heading and position alone; relative: RPE as estimated; relative_sim3: RPE after
-    the scale of the Sim(3) alignment.
+    the scale of the Sim(3) alignment; still: which of the two, "estimate" or "truth", is at one place all the time.
     """
 
     matched: int
@@ -40,6 +40,7 @@ class TrajectoryReport:
     yaw: AbsoluteError
     relative: RelativeError
     relative_sim3: RelativeError
+    still: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -60,6 +61,8 @@ class TrajectoryReport:
             found.append(
                 f"the scale is {scale:.3g}: the two are not in one unit, and Sim(3) errors say nothing of that"
             )
+        if self.still:
+            found.append(f"all poses of the {' and the '.join(self.still)} are at one place: the scale says nothing")
         if not len(self.relative.translation):
             found.append(f"no two of them are {self.relative.interval} apart: there is no RPE, give a smaller `delta`")
         return tuple(found)
@@ -131,6 +134,7 @@ def evaluate_trajectory(
             "larger `max_dt`, or give longer trajectories"
         )
     sim3 = absolute_error(matched, reference, "sim3")
+    compared = {"estimate": matched, "truth": reference}
     return TrajectoryReport(
         matched=len(matched),
         estimated=len(estimate),
@@ -142,6 +146,7 @@ def evaluate_trajectory(
         yaw=absolute_error(matched, reference, "yaw", vertical),
         relative=relative_error(matched, reference, delta, all_pairs, unit),
         relative_sim3=relative_error(sim3.alignment.trajectory(matched), reference, delta, all_pairs, unit),
+        still=tuple(name for name, path in compared.items() if not np.ptp(path.positions, axis=0).any()),
     )
 
 
