@@ -70,6 +70,15 @@ def test_a_picture_is_written_as_a_whole_or_not_at_all(tmp_path: Path, suffix: s
     assert os.listdir(file.parent) == [file.name]
 
 
+def test_the_home_folder_is_where_the_shell_sees_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that `~` is the home folder for what is written, as for what is read. Oracle: the file.
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    write_text("~/a.txt", "a")
+    assert (tmp_path / "home" / "a.txt").read_text() == "a"
+    assert not Path(tmp_path, "~").exists()
+
+
 def test_the_temporary_file_lies_beside_and_keeps_the_suffix(tmp_path: Path) -> None:
     # Proves what `os.replace` and writers that go by the suffix need. Oracle: the paths themselves.
     with atomic_path(tmp_path / "depth.png") as temporary:

@@ -93,8 +93,6 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
     place = path_of("path", path)
     if kind == "camera" or (kind is None and is_live(os.fspath(path))):
         return LiveCamera.open(os.fspath(path))
-    with suppress(RuntimeError):  # `~name` of a user whom this computer does not know, or no home folder at all
-        place = place.expanduser()
     sequence = _open_place(place, kind)
     if sequence.camera.known:
         check_plausible(f"the camera of `{os.fspath(path)}`", sequence.camera)
@@ -113,8 +111,6 @@ def check_there(path: str | os.PathLike[str]) -> None:
     """InputError where nothing lies that could be opened, or what may not be read: what is asked first, and quickly."""
     place = path_of("path", path)
     if not is_live(os.fspath(path)):
-        with suppress(RuntimeError):
-            place = place.expanduser()
         _check_place(place)
 
 

@@ -22,7 +22,8 @@ def check_kind(name: str, given: Any, kind: Any, expected: str) -> None:
 
 
 def path_of(name: str, given: Any) -> Path:
-    """The path that was given, as a text or an `os.PathLike`; whether anything is there is for the caller to ask.
+    """The path that was given, as a text or an `os.PathLike`, `~` being the home folder, as in a shell: else what is
+    saved there would go into a folder of that name. Whether anything is there is for the caller to ask.
 
     Raises:
         InputError: it is of another kind, bytes among them; or empty, which would mean the working folder; or no file
@@ -36,7 +37,7 @@ def path_of(name: str, given: Any) -> Path:
         raise InputError(f"`{name}` is empty, which would mean the working folder; give a path")
     if "\0" in found:
         raise InputError(f"`{name}` is {given!r:.60}, which has a zero byte in it; give a path")
-    return Path(found)
+    return Path(os.path.expanduser(found))  # of pathlib, it fails for a user that is not known
 
 
 def check_whole(name: str, given: Any, least: int = 0, most: int | None = None) -> None:
