@@ -184,12 +184,19 @@ def as_they_are_in_a_run(_: Path) -> None:
     assert all((frame.image == image).all() for frame, image in zip(frames, IMAGES, strict=True))
 
 
+def fixed(count: int = 5) -> vg.Trajectory:
+    """A camera that stands still."""
+    return vg.Trajectory(range(count), [EYE] * count)
+
+
 CLOUD = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
 TRIANGLE = np.eye(3), np.array([[0, 1, 2]])
 
 CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     *SOLVING,
     ("`plot` of a number", lambda _: vg.plot(5)),
+    ("`plot`: a truth of another time", lambda _: vg.plot(fixed(), vg.Trajectory([100.0], [EYE]))),
+    ("`plot` of a result: a file's name as truth", lambda _: vg.plot(result(), truth="truth.txt")),
     ("`frame_trajectory` of nothing", lambda _: vg.frame_trajectory(None)),
     ("`SurfaceFusion.update` of nothing", lambda _: vg.SurfaceFusion([50.0, 50.0, 32.0, 24.0]).update(None)),
     ("`SurfaceFusion`: three intrinsics", lambda _: vg.SurfaceFusion([50.0, 50.0, 32.0])),
@@ -234,6 +241,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`finish` of nothing", lambda _: vg.finish(None)),
     ("a trajectory whose times are dates", trajectory(np.array(["2024"], "M8[ns]"), [EYE])),
     ("a trajectory of complex numbers", trajectory([0], [EYE * (1 + 1j)])),
+    ("a trajectory of transposed poses", trajectory([0], [(EYE + np.eye(4, k=3)).T])),
     ("a trajectory of nothing", trajectory(None, None)),
     ("`evaluate` of two arrays of poses", lambda _: vg.evaluate(EYE[None], EYE[None])),
     ("a camera of half a pixel", lambda _: vg.Camera((50, 50, 32, 24), 64.5, 48)),
@@ -313,6 +321,10 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a confidence of one's own of another size", lambda _: next(vg.run(IMAGES, roles=vg.Roles(confidence=Half())))),
     ("a matcher of one's own that forgets to return", lambda _: next(vg.run(IMAGES, roles=vg.Roles(Forgetful())))),
     ("a result saved to nothing", lambda _: result().save(None)),
+    ("a result of a trajectory", lambda _: vg.Result.of(fixed())),
+    ("a result saved with depth of no such choice", lambda folder: result().save(folder / "r", depth="evry")),
+    ("a result saved with a folder's name as frames", lambda folder: result().save(folder / "r", frames="clip")),
+    ("a result saved with a setting that is an object", lambda made: result().save(made / "r", settings={"a": object})),
     ("a result saved to an empty name", lambda _: result().save("")),
     ("`export` to a list", lambda folder: export(folder, ["ply"])),
 )

@@ -12,6 +12,7 @@ import numpy as np
 from test_problem_file import SCENE
 
 import vggtgeo as vg
+from vggtgeo.bundle.batches import stack
 
 
 def pack(seen: dict[str, Any] | None = None, **changes: Any) -> Callable[[Path], Any]:
@@ -71,6 +72,27 @@ def with_prior(kind: Any, **data: Any) -> Callable[[Path], Any]:
     return with_pair(lambda p, s: vg.energy(p.with_term(kind(**term)), s))
 
 
+def weighted(call: Callable[[Any, Any], Any], weight: float) -> Callable[[Path], Any]:
+    """A call with a good problem whose matches all have this weight."""
+    return with_pair(lambda p, s: call(p.with_term(p.points.reweighted(np.full(p.points.weight.shape, weight))), s))
+
+
+def drawn(truth: Any = None, *, count: int = 3, batch: bool = False, **options: Any) -> Callable[[Path], Any]:
+    """The picture of covariances of so many keyframes, which are all known exactly, with the state of three."""
+
+    def call(problem: Any, state: Any) -> Any:
+        zeros = lambda *shape: jax.numpy.zeros((count, *shape))
+        known = vg.Covariances(zeros(6, 6), jax.numpy.zeros((4, 4)), zeros(2), zeros(1, 6, 6), jax.numpy.ones(()))
+        return vg.plot(stack([known, known]) if batch else known, state, truth, **options)
+
+    return with_pair(call)
+
+
+def batched(call: Callable[[Any, Any], Any]) -> Callable[[Path], Any]:
+    """A call with two copies of a good problem, and of its state."""
+    return with_pair(lambda p, s: call(*stack([(p, s), (p, s)])))
+
+
 class Points(Fix):
     """A class that is called as the term of matches is."""
 
@@ -78,6 +100,10 @@ class Points(Fix):
 ONE = np.ones(1)
 UPRIGHT, TWICE = (length * np.array([[1.0, 0.0, 0.0, 0.0]]) for length in (1, 2))
 ROOT, ROOT_OF_POSE = np.eye(3)[None], np.eye(6)[None]
+
+ONLY_FIRST = lambda leaf: leaf[:1]
+WINDOW = (SCENE.observations, SCENE.start_poses, SCENE.start_intrinsics, SCENE.inverse_depth)
+SHORT = (WINDOW[0], WINDOW[1][:1], *WINDOW[2:])
 
 SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`pack`: poses of complex numbers", pack(poses=SCENE.start_poses.astype(complex))),
@@ -120,12 +146,29 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
         "`marginalise`: a keyframe that is not there",
         with_pair(lambda p, s: vg.marginalise(p, s, 3)),
     ),
+    ("`covariances` of no keyframe", with_pair(lambda p, s: vg.covariances(p, s, keyframes=np.zeros(0, int)))),
+    ("`covariances`: a solver's name", with_pair(lambda p, s: vg.covariances(p, s, reduced_solver="dense"))),
+    ("`covariances` under weights below zero", weighted(vg.covariances, -1.0)),
+    ("`observability` under weights that are NaN", weighted(vg.observability, np.nan)),
+    ("`marginalise` under weights that are NaN", weighted(lambda p, s: vg.marginalise(p, s, 0), np.nan)),
+    ("`marginalise` where a solve failed", with_pair(lambda p, s: vg.marginalise(p, not_finite(s), 0))),
+    ("`plot`: covariances of other keyframes than the state's", drawn(count=2)),
+    ("`plot`: one true centre for three keyframes", drawn(np.zeros((1, 3)))),
+    ("`plot`: ellipses of no size", drawn(sigmas=0)),
+    ("`plot` of a batch", drawn(batch=True)),
     ("`marginalise` of two keyframes", with_pair(lambda p, s: vg.marginalise(p, s, [0, 1]))),
     ("`reweighted` by weights of another shape", with_pair(lambda p, s: p.points.reweighted(np.ones(3)))),
     ("`reweighted` by a text", with_pair(lambda p, s: p.points.reweighted("all"))),
     ("`gather` of one value a keyframe", lambda _: SCENE.pack()[2].gather(np.ones(3))),
     ("`reorder`: a keyframe twice", lambda _: vg.reorder(vg.no_prior(3), [0, 0, 1])),
     ("`solve_batch` of one window", with_pair(vg.solve_batch)),
+    ("`solve_batch`: two problems and one state", batched(lambda p, s: vg.solve_batch(p, jax.tree.map(ONLY_FIRST, s)))),
+    ("`solve_batch`: no window at once", batched(lambda p, s: vg.solve_batch(p, s, at_once=0))),
+    ("`solve_batch`: a device's name", batched(lambda p, s: vg.solve_batch(p, s, devices="cpu"))),
+    (
+        "`pack_batch`: fewer poses than keyframes",
+        lambda _: vg.pack_batch([WINDOW, SHORT]),
+    ),
     ("`load_problem` of an empty name", lambda _: vg.load_problem("")),
     ("`load_problem` of whole numbers", lambda _: vg.load_problem("no.npz", dtype="int32")),
     ("`save_problem` to a number", lambda _: vg.save_problem(1, *SCENE.pack())),

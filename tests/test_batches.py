@@ -12,10 +12,11 @@ import pytest
 from scenes import Scene, make_scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
+from vggtgeo.bundle.analysis.covariances import Covariances
 from vggtgeo.bundle.batches import Window, pack_batch, solve_batch
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.solution import solution_like, solve
 from vggtgeo.io.errors import InputError
 
 SOLVER = SchurLevenbergMarquardt(max_iterations=40, rtol=1e-12)
@@ -53,6 +54,17 @@ def test_a_ragged_batch_gives_what_each_window_gives(at_once: int) -> None:
 @eqx.filter_jit
 def solve_alone(problem: Problem, state: State):
     return solve(problem, state, solver=SOLVER)
+
+
+def test_a_batch_can_be_printed() -> None:
+    # Proves that results of a batch are readable where there is no one number to show. Oracle: the shapes in the text.
+    one = solution_like(*SCENES[1].pack()[:2], SOLVER)
+    solutions = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one)
+    assert "energy=f64[2]" in str(solutions)
+    assert repr(solutions) == str(solutions)
+    zeros = lambda *shape: jnp.zeros(shape)
+    known = Covariances(zeros(4, 6, 6), zeros(4, 4), zeros(4, 9), zeros(4, 3, 6, 6), zeros())
+    assert "poses=f64[2,4,6,6]" in str(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), known))
 
 
 @pytest.mark.long

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -12,13 +13,14 @@ import optimistix as optx
 from jax.sharding import PartitionSpec
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
-from vggtgeo.bundle.packing import pack
+from vggtgeo.bundle.packing import as_arrays, pack
+from vggtgeo.bundle.packing_checks import as_poses, check_observations
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex
 from vggtgeo.bundle.pair_checks import check_kinds
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind
+from vggtgeo.io.given import check_kind, check_whole
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 Window = (
@@ -61,10 +63,8 @@ def pack_batch(
         size = PaddedSize.largest(sizes)
     packed = []
     for number, (window, own) in enumerate(zip(windows, given, strict=True)):
-        try:
+        with _named(number):
             packed.append(pack(*window[:4], size=size, terms=own, **options))
-        except InputError as error:
-            raise InputError(f"`windows[{number}]`: {error}") from error
     problems, states, indices = zip(*packed, strict=True)
     return stack(problems), stack(states), list(indices)
 
@@ -77,6 +77,17 @@ def _check_windows(windows: Sequence[Any]) -> None:
                 "intrinsics, inverse_depth), and its terms where it has some"
             )
         check_kind(f"windows[{number}][0]", window[0], Observations, "`vggtgeo.Observations`")
+        with _named(number):
+            check_observations(as_arrays(window[0]), as_poses(window[1]))
+
+
+@contextmanager
+def _named(number: int) -> Iterator[None]:
+    """Errors name the window."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"`windows[{number}]`: {error}") from error
 
 
 def _same_terms(windows: Sequence[Sequence[GivenTerm]]) -> list[list[GivenTerm]]:
@@ -122,7 +133,7 @@ def solve_batch(
             the placement to JAX. A process sees its CPU cores as devices when `jax_num_cpu_devices` says so.
 
     Raises:
-        InputError: the batch cannot be shared out equally.
+        InputError: `problems` and `initials` are not of one number of windows, or cannot be shared out equally.
 
     Example:
         >>> twice = jax.tree.map(lambda leaf: jax.numpy.stack([leaf, leaf]), (problem, initial))
@@ -137,6 +148,17 @@ def solve_batch(
             "`initials` has no axis of windows; give what `vggtgeo.pack_batch` makes, or use `vggtgeo.solve`"
         )
     count = len(initials.intrinsics)
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((problems, initials))}
+    if lengths != {(count,)}:
+        found = ", ".join(str(length[0]) if length else "none" for length in sorted(lengths))
+        raise InputError(
+            f"the arrays of `problems` and `initials` have different numbers of windows ({found}); give both as "
+            "`vggtgeo.pack_batch` makes them"
+        )
+    if at_once is not None:
+        check_whole("at_once", at_once, 1)
+    if devices is not None and not (devices and all(isinstance(device, jax.Device) for device in devices)):
+        raise InputError(f"`devices` is {devices!r:.60}; expected a list of devices, such as `jax.devices()`, or None")
     if devices is not None and count % len(devices):
         raise InputError(
             f"`problems` holds {count} windows, `devices` {len(devices)} devices: pad the batch to a multiple, with "

@@ -22,7 +22,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.pair_checks import check_pair
+from vggtgeo.bundle.observed import check_weights
+from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
@@ -76,6 +77,8 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> Marg
 
     """
     check_pair(problem, state)
+    check_finite(state)
+    check_weights(problem)
     if not isinstance(leaving, jax.core.Tracer):
         given = np.asarray(leaving)
         check_whole("leaving", given.item() if given.size == 1 else leaving, 0, problem.num_keyframes - 1)

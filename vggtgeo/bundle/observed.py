@@ -12,7 +12,6 @@ from scipy.sparse.csgraph import connected_components
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm
-from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.io.errors import InputError, InputWarning
 
 
@@ -25,12 +24,11 @@ def check_observed(problem: Problem) -> None:
             finite, which would count as an observation that is not there.
 
     """
+    check_weights(problem)
     about = [term for term in problem.terms if not isinstance(term, CameraTerm)]
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(about)):
         return
     with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
-        for term in about:
-            _check_weights(term)
         for term in about:
             if np.any(np.asarray(term.present())) and not (isinstance(term, DenseTerm) and not int(term.rows())):
                 return
@@ -40,12 +38,22 @@ def check_observed(problem: Problem) -> None:
     )
 
 
-def _check_weights(term: AbstractTerm) -> None:
-    weight = np.asarray(getattr(term, "weight", 0.0))
+def check_weights(problem: Problem) -> None:
+    """InputError for a weight that is negative or not finite, where it has a value: under one, a linearisation leaves
+    zeros or worse, which look like results.
+    """
+    with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
+        for term in problem.terms:
+            weight = getattr(term, "weight", 0.0)
+            if not isinstance(weight, jax.core.Tracer):
+                _check_weights(term.name, np.asarray(weight))
+
+
+def _check_weights(name: str, weight: np.ndarray) -> None:
     wrong = weight[~(np.isfinite(weight) & (weight >= 0))]
     if wrong.size:
         raise InputError(
-            f"`{term.name}.weight` has {wrong.size} values of {weight.size} that are negative or not finite (the "
+            f"`{name}.weight` has {wrong.size} values of {weight.size} that are negative or not finite (the "
             f"first: {wrong.flat[0]:g}); give 0 to an observation that is to count for nothing"
         )
 

@@ -107,7 +107,7 @@ def pack(
     dtype = jnp.result_type(float) if dtype is None else dtype
     check_dtype(dtype)
     check_kind("observations", observations, Observations, "`vggtgeo.Observations`")
-    observations, poses = _as_arrays(observations), as_poses(poses)
+    observations, poses = as_arrays(observations), as_poses(poses)
     intrinsics, inverse_depth = real_numbers("intrinsics", intrinsics), real_numbers("inverse_depth", inverse_depth)
     mean = intrinsics if intrinsics_mean is None else real_numbers("intrinsics_mean", intrinsics_mean)
     camera_of = None if camera_of is None else real_numbers("camera_of", camera_of)
@@ -150,7 +150,7 @@ def _of_type(problem: Problem, dtype: DTypeLike) -> Problem:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, problem)
 
 
-def _as_arrays(observations: Observations) -> Observations:
+def as_arrays(observations: Observations) -> Observations:
     """The same observations, lists turned into arrays."""
     names = [field.name for field in fields(observations) if field.name != "alpha"]
     given = {name: getattr(observations, name) for name in names}

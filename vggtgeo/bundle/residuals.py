@@ -51,7 +51,7 @@ class ResidualSizes(Readable):
         sizes = {name: float(value) for name, value in self.rms.items()}
         return {**sizes, **{f"{name}_count": int(value) for name, value in self.count.items()}}
 
-    def __str__(self) -> str:
+    def _line(self) -> str:
         parts = [
             f"{name} {float(self.rms[name]):.2f} {unit} ({int(self.count[name])})".replace("  ", " ")
             for name, unit in self.units

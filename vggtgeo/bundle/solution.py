@@ -75,7 +75,7 @@ class Solution(Readable):
             "at_bound": int(self.at_bound),
         }
 
-    def __str__(self) -> str:
+    def _line(self) -> str:
         before, after = float(self.history[0]), float(self.energy)
         return f"{self.result}: energy {before:.6g} -> {after:.6g} in {int(self.iterations)} iterations"
 

@@ -5,19 +5,21 @@ from __future__ import annotations
 from functools import singledispatch
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from vggtgeo.bundle.analysis.covariances import Covariances
 from vggtgeo.bundle.analysis.observability_report import Observability
+from vggtgeo.bundle.pair_checks import check_finite
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.solution import Solution
-from vggtgeo.evaluation import TrajectoryReport
+from vggtgeo.evaluation import TrajectoryReport, associate
 from vggtgeo.figures.plots import NotebookFigure, energy_figure, errors_figure, trajectory_figure
 from vggtgeo.figures.uncertainty import covariance_figure, observability_figure
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind
+from vggtgeo.io.given import check_kind, check_positive, real_array
 
 
 @singledispatch
@@ -51,10 +53,23 @@ def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
     raise InputError(f"`plot` has no picture of a `{type(value).__name__}`; it draws {', '.join(known)}")
 
 
+def check_single(values: Any, axes: int) -> None:
+    """InputError for a batch, which has no one picture."""
+    if jnp.ndim(values) != axes:
+        raise InputError("`value` is a batch; give one of it: `jax.tree.map(lambda leaf: leaf[0], value)` is the first")
+
+
 @plot.register(Trajectory)
 def _trajectory(value: Trajectory, truth: Trajectory | None = None, *, with_scale: bool = False) -> NotebookFigure:
-    check_kind("truth", truth, Trajectory | None, "a `vggtgeo.Trajectory`")
+    check_truth(value, truth)
     return trajectory_figure(value, truth, with_scale=with_scale)
+
+
+def check_truth(value: Trajectory, truth: Trajectory | None) -> None:
+    """InputError unless it is a trajectory of the same times: another one could not be drawn beside `value`."""
+    if truth is not None:
+        check_kind("truth", truth, Trajectory, "a `vggtgeo.Trajectory`")
+        associate(value, truth)
 
 
 @plot.register(TrajectoryReport)
@@ -65,6 +80,7 @@ def _errors(value: TrajectoryReport) -> NotebookFigure:
 @plot.register(Solution)
 def _energy(value: Solution) -> NotebookFigure:
     history = np.asarray(value.history)
+    check_single(history, 1)
     return energy_figure(history[np.isfinite(history)], value.result)
 
 
@@ -72,6 +88,19 @@ def _energy(value: Solution) -> NotebookFigure:
 def _covariances(
     value: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, *, sigmas: float | None = None
 ) -> NotebookFigure:
+    check_single(value.poses, 3)
+    check_kind("state", state, State, "a `State`, such as `solution.state`")
+    keyframes = len(value.poses)
+    if jnp.shape(state.poses.wxyz_xyz) != (keyframes, 7):
+        raise InputError(
+            f"`state` has poses of the shape {jnp.shape(state.poses.wxyz_xyz)}, the covariances {keyframes} keyframes; "
+            "give the state that they are of, and covariances of all its keyframes"
+        )
+    check_finite(state)
+    if truth is not None:
+        real_array("truth", truth, (keyframes, 3))
+    if sigmas is not None:
+        check_positive("sigmas", sigmas, "standard deviations")
     return covariance_figure(value, state, truth, sigmas)
 
 

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import abc
+
 import equinox as eqx
 
 
 class Readable(eqx.Module):
-    """A pytree whose `repr` is its `str`; inside `jit`, or for a batch, that of its leaves."""
+    """A pytree that reads as one line; inside `jit`, or for a batch, as its leaves."""
 
-    def __repr__(self) -> str:
+    @abc.abstractmethod
+    def _line(self) -> str:
+        """One result in a line; any error of a shape or a type where there is none, or there are many."""
+
+    def __str__(self) -> str:
         try:
-            return str(self)
-        except TypeError:  # traced values and batches have no number to show
+            return self._line()
+        except (TypeError, ValueError, IndexError):  # traced values and batches have no number to show
             return eqx.Module.__repr__(self)
+
+    __repr__ = __str__

@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from vggtgeo.datasets.frame import Sequence
-from vggtgeo.figures.plot import plot
+from vggtgeo.figures.plot import check_truth, plot
 from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
 from vggtgeo.figures.result_figure import result_figure
 from vggtgeo.geometry.mesh import Mesh
@@ -22,7 +22,7 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
-from vggtgeo.io.given import path_of
+from vggtgeo.io.given import check_kind, check_plain, path_of
 from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
 from vggtgeo.results.every_depth import every_depth
@@ -135,6 +135,7 @@ class Result:
         evidence: what an `EvidenceRecorder` noted of all frames; without it the verdict rests on the run's own record.
         truth: camera -> world, where it is known. dense: whose depth the map is made of, as of `vggtgeo.reconstruct`.
         """
+        check_kind("slam", slam, Slam, "a state that `vggtgeo.run` gave")
         slam = settled(slam)
         verdict, built = judge(slam, evidence), dense_map(slam, dense)
         count = len(built.cloud)
@@ -202,10 +203,15 @@ class Result:
             What `summary.json` holds: the summary, and of a run how long it took with all its files.
 
         Raises:
-            InputError: `frames` are of another size than those of the run, `depth` is asked of a result that was read
-                from a folder, or the folder cannot be written, is in use by a run, or holds a sequence of images.
+            InputError: `frames` are of another size than those of the run, `depth` is none of these or is asked of a
+                result that was read from a folder, `settings` are no plain values, or the folder cannot be written, is
+                in use by a run, or holds a sequence of images.
 
         """
+        if not (depth == "every" or isinstance(depth, bool | np.bool_)):
+            raise InputError(f"`depth` is {depth!r:.60}; expected True, False or 'every'")
+        check_kind("frames", frames, Sequence | None, "what the run read, such as `vggtgeo.open_sequence` gives")
+        check_plain("settings", settings or {})
         with taken_beside(path_of("folder", folder)) as place:
             return self.save_into(place, depth=depth, frames=frames, settings=settings)
 
@@ -318,4 +324,5 @@ class Result:
 
 @plot.register(Result)
 def _plot(value: Result, truth: Trajectory | None = None) -> NotebookFigure:
+    check_truth(value.trajectory, truth)
     return result_figure(value.trajectory, value.keyframes, value.cloud, value.metric, truth)

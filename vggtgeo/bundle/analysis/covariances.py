@@ -21,13 +21,14 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.bundle.analysis.redundancy import changing
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared, prepared_energy
+from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import real_numbers
+from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import covariance
@@ -95,7 +96,7 @@ class Covariances(Readable):
             "variance_factor": float(self.variance_factor),
         }
 
-    def __str__(self) -> str:
+    def _line(self) -> str:
         blocks = np.asarray(self.poses, np.float64)[:, :3, :3]
         known = np.isfinite(blocks).all((1, 2))
         worst = 1e3 * float(np.sqrt(np.linalg.eigvalsh(blocks[known]).max(initial=0.0)))
@@ -140,6 +141,9 @@ def covariances(
     """
     check_pair(problem, state)
     check_finite(state)
+    check_weights(problem)
+    expected = "what `vggtgeo.choose_reduced_solver` gives"
+    check_kind("reduced_solver", reduced_solver, AbstractReducedSolver | None, expected)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
     asked = jnp.arange(problem.num_keyframes) if keyframes is None else _numbers_of(keyframes, problem.num_keyframes)
     _check_size(solver, problem.num_keyframes, len(asked))
@@ -151,9 +155,10 @@ def _numbers_of(keyframes: Any, count: int) -> Int[Array, " h"]:
     if isinstance(keyframes, jax.core.Tracer):
         return keyframes
     found = real_numbers("keyframes", keyframes)
-    if found.ndim != 1 or found.dtype.kind not in "iu" or not ((found >= 0) & (found < count)).all():
+    if found.ndim != 1 or not len(found) or found.dtype.kind not in "iu" or not ((found >= 0) & (found < count)).all():
         raise InputError(
-            f"`keyframes` is {found.tolist()!r:.60}; expected a list of whole numbers from 0 to {count - 1}"
+            f"`keyframes` is {found.tolist()!r:.60}; expected a list of at least one whole number, "
+            f"from 0 to {count - 1}"
         )
     return jnp.asarray(found)
 

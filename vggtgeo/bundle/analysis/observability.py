@@ -36,6 +36,7 @@ from vggtgeo.bundle.analysis.observability_report import Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
+from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
@@ -75,6 +76,7 @@ def observability(problem: Problem, state: State) -> Observability:
     """
     check_pair(problem, state)
     check_finite(state)
+    check_weights(problem)
     if problem.num_keyframes <= DENSE_KEYFRAMES:
         return _observability_jit(problem, state)
     _check_large(problem, state)
