@@ -96,7 +96,9 @@ def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None
         None: "in the unit of GT, which its file does not say",
     }
     for scale, words in said.items():
-        (tmp_path / "run" / "summary.json").write_text(json.dumps({} if scale is None else {"scale": scale}))
+        (tmp_path / "run" / "summary.json").unlink(missing_ok=True)
+        if scale is not None:
+            (tmp_path / "run" / "summary.json").write_text(json.dumps({"scale": scale}))
         found = CliRunner().invoke(app, [str(estimate), str(of_run)])
         assert found.exit_code == 0, found.output
         assert (" cm" in found.output) == (words is None), f"{scale}: {found.output}"
