@@ -36,7 +36,8 @@ def _cut(file: Path, share: float) -> None:
         (lambda path: path.mkdir(), "is empty"),
         (lambda path: tiny.images(path, ()), "holds `calibration.txt`; expected a 7-Scenes folder"),
         (lambda path: path.write_text("hello"), "is a text file"),
-        (lambda path: path.write_bytes(b""), "cannot be opened as a video"),
+        (lambda path: path.write_bytes(b""), "is empty"),
+        (lambda path: path.write_bytes(bytes(99)), "cannot be opened as a video"),
     ],
 )
 def test_what_is_no_sequence_is_an_error(tmp_path: Path, make: Callable[[Path], object], message: str) -> None:

@@ -31,7 +31,7 @@ def test_ctrl_c_before_the_first_frame_is_no_fault_of_the_input(
     oracle: the code, and a file that was there.
     """
 
-    def interrupted(*_: object) -> Iterator[object]:
+    def interrupted(*_: object, **__: object) -> Iterator[object]:
         raise KeyboardInterrupt
         yield
 
