@@ -233,6 +233,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("an image of 3.6 billion pixels", reconstruct(lambda: [np.broadcast_to(np.uint8(3), (60000, 60000, 3))])),
     ("checkpoints every `often`", lambda _: vg.Checkpoints("night.npz", every="often")),
     ("`evaluate`: `delta` that is a text", evaluated(delta="a")),
+    ("`evaluate`: a word for `all_pairs`", evaluated(all_pairs="no")),
     ("`evaluate`: a letter for `vertical`", evaluated(vertical="z")),
     ("a camera resized to nothing", lambda _: vg.Camera((50, 50, 32, 24), 64, 48).resized(0, 0)),
     ("a seed that is none", reconstruct(seed=None)),

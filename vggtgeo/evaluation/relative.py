@@ -16,7 +16,7 @@ from vggtgeo.evaluation.association import check_trajectories
 from vggtgeo.evaluation.statistics import ErrorStatistics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real, real_array
+from vggtgeo.io.given import check_kind, check_real, real_array
 
 Unit = Literal["poses", "seconds", "metres"]
 UNITS: tuple[Unit, ...] = get_args(Unit)
@@ -76,6 +76,7 @@ def relative_error(
         raise InputError(
             f"`estimate` has {len(estimate)} poses, `truth` {len(truth)}; match them first with `associate`"
         )
+    check_kind("all_pairs", all_pairs, bool | np.bool_, "True or False")
     first, second = pairs(truth, delta, all_pairs, unit)
     estimated = _motion(estimate.poses[first], estimate.poses[second])
     true = _motion(truth.poses[first], truth.poses[second])
