@@ -9,8 +9,8 @@ followed corners is smooth (by at most 8 % of the width, 3.4 degrees and 5 %; de
 picture over depth that is not (without depth it is a video of the mirrored room); a focus that breathes (2 and 5 % of
 the focal length); writing all over it that shines through; fifteen frames of a title before it; a beginning that comes
 out of the dark; sides filled with an enlarged, blurred copy; a second picture in its corner; a screen that was filmed
-(moire, bands of light); a recorder that hangs for twelve frames and repeats its picture (depth goes on). ATE after
-SE(3) with depth, after Sim(3) without.
+(moire, bands of light); a recorder that hangs for twelve frames and repeats its picture (depth goes on);
+a camera that stands still for as long. ATE after SE(3) with depth, after Sim(3) without.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from degraded_clips import judged, print_table
 
 from vggtgeo.datasets.views import SequenceView
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation.degradations import Degradation, Recording, as_it_is, with_depths, with_images
 
 COLUMNS = ("cm", "tracked", "verdict", "reasons")
@@ -71,6 +72,20 @@ def hangs(recording: Recording, rng: np.random.Generator) -> Recording:
     last = len(recording.frames) // 2
     held = recording.frames[last - HANGS].image
     return with_images(recording, lambda image, row: held if last - HANGS < row <= last else image)
+
+
+def stands(recording: Recording, rng: np.random.Generator) -> Recording:
+    """The camera stands still for so long: the same frame again and again, its depth and the truth, too."""
+    del rng
+    middle = len(recording.frames) // 2
+    rows = [row if row <= middle - HANGS else max(middle - HANGS, row - HANGS) for row in range(len(recording.frames))]
+    frames = [
+        replace(recording.frames[row], index=frame.index, timestamp=frame.timestamp, name=frame.name)
+        for row, frame in zip(rows, recording.frames, strict=True)
+    ]
+    times, truth = np.array([frame.timestamp for frame in frames]), recording.truth
+    nearest = np.abs(truth.timestamps - times[rows, None]).argmin(1)
+    return replace(recording, frames=frames, truth=Trajectory(times, truth.poses[nearest]))
 
 
 HANGS = 12
@@ -211,7 +226,7 @@ CHANGES: dict[str, Degradation] = {
     "breathes by 5 %": breathing(0.05),
     **{
         change.__name__.replace("_", " "): change
-        for change in (watermark, title, out_of_the_dark, blurred_sides, second_picture, filmed_screen, hangs)
+        for change in (watermark, title, out_of_the_dark, blurred_sides, second_picture, filmed_screen, hangs, stands)
     },
 }
 

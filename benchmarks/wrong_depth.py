@@ -7,24 +7,31 @@ The first 40 frames of each clip with the faults that programs and people make: 
 ray in place of depth, the inverse, files paired by names sorted as text, a lower rate, a filter over time, each image
 scaled to one range, answers of a network (another scale in each image, smooth errors), other resolutions and ranges,
 a wall in place of the scene, an offset, a power. ATE after SE(3) and Sim(3), cm; the share of matches that agree with
-the poses, in the median pair of keyframes 1, 2, 3 and 5 apart. Oracle: what was done. No image tells of a factor on all
-depth.
+the poses, in the median pair of keyframes 1, 2, 3 and 5 apart; by how much of the way from depth to distance the
+depth is longer than the motion's (`share_of_distance` in `vggtgeo/slam/trust/depth_agreement.py`). Oracle: what was
+done. No image tells of a factor on all depth.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 
 import cv2
 import numpy as np
 from degraded_clips import judged, print_table
 
+import vggtgeo as vg
 from vggtgeo.datasets import Frame
 from vggtgeo.datasets.views import SequenceView
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation.degradations import Degradation, Recording, as_it_is, with_depths
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.contradicted import median_shares
+from vggtgeo.slam.trust.depth_agreement import depth_ratios, share_of_distance
+from vggtgeo.slam.trust.estimate import Estimate
 
-COLUMNS = ("SE(3) cm", "Sim(3) cm", "agreeing matches", "verdict", "reasons")
+COLUMNS = ("SE(3) cm", "Sim(3) cm", "agreeing matches", "distance", "verdict", "reasons")
 
 
 def of_depth(change: Callable[[np.ndarray], np.ndarray]) -> Degradation:
@@ -115,6 +122,17 @@ CHANGES: dict[str, Degradation] = {
 }
 
 
+def distance(sequence: SequenceView, slam: Slam) -> str:
+    """The share of distance in the depth, and its standard deviation; nothing where too few corners have parallax."""
+    recorder = vg.EvidenceRecorder(sequence.camera)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        for frame in sequence.frames():
+            recorder.add(frame)
+    ratios = depth_ratios(Estimate.of(slam), recorder.frames)
+    return "{:.2f} +- {:.2f}".format(*share_of_distance(ratios)) if ratios.enough else ""
+
+
 def cells(sequence: SequenceView) -> Iterator[str]:
     """What came of it."""
     result, metric = judged(sequence)
@@ -122,7 +140,7 @@ def cells(sequence: SequenceView) -> Iterator[str]:
     free = truth["ate_sim3_m"]["rmse"] if truth else float("nan")
     assert result.record is not None
     shares = median_shares(result.record.slam.keyframes, result.record.slam.intrinsics)
-    yield from (f"{100 * metric:.1f}", f"{100 * free:.1f}", shares)
+    yield from (f"{100 * metric:.1f}", f"{100 * free:.1f}", shares, distance(sequence, result.record.slam))
     yield from (result.verdict.level, "; ".join(result.verdict.reasons))
 
 

@@ -72,8 +72,8 @@ def run_jobs(
                 if not all(future.done() and not future.exception() for future in futures):
                     stop.set()
             errors = [error for future in futures if (error := future.exception()) is not None]
-            for error in sorted(errors, key=lambda error: isinstance(error, KeyboardInterrupt)):
-                raise error  # the first of all: those that were stopped for it tell of no more
+            if errors:  # those that were stopped for another one tell of no more
+                raise min(errors, key=lambda error: isinstance(error, KeyboardInterrupt))
 
 
 def run_one(

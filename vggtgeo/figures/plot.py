@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import singledispatch
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -55,7 +54,7 @@ def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
 
 def check_single(values: Any, axes: int) -> None:
     """InputError for a batch, which has no one picture."""
-    if jnp.ndim(values) != axes:
+    if np.ndim(values) != axes:
         raise InputError("`value` is a batch; give one of it: `jax.tree.map(lambda leaf: leaf[0], value)` is the first")
 
 
@@ -91,9 +90,9 @@ def _covariances(
     check_single(value.poses, 3)
     check_kind("state", state, State, "a `State`, such as `solution.state`")
     keyframes = len(value.poses)
-    if jnp.shape(state.poses.wxyz_xyz) != (keyframes, 7):
+    if np.shape(state.poses.wxyz_xyz) != (keyframes, 7):
         raise InputError(
-            f"`state` has poses of the shape {jnp.shape(state.poses.wxyz_xyz)}, the covariances {keyframes} keyframes; "
+            f"`state` has poses of the shape {np.shape(state.poses.wxyz_xyz)}, the covariances {keyframes} keyframes; "
             "give the state that they are of, and covariances of all its keyframes"
         )
     check_finite(state)

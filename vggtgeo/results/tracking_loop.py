@@ -106,7 +106,8 @@ class TrackingLoop:
         frames = iter(self.source.frames.frames(tracked[0], end, stride))
         before = []
         for frame in frames:
-            before += [frame] if frame.index in tracked else []
+            if frame.index in tracked:
+                before.append(frame)
             if frame.index >= tracked[-1]:
                 break
         check_same_frame(keeper.asked, before[-1] if before else None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
@@ -25,10 +24,13 @@ def in_double_precision(function: Callable[_Given, _Result]) -> Callable[_Given,
 
     @wraps(function)
     def wrapped(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
-        own = jax.enable_x64(True), jax.numpy_dtype_promotion("standard"), jax.debug_nans(False), jax.debug_infs(False)
-        with ExitStack() as settings:
-            for setting in (*own, jax.disable_jit(False)):
-                settings.enter_context(setting)
+        with (
+            jax.enable_x64(True),
+            jax.numpy_dtype_promotion("standard"),
+            jax.debug_nans(False),
+            jax.debug_infs(False),
+            jax.disable_jit(False),
+        ):
             return function(*args, **kwargs)
 
     return wrapped

@@ -58,9 +58,9 @@ MOST_SPREAD = 0.10
 """Largest spread of the medians of single frames."""
 DISTANCE, DISTANCE_SIGMAS = 0.5, 3.0
 """Of `x` over the logarithm of a corner's distance from the camera's centre over its depth along the axis: 0 for depth,
-1 for distances; what is nearer to 1, and not by chance. Five pieces of 40 to 120 frames of three clips have -0.29
-(redkitchen, whose lens bends) to 0.06, and 0.66 to 0.97 with distances in place of depth, 2.5 cm and a tenth of the
-scale off; each known to 0.08 to 0.14."""
+1 for distances; what is nearer to 1, and not by chance. Six pieces of 40 to 120 frames of three clips have -0.30
+(redkitchen, whose lens bends) to 0.08, and 0.64 or more with distances in place of depth, which cost 2.5 cm and a tenth
+of the scale; each known to 0.07 to 0.15. Two of them: `benchmarks/wrong_depth.py --changes base "along the ray"`."""
 ROBUST, ITERATIONS, SMALLEST = 1.5, 20, 1e-12
 """Standard deviations: Huber's width over corners."""
 
