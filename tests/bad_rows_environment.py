@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from bad_row import nothing, rows
@@ -31,9 +34,32 @@ def limited(gigabytes: float) -> None:
         check_address_space("run")
 
 
+def listed(**variables: str) -> dict[str, Any]:
+    """A command in a process of its own, without a terminal, that says the same words with these variables."""
+
+    def call(_: Path) -> None:
+        def words(**more: str) -> list[str]:
+            command = [sys.executable, "-c", "from vggtgeo.cli import main; main()", "models", "list"]
+            done = subprocess.run(command, env={**os.environ, **more}, capture_output=True, check=True)
+            return done.stdout.decode(errors="replace").split()
+
+        plain, said = words(), words(**variables)
+        assert len(said) > 50
+        assert [word for word in said if word.isascii()] == [word for word in plain if word.isascii()]
+
+    return {"call": call, "slack": 3.0}
+
+
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ENVIRONMENT = rows(
     "Environment",
     [
+        ("no terminal", nothing, listed()),
+        ("a terminal of 20 columns", nothing, listed(COLUMNS="20")),
+        ("a terminal that can do nothing", nothing, listed(TERM="dumb", COLUMNS="1")),
+        ("a locale without other letters than ASCII's", nothing, listed(**ASCII)),
+        ("one thread", nothing, listed(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")),
+        ("32 threads", nothing, listed(OMP_NUM_THREADS="32", OPENBLAS_NUM_THREADS="32")),
         ("no home folder, or one that cannot be written: nothing is cached", nothing, {"call": without_home}),
         ("`ulimit -v` that is too small", nothing, {"call": lambda made: limited(2.5)}),
         ("`ulimit -v` that is small", nothing, {"call": lambda made: limited(4.0)}),
