@@ -15,7 +15,7 @@ import picture_bytes as bytes_of
 import tiny_layouts as layouts
 import tiny_sequences as tiny
 from bad_files import beside
-from bad_row import Row, read_frames, rows
+from bad_row import Row, good, read_frames, rows
 
 from vggtgeo.datasets import open_sequence
 
@@ -127,6 +127,15 @@ def deep_jpeg() -> bytes:
     return bytes(whole)
 
 
+def read_while_it_grows(folder: Path) -> None:
+    """Two images more once the first is read, and what is none of them."""
+    frames = open_sequence(folder).frames()
+    next(frames)
+    for name in ("3.png", "4.png", "preview.jpg"):
+        shutil.copy(folder / "0.png", folder / name)
+    assert len(list(frames)) == 2
+
+
 IMAGES = rows(
     "Images",
     [
@@ -196,6 +205,7 @@ DOUBLES = rows(
     ],
     call=frame_names,
 )
+GROWING = rows("Images", [("images that come in while the folder is read", good)], call=read_while_it_grows)
 ORDERED = rows(
     "Images",
     [
@@ -209,4 +219,4 @@ ORDERED = rows(
     ],
     call=in_order,
 )
-ALL_IMAGES: list[Row] = [*IMAGES, *DOUBLES, *ORDERED]
+ALL_IMAGES: list[Row] = [*IMAGES, *DOUBLES, *GROWING, *ORDERED]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -49,6 +52,19 @@ def test_it_is_due_by_the_number_of_frames() -> None:
     frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
     assert [is_due(replace(slam, frames=(frame,) * count)) for count in (1, LAG, LAG + 1)] == [False, False, True]
     assert not is_due(settled(slam))
+
+
+@pytest.mark.parametrize("again", [lambda slam: pickle.loads(pickle.dumps(slam)), copy.deepcopy])
+def test_a_state_that_waits_for_a_window_pickles_and_copies(again: Callable[[Slam], Slam]) -> None:
+    """A Future has a lock, which does neither: the copy has the result. Oracle: that of the state itself."""
+    slam = begin_window(STATE, lambda: replace(STATE, intrinsics=2 * CAMERA, window=(1, 2)))
+    found = again(slam)
+    assert found.pending is not None
+    assert slam.pending is not None
+    assert found.pending.due == slam.pending.due
+    after = settled(found)
+    assert after.window == (1, 2)
+    np.testing.assert_array_equal(after.intrinsics, 2 * CAMERA)
 
 
 def test_an_error_is_not_lost() -> None:

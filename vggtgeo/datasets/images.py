@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -10,10 +11,11 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.frame import Frame
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, read_image
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
 
 FRAMES_PER_SECOND = 30.0
 _SECONDS = re.compile(r"-?\d+\.\d+")
@@ -60,6 +62,24 @@ class ImageFolder(FolderSequence):
         width, height = common_size(str(folder), files)
         camera = camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
         return cls(folder, folder.resolve().name, camera, files)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """See `FolderSequence.frames`; behind the last image, how many came in since the folder was opened is told."""
+        read = super().frames(start, end, stride)
+        return read if end is not None and end < len(self) else self._then_tell_of_new(read)
+
+    def _then_tell_of_new(self, read: Iterator[Frame]) -> Iterator[Frame]:
+        yield from read
+        listed = {file.image for file in self.files}
+        kinds = {image.suffix.lower() for image in listed}
+        there = image_files(self.folder) if self.folder.is_dir() else []
+        new = [image for image in there if image not in listed and image.suffix.lower() in kinds]
+        if new:
+            text = (
+                f"`{self.folder}` got {len(new)} more images while it was read, `{new[0].name}` the first: they are "
+                "left out; run again for them, or once the folder is whole"
+            )
+            warnings.warn(LeftOutWarning(text, len(new)), stacklevel=3)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses, if the folder has them."""

@@ -21,13 +21,17 @@ def check_kind(name: str, given: Any, kind: Any, expected: str) -> None:
         raise InputError(f"`{name}` is of the type `{type(given).__name__}`; expected {expected}")
 
 
+_LONGEST_NAME, _LONGEST_PATH = 255, 4095
+"""Bytes; of Linux and its file systems."""
+
+
 def path_of(name: str, given: Any) -> Path:
     """The path that was given, as a text or an `os.PathLike`, `~` being the home folder, as in a shell: else what is
     saved there would go into a folder of that name. Whether anything is there is for the caller to ask.
 
     Raises:
         InputError: it is of another kind, bytes among them; or empty, which would mean the working folder; or no file
-            system has such a name.
+            system has such a name, for a zero byte or its length.
 
     """
     found = os.fspath(given) if isinstance(given, str | os.PathLike) else given
@@ -37,6 +41,14 @@ def path_of(name: str, given: Any) -> Path:
         raise InputError(f"`{name}` is empty, which would mean the working folder; give a path")
     if "\0" in found:
         raise InputError(f"`{name}` is {given!r:.60}, which has a zero byte in it; give a path")
+    try:
+        whole = os.fsencode(found)
+    except UnicodeEncodeError:
+        raise InputError(f"`{name}` is {given!r:.60}, which has a letter that no file's name can have") from None
+    longest = max(map(len, whole.split(os.fsencode(os.sep))))
+    if longest > _LONGEST_NAME or len(whole) > _LONGEST_PATH:
+        text = f"{len(whole)} bytes, {longest} between two slashes; there can be {_LONGEST_PATH}, and {_LONGEST_NAME}"
+        raise InputError(f"`{name}` is {given!r:.30}..., a path of {text}")
     return Path(os.path.expanduser(found))  # of pathlib, it fails for a user that is not known
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
@@ -101,6 +102,16 @@ class PendingWindow:
     due: int
     begun: Slam
     result: Future[Slam]
+
+    def __reduce__(self) -> tuple[Callable[..., PendingWindow], tuple[int, Slam, Slam]]:
+        """So that states pickle, and copy: with the result, which is waited for."""
+        return _done, (self.due, self.begun, self.result.result())
+
+
+def _done(due: int, begun: Slam, result: Slam) -> PendingWindow:
+    future: Future[Slam] = Future()
+    future.set_result(result)
+    return PendingWindow(due, begun, future)
 
 
 @dataclass(frozen=True)
