@@ -20,7 +20,7 @@ from typing import Any
 from vggtgeo.benchmark.jobs import Job
 from vggtgeo.benchmark.processes import Limits, claimed, run_limited
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.scheduling import Command, Finished, described, worker_command
+from vggtgeo.benchmark.scheduling import Command, Finished, check_space, described, worker_command
 from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import JOB, LOG, ROW
 from vggtgeo.io.errors import InputError
@@ -54,7 +54,7 @@ def run_jobs_on_cluster(
 ) -> None:
     """Run `jobs` wherever the cluster has room, and store their rows as they come.
 
-    InputError where Ray is not installed, or no cluster answers at the address.
+    InputError where Ray is not installed, no cluster answers at the address, or a node has no space left.
     """
     if not jobs:
         return
@@ -109,6 +109,7 @@ def _taken(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[str, Any
     if ROW in contents:
         with atomic_path(place / ROW) as temporary:
             temporary.write_bytes(contents[ROW])
+    check_space(place, ending)
     return store.complete(job, **ending)
 
 

@@ -7,7 +7,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +26,7 @@ Command = Callable[[Path, Path], Sequence[str]]
 """The command line of a run, given its folder and the scratch folder."""
 Finished = Callable[[Job, Row], None]
 _WAIT = 0.1
+_FULL = "no space"  # in place of a status: there will be no row
 _LAST = 2000  # characters of a log that are looked at for its last line
 
 
@@ -89,22 +90,29 @@ def run_one(
     place = store.begin(job)
     began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     log = place / LOG
-    ending = run_limited(command(place, scratch), log, limits, cores, stop)
-    if ending.code == NO_SPACE:
+    ending = described(run_limited(command(place, scratch), log, limits, cores, stop), log.read_bytes())
+    check_space(place, ending)
+    return store.complete(job, **ending, started=began, cpus=len(cores))
+
+
+def check_space(place: Path, ending: Mapping[str, Any]) -> None:
+    """InputError where a run ended because its disk was full, and so would be for those that follow."""
+    if ending["status"] == _FULL:
         raise InputError(
-            f"there is no space left for the run `{place}` ({_last_line(log.read_bytes())}); give it some and call "
-            "again: what is finished is kept"
+            f"there is no space left for the run `{place}` ({ending['message']}); give it some and call again: what is "
+            "finished is kept"
         )
-    return store.complete(job, **described(ending, log.read_bytes()), started=began, cpus=len(cores))
 
 
 def described(ending: Ending, log: bytes) -> dict[str, Any]:
     """The columns of a row that tell how its process ended, and where; the status is that of a run that left no row."""
-    message = ending.message
-    if ending.status == "ended" and ending.code > 0:
+    message, status = ending.message, "crash" if ending.status in ("ended", "killed") else ending.status
+    if ending.status == "ended" and ending.code == NO_SPACE:
+        message, status = _last_line(log), _FULL
+    elif ending.status == "ended" and ending.code > 0:
         message = f"{message}: {_last_line(log)}"
     return {
-        "status": "crash" if ending.status in ("ended", "killed") else ending.status,
+        "status": status,
         "message": message,
         "seconds_wall": ending.seconds,
         "peak_memory_gb": ending.peak_gb,
