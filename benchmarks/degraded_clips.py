@@ -14,6 +14,7 @@ from vggtgeo.benchmark.inputs import DegradedWalk
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation.degradations import Degradation, Recording
+from vggtgeo.slam.trust.evidence import Evidence
 
 
 def degraded_clips(
@@ -45,6 +46,16 @@ def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> t
     truth = result.summary.get("truth")
     alignment = "ate_se3_m" if sequence.has_depth else "ate_sim3_m"
     return result, truth[alignment]["rmse"] if truth else float("nan")
+
+
+def evidence(sequence: SequenceView) -> Evidence:
+    """What the verdict looks at, of each frame."""
+    recorder = vg.EvidenceRecorder(sequence.camera)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        for frame in sequence.frames():
+            recorder.add(frame)
+    return recorder.frames
 
 
 def print_table(

@@ -14,17 +14,14 @@ done. No image tells of a factor on all depth.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 
 import cv2
 import numpy as np
-from degraded_clips import judged, print_table
+from degraded_clips import evidence, judged, print_table
 
-import vggtgeo as vg
 from vggtgeo.datasets import Frame
 from vggtgeo.datasets.views import SequenceView
-from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation.degradations import Degradation, Recording, as_it_is, with_depths
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.contradicted import median_shares
@@ -124,12 +121,7 @@ CHANGES: dict[str, Degradation] = {
 
 def distance(sequence: SequenceView, slam: Slam) -> str:
     """The share of distance in the depth, and its standard deviation; nothing where too few corners have parallax."""
-    recorder = vg.EvidenceRecorder(sequence.camera)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        for frame in sequence.frames():
-            recorder.add(frame)
-    ratios = depth_ratios(Estimate.of(slam), recorder.frames)
+    ratios = depth_ratios(Estimate.of(slam), evidence(sequence))
     return "{:.2f} +- {:.2f}".format(*share_of_distance(ratios)) if ratios.enough else ""
 
 

@@ -384,6 +384,27 @@ PROBLEMS = rows(
         ("saved: an array is missing", bad.saved(lambda old: old.pop("problem/terms/points/target"))),
         ("saved: a weight that is NaN", bad.saved(lambda old: old["problem/terms/points/weight"].fill(np.nan))),
         ("saved: an edge to a keyframe that is not there", bad.saved(lambda old: old["problem/edges/target"].fill(99))),
+        (
+            "saved: an array of matches that was cut",
+            bad.saved(lambda old: old.update({"problem/terms/points/target": old["problem/terms/points/target"][:-1]})),
+        ),
+        (
+            "saved: places of edges that are not theirs",
+            bad.saved(
+                lambda old: old.update({"problem/edges/index_at_host": old["problem/edges/index_at_host"] + 10**6})
+            ),
+        ),
+        ("saved: two landmarks at one place", bad.saved(lambda old: old["index/slot"].fill(0))),
+        (
+            "saved: a parameter that the camera has not",
+            bad.saved(lambda old: old["problem/terms/intrinsics_prior/index"].fill(99)),
+        ),
+        (
+            "saved: a kernel without width",
+            bad.saved(lambda old: old.update({"problem/terms/points/kernel/delta": np.array(-1.0)})),
+        ),
+        ("saved: edges from a keyframe to itself", bad.saved(lambda old: old["problem/edges/target"].fill(0))),
+        ("saved: a match that is NaN", bad.saved(lambda old: old["problem/terms/points/target"].fill(np.nan))),
         ("saved: poses with NaN", bad.saved(lambda old: old["state/poses/wxyz_xyz"].fill(np.nan))),
     ],
     argv=solve_with(),

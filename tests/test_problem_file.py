@@ -1,6 +1,7 @@
 """Problem and solution files: what is written is what is read, and the energy is the one the layout defines."""
 
 import importlib.util
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +12,7 @@ import pytest
 from scenes import INTRINSICS, Scene, make_scene
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.marginalisation import no_prior
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem_file import LAYOUT, load_problem, save_problem, save_solution
 from vggtgeo.io.errors import InputError
@@ -126,6 +128,48 @@ def oracle(shared_bench: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+DAMAGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "a row too few": lambda array: array[:-1],
+    "a row too many": lambda array: np.concatenate([array, array[-1:]]),
+    "a column too few": lambda array: array[:, :-1],
+    "a column too many": lambda array: np.concatenate([array, array[:, -1:]], 1),
+    "an axis too few": lambda array: array.reshape(-1),
+    "numbers beyond the last": lambda array: array + np.array(10**6, array.dtype),
+    "numbers below zero": lambda array: -array - 1,
+    "halves": lambda array: array + 0.5,
+}
+OF_NUMBERS = ("numbers beyond the last", "numbers below zero", "halves")
+NOT_COUNTED = ("index/edge: a row too few",)
+"""Edges that are given, in the rows that are stored: fewer may be given."""
+
+
+def test_a_saved_problem_that_was_cut_or_renumbered_is_refused(tmp_path: Path) -> None:
+    # Proves that every array of a saved problem is held against the others: what no longer fits ended in words of JAX,
+    # and numbers beyond an array were taken for its last row, with a solution and no word. Oracle: each array of the
+    # file with each damage, all of which make another problem or none, and all of which are named.
+    problem, state, index = SCENE.pack()
+    save_problem(tmp_path / "whole.npz", problem.with_term(no_prior(problem.num_keyframes)), state, index)
+    with np.load(tmp_path / "whole.npz") as opened:
+        arrays = dict(opened)
+    refused: list[str] = []
+    taken: list[str] = []
+    for name in sorted(arrays.keys() - {"description"}):
+        for damage, change in DAMAGES.items():
+            whole = arrays[name].dtype.kind in "iu"
+            least = 2 if "column" in damage or "axis" in damage else 1
+            if arrays[name].ndim < (0 if damage in OF_NUMBERS else least) or (damage in OF_NUMBERS and not whole):
+                continue
+            np.savez(tmp_path / "cut.npz", **{**arrays, name: change(arrays[name])})
+            try:
+                load_problem(tmp_path / "cut.npz")
+                taken.append(f"{name}: {damage}")
+            except InputError as error:
+                refused.append(str(error))
+    assert len(refused) > 100
+    assert all("cut.npz" in text for text in refused)
+    assert taken == list(NOT_COUNTED)
 
 
 @pytest.mark.parametrize("outliers", ["offset", "uniform"])

@@ -18,7 +18,8 @@ from vggtgeo.bundle.packing_checks import check_dtype
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.precision import check_precision
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.saved_modules import check_problem, describe, restore
+from vggtgeo.bundle.saved_checks import check_problem
+from vggtgeo.bundle.saved_modules import describe, restore
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
