@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import bad_files as bad
+import cv2
 import numpy as np
 import pytest
 import tiny_layouts as layouts
@@ -39,6 +40,49 @@ def piped_suite(folder: Path) -> Path:
     return folder / "suite.toml"
 
 
+def realsense(coefficients: list[Any], model: str) -> Callable[[Path], None]:
+    """A camera as RealSense's tools write it."""
+    fx, fy, cx, cy = layouts.INTRINSICS
+    camera = {"fx": fx, "fy": fy, "ppx": cx, "ppy": cy, "coeffs": coefficients, "model": f"distortion.{model}"}
+    return bad.write("intrinsic.json", json.dumps(camera))
+
+
+def copy_of_phone(folder: Path) -> None:
+    """What a phone wrote, beside what it was converted to."""
+    (folder / "rgb/1.HEIC").write_bytes(b"no")
+
+
+def in_icloud(folder: Path) -> None:
+    """Two of the images are elsewhere, and so are their depths."""
+    for number in (1, 2):
+        (folder / f"rgb/{number}.png").rename(folder / f"rgb/.{number}.png.icloud")
+        (folder / f"depth/{number}.png").unlink()
+
+
+def in_two_folders(folder: Path) -> None:
+    """The images from the second on are in a folder of another name."""
+    (folder / "color").mkdir()
+    for number in range(1, layouts.COUNT):
+        (folder / f"rgb/{number}.png").rename(folder / f"color/{number}.png")
+        (folder / f"depth/{number}.png").unlink()
+
+
+def counted_from_one(folder: Path) -> None:
+    """The depths have other numbers than their images."""
+    for number in reversed(range(layouts.COUNT)):
+        (folder / f"depth/{number}.png").rename(folder / f"depth/{number + 1}.png")
+
+
+def of_size(rows: int, columns: int, depth: str = "depth") -> Callable[[Path], None]:
+    """All depth images of another size."""
+
+    def change(folder: Path) -> None:
+        for file in (folder / depth).iterdir():
+            cv2.imwrite(str(file), np.full((rows, columns), 2000, np.uint16))
+
+    return change
+
+
 TIMES = rows(
     "Lists and poses",
     [
@@ -65,6 +109,35 @@ CAMERAS = rows(
             "`is_fisheye` that is a text in `transforms.json`",
             recorded(layouts.nerfstudio, other_numbers("transforms.json", is_fisheye="yes")),
         ),
+        (
+            "a focal length of 0 in `transforms.json`",
+            recorded(layouts.nerfstudio, other_numbers("transforms.json", fl_y=0)),
+        ),
+        ("a fourth radial coefficient in it", recorded(layouts.nerfstudio, other_numbers("transforms.json", k4=0.1))),
+        ("RealSense's distortion in `intrinsic.json`", recorded(layouts.rgbd, realsense([0.1, 0, 0, 0, 0], "brown"))),
+        ("words for it", recorded(layouts.rgbd, realsense(["none"], ""))),
+    ],
+    call=read_frames,
+)
+LEFT_OUT = rows(
+    "Images",
+    [
+        ("AVIF among PNG", recorded(layouts.rgbd, lambda folder: (folder / "rgb/9.avif").write_bytes(b"no"))),
+        ("HEIC beside a PNG of the same name", recorded(layouts.rgbd, copy_of_phone)),
+        ("pictures that iCloud has not brought", recorded(layouts.rgbd, in_icloud)),
+        ("a picture that is still being copied", recorded(layouts.rgbd, bad.write("rgb/9.png.part", "no"))),
+        ("a half of the images in another folder", recorded(layouts.rgbd, in_two_folders)),
+    ],
+    call=read_frames,
+)
+PAIRS = rows(
+    "Depth images",
+    [
+        ("depth without an image", recorded(layouts.rgbd, lambda folder: (folder / "rgb/2.png").unlink())),
+        ("as many as images, counted from 1 where they are from 0", recorded(layouts.rgbd, counted_from_one)),
+        ("of one pixel, in `transforms.json`", recorded(layouts.nerfstudio, of_size(1, 1))),
+        ("turned, in `transforms.json`", recorded(layouts.nerfstudio, of_size(20, 15))),
+        ("turned, of ARKit", recorded(layouts.arkit, of_size(20, 15, "lowres_depth"))),
     ],
     call=read_frames,
 )
@@ -135,4 +208,4 @@ SUITES = rows(
         )
     ],
 )
-LAYOUTS: list[Row] = [*TIMES, *CAMERAS, *SCANS, *ENVIRONMENT, *SOLVE, *SUITES]
+LAYOUTS: list[Row] = [*TIMES, *CAMERAS, *LEFT_OUT, *PAIRS, *SCANS, *ENVIRONMENT, *SOLVE, *SUITES]

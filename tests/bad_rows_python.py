@@ -249,6 +249,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a cloud that float32 cannot hold", lambda folder: save_cloud(folder, 1e300)),
     ("`open_sequence` of nothing", lambda _: vg.open_sequence(None)),
     ("`read` of bytes", lambda _: vg.read(b"clip")),
+    ("`open_sequence` at a rate that is a text", lambda folder: vg.open_sequence(bad.frames(folder / "a"), rate="30")),
     ("`read` of a name of 5,000 letters", lambda _: vg.read("a" * 5000)),
     ("`read` of half a letter of UTF-16", lambda _: vg.read("\ud800")),
     ("`evaluate` of a name with a zero byte", lambda _: vg.evaluate("a\0b", trajectory([0.0], [EYE])(_))),

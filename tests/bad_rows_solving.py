@@ -105,6 +105,13 @@ ONLY_FIRST = lambda leaf: leaf[:1]
 WINDOW = (SCENE.observations, SCENE.start_poses, SCENE.start_intrinsics, SCENE.inverse_depth)
 SHORT = (WINDOW[0], WINDOW[1][:1], *WINDOW[2:])
 
+
+def save_turned(file: Path) -> None:
+    """The two in each other's place."""
+    problem, state, index = SCENE.pack()
+    vg.save_problem(file, state, problem, index)
+
+
 SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`pack`: poses of complex numbers", pack(poses=SCENE.start_poses.astype(complex))),
     ("`pack`: poses with a mask", pack(poses=np.ma.masked_less(SCENE.start_poses, 0.5))),
@@ -171,6 +178,8 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ),
     ("`load_problem` of an empty name", lambda _: vg.load_problem("")),
     ("`load_problem` of whole numbers", lambda _: vg.load_problem("no.npz", dtype="int32")),
+    ("`save_problem` without its index", lambda made: vg.save_problem(made / "p.npz", *SCENE.pack()[:2], None)),
+    ("`save_problem` of a state and a problem", lambda made: save_turned(made / "p.npz")),
     ("`save_problem` to a number", lambda _: vg.save_problem(1, *SCENE.pack())),
     ("`with_term` of nothing", with_pair(lambda p, s: p.with_term(None))),
     ("`with_terms` of a list", with_pair(lambda p, s: p.with_terms([p.points]))),

@@ -109,6 +109,10 @@ def test_folders_that_cannot_be_paired_are_named(tmp_path: Path) -> None:
         open_sequence(folder)
     camera.write_text('{"fx": 50, "fy": 50, "ppx": 20, "ppy": 15}')
     assert open_sequence(folder).camera.intrinsics == (50, 50, 20, 15)
+    camera.write_text(
+        '{"fx": 50, "fy": 50, "ppx": 20, "ppy": 15, "model": "distortion.brown_conrady", "coeffs": [0.1, -0.2, 0, 0]}'
+    )
+    assert open_sequence(folder).camera.distortion == (0.1, -0.2, 0.0, 0.0)
     camera.write_text('{"fx": 50}')
     with pytest.raises(InputError, match=r"expected `intrinsic_matrix` \(nine numbers"):
         open_sequence(folder)

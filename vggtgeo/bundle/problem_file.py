@@ -16,6 +16,7 @@ from vggtgeo.bundle.observed import check_tied
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.packing_checks import check_dtype
 from vggtgeo.bundle.padding import SlotIndex
+from vggtgeo.bundle.pair_checks import check_kinds
 from vggtgeo.bundle.precision import check_precision
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.saved_checks import check_problem
@@ -23,7 +24,7 @@ from vggtgeo.bundle.saved_modules import describe, restore
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
-from vggtgeo.io.given import path_of
+from vggtgeo.io.given import check_kind, path_of
 from vggtgeo.solvers.kernels import Huber
 
 DESCRIPTION = "description"
@@ -131,7 +132,8 @@ def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -
     `load_problem` gives the same leaves back, bit by bit. The file is written atomically and holds no pickles.
 
     Raises:
-        InputError: a term holds something that is no array, number or text.
+        InputError: they are not a problem, a state and an index, or a term holds something that is no array, number or
+            text.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()`):
         >>> import tempfile
@@ -143,6 +145,8 @@ def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -
         True
 
     """
+    check_kinds(problem, state)
+    check_kind("index", index, SlotIndex, "a `SlotIndex`, the third of what `vggtgeo.pack` gives")
     arrays: dict[str, np.ndarray] = {}
     parts = {"problem": problem, "state": state}
     description = {name: describe(part, name, arrays) for name, part in parts.items()}

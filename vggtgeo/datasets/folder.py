@@ -104,7 +104,23 @@ class FolderSequence:
         """The depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
         depth = read_depth(path, self.depth_format)
         size = self.camera.width, self.camera.height
-        return enlarged(depth, size) if self.depth_of_fewer_pixels and _is_of_fewer_pixels(depth, *size) else depth
+        return (
+            enlarged(depth, size, path) if self.depth_of_fewer_pixels and _is_of_fewer_pixels(depth, *size) else depth
+        )
+
+    def depth_can_be_read(self) -> bool:
+        """Whether depth of the first, the middle or the last image that has some can be read; else an InputWarning."""
+        depths = [file.depth for file in self.files if file.depth is not None]
+        reason = ""
+        for depth in (depths[0], depths[len(depths) // 2], depths[-1]):
+            try:
+                self.load_depth(depth)
+            except InputError as error:
+                reason = reason or str(error)
+            else:
+                return True
+        warnings.warn(f"{reason}; reading the images only", InputWarning, stacklevel=4)
+        return False
 
     def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
         empty = 0
@@ -193,6 +209,7 @@ def common_size(
 
 NEAREST = 0.01
 """Metres: no camera of depth measures what is nearer."""
+_SAME_SHAPE = 0.01
 MOST_ENLARGED = 32
 """Pixels of an image to one of its depth, along a side; phones have 8."""
 
@@ -251,10 +268,22 @@ def tell_of_no_depth(folder: Path, files: Sequence[FrameFile]) -> None:
         _warn(f"`{folder}`: {alone} of {len(files)} images have no depth")
 
 
-def enlarged(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Depth of another number of pixels in the same view, float32 [height, width]: each pixel takes the nearest."""
-    if depth.shape == size[::-1]:
+def enlarged(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
+    """Depth of another number of pixels in the same view, float32 [height, width]: each pixel takes the nearest.
+
+    Raises:
+        InputError: it has another shape than the images, so that it is of another view, or hardly any pixels.
+
+    """
+    (rows, columns), (width, height) = depth.shape, size
+    if (rows, columns) == (height, width):
         return depth
+    off = abs(columns * height / width - rows)
+    if off >= max(1.0, _SAME_SHAPE * rows) or not width / MOST_ENLARGED <= columns <= width * MOST_ENLARGED:
+        raise InputError(
+            _other_size(path, depth, width, height) + ": no such size of the same view; register the depth to the "
+            "images, or leave it out with --rgb-only"
+        )
     return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
 
 

@@ -26,6 +26,17 @@ from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 
+OTHER_PICTURES = frozenset(
+    {
+        *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".j2k", ".gif", ".tga", ".dng", ".raw", ".cr2", ".cr3", ".nef"),
+        *(".arw", ".raf", ".orf", ".rw2"),
+    }
+)
+"""Of phones and cameras, and what image programs write."""
+
+UNFINISHED = frozenset({".icloud", ".part", ".partial", ".filepart", ".crdownload", ".download", ".tmp"})
+"""Behind the name of a file that is still elsewhere, or is still being copied."""
+
 DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, read_image
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES, UNFINISHED, read_image
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
@@ -53,6 +53,7 @@ class ImageFolder(FolderSequence):
         if not images:
             raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
         images = _without_doubles(folder, images)
+        tell_of_unread(folder, images)
         _tell_of_series(folder, images)
         _tell_of_more(folder, len(images))
         times = times_by_name(images)
@@ -117,6 +118,31 @@ def _show_the_same(one: Path, other: Path) -> bool:
         return False
     first, second = (picture.astype(float).ravel() - picture.mean() for picture in small)
     return bool(first @ second >= _ALIKE * np.sqrt((first @ first) * (second @ second)))
+
+
+def tell_of_unread(folder: Path, images: list[Path]) -> None:
+    """How many pictures lie among `images` in a kind that is not read, or are not whole: in an InputWarning. One that
+    is there in another kind, too, is none of them (HEIC of a phone beside JPEG, raw of a camera).
+    """
+    read = {image.stem for image in images}
+    files = [path for path in folder.iterdir() if path.is_file()]
+    other = [path for path in files if path.suffix.lower() in OTHER_PICTURES and path.stem.lstrip(".") not in read]
+    partial = [
+        path
+        for path in files
+        if path.suffix.lower() in UNFINISHED
+        and Path(path.stem).suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES
+        and Path(path.stem.lstrip(".")).stem not in read
+    ]
+    for found, what in (
+        ([path for path in other if path.name[0] != "."], "of a kind that is not read: convert to PNG or JPEG"),
+        (partial, "not here, or not whole: wait for the copy"),
+    ):
+        if found:
+            first = min(path.name for path in found)
+            count = f"{len(found)} pictures" if len(found) > 1 else "a picture"
+            text = f"`{folder}` holds {count} {what} (`{first}`); left out"
+            warnings.warn(LeftOutWarning(text, len(found)), stacklevel=4)
 
 
 def _tell_of_series(folder: Path, images: list[Path]) -> None:

@@ -269,9 +269,28 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
     if not all(isinstance(number, int | float) for number in found):
         raise InputError(f"`{file}`: expected `intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`")
     try:
-        return Camera(check_intrinsics(tuple(map(float, found))), width, height)
+        return Camera(check_intrinsics(tuple(map(float, found))), width, height, _of_realsense(file, content))
     except InputError as error:
         raise InputError(f"`{file}`: {error}") from None
+
+
+def _of_realsense(file: Path, content: Mapping[str, Any]) -> tuple[float, ...]:
+    """k1 k2 p1 p2 k3 of `coeffs`, where its `model` is OpenCV's; of another one they are told and left out: the inverse
+    one, which undoes what a lens did.
+    """
+    given = content.get("coeffs")
+    if given is None:
+        return ()
+    if not isinstance(given, list) or not all(isinstance(number, int | float) for number in given):
+        raise InputError(f"`coeffs` is {str(given)[:40]}; expected a list of numbers, k1 k2 p1 p2 k3")
+    model = str(content.get("model", "")).lower().removeprefix("distortion.").replace(" ", "_").replace("-", "_")
+    if not any(given) or model == "none":
+        return ()
+    if model in ("", "brown_conrady", "modified_brown_conrady"):
+        return check_distortion(tuple(map(float, given)))
+    text = f"`model` is {model[:40]}, which is not read: its `coeffs` are left out; undistort the images"
+    warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=5)
+    return ()
 
 
 _DECIMAL_COMMA = re.compile(r"-?\d+,\d+")

@@ -78,11 +78,12 @@ class Nerfstudio(FolderSequence):
             warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=3)
         unit = _positive(file, "integer_depth_scale", content.get("integer_depth_scale", 1e-3))
         coding = replace(MILLIMETRES, units_per_metre=1.0 / unit)
-        return cls(folder, folder.resolve().name, camera, files, coding, has_depth)
+        whole = cls(folder, folder.resolve().name, camera, files, coding, has_depth)
+        return whole if not has_depth or whole.depth_can_be_read() else replace(whole, has_depth=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth, enlarged to the images where it is smaller, as a phone's is."""
-        return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height))
+        return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
         """The poses of the file, camera -> world."""
@@ -168,9 +169,11 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
     focal = _focal(file, content, frames, across)
     if focal is None:
         return guess_with_warning(str(file.parent), width, height)
-    fy = _number(file, content, frames, "fl_y") or focal
+    fy = _number(file, content, frames, "fl_y")
+    fy = focal if fy is None else fy
     cx, cy = _number(file, content, frames, "cx"), _number(file, content, frames, "cy")
     centre = (0.5 * across if cx is None else cx) - 0.5, (0.5 * down if cy is None else cy) - 0.5
+    _tell_of_unread(file, content, frames, fisheye)
     lens = tuple(_number(file, content, frames, key) or 0.0 for key in (_OF_FISHEYE if fisheye else _DISTORTION))
     try:
         distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
@@ -183,6 +186,16 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
         )
     camera = Camera(intrinsics_of(file, (focal, fy, *centre)), round(across), round(down), distortion, fisheye=fisheye)
     return camera.resized(width, height)
+
+
+def _tell_of_unread(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], fisheye: bool) -> None:
+    """Coefficients of the lens beyond those that are read."""
+    unread = [key for key in ("k4", "k5", "k6") if not (fisheye and key == "k4")]
+    if unread := [key for key in unread if _number(file, content, frames, key)]:
+        text = (
+            f"{', '.join(f'`{key}`' for key in unread)} of its lens, which is not read, left out: undistort the images"
+        )
+        warnings.warn(f"`{file}` has {text}", InputWarning, stacklevel=4)
 
 
 def _is_fisheye(file: Path, content: Mapping[str, Any]) -> bool:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from vggtgeo.datasets.image_files import OTHER_PICTURES
 from vggtgeo.datasets.images import files_like
 
 _RAW_PARTS = ("image_00", "image_01", "image_02", "image_03", "oxts", "velodyne_points")
@@ -26,15 +27,6 @@ def reason_not_read(place: Path) -> str | None:
     if other := next((file for file in pictures if file.suffix.lower() in OTHER_PICTURES), None):
         return f"`{place}` holds `{other.name}`, ..., a kind of image that is not read; convert them to PNG or JPEG"
     return None
-
-
-OTHER_PICTURES = frozenset(
-    {
-        *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".j2k", ".gif", ".tga", ".dng", ".raw", ".cr2", ".cr3", ".nef"),
-        *(".arw", ".raf", ".orf", ".rw2"),
-    }
-)
-"""Of phones and cameras, and what image programs write."""
 
 
 def _downloads(folder: Path) -> list[Path]:

@@ -14,13 +14,13 @@ from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim
 from vggtgeo.datasets.icl_raw import IclNuimRaw
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, is_there
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES, is_there
 from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
-from vggtgeo.datasets.not_read import OTHER_PICTURES, reason_not_read
+from vggtgeo.datasets.not_read import reason_not_read
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
 from vggtgeo.datasets.replica import Replica

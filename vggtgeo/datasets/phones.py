@@ -13,7 +13,7 @@ those of ARKit, which are no independent truth: differences from them are not er
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -113,12 +113,12 @@ class StrayScanner:
         file = self.folder / "depth" / f"{index:06d}.png"
         try:
             depth = read_depth(file, MILLIMETRES)
+            if (self.folder / _CONFIDENCE).is_dir():
+                self._leave_out_doubtful(depth, self.folder / _CONFIDENCE / file.name)
+            return enlarged(depth, (self.camera.width, self.camera.height), file)
         except InputError as error:
             warnings.warn(f"{error}; the frame is used without depth", InputWarning, stacklevel=3)
             return np.full(shape, np.nan, np.float32)
-        if (self.folder / _CONFIDENCE).is_dir():
-            self._leave_out_doubtful(depth, self.folder / _CONFIDENCE / file.name)
-        return enlarged(depth, (self.camera.width, self.camera.height))
 
     def _leave_out_doubtful(self, depth: np.ndarray, file: Path) -> None:
         """Makes NaN of what the phone does not trust; where that is not known all stays, with an InputWarning."""
@@ -154,11 +154,12 @@ class ArkitScenes(FolderSequence):
         tell_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         has_depth = any(file.depth is not None for file in files)
-        return cls(folder, folder.resolve().name, _pincam(folder, width, height), files, MILLIMETRES, has_depth)
+        whole = cls(folder, folder.resolve().name, _pincam(folder, width, height), files, MILLIMETRES, has_depth)
+        return whole if not has_depth or whole.depth_can_be_read() else replace(whole, has_depth=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth, enlarged to the images where it is smaller."""
-        return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height))
+        return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
         """ARKit's poses: the file holds world -> camera, an axis with the angle as its length, and a translation."""

@@ -104,7 +104,7 @@ class Record3d(FolderSequence):
         width, height = common_size(str(folder), files, lambda path: unread.load_image(path).image)
         camera = _camera(unread.file, metadata, width, height) or guess_with_warning(str(folder), width, height)
         whole = cls(folder, unread.name, camera, files, MILLIMETRES, any(there), _depth_size(metadata))
-        return whole if not any(there) or whole.depth_is_usable() else replace(whole, has_depth=False)
+        return whole if not any(there) or whole.depth_can_be_read() else replace(whole, has_depth=False)
 
     @property
     def file(self) -> Path:
@@ -125,20 +125,6 @@ class Record3d(FolderSequence):
             return path.is_file()
         return path.relative_to(self.folder).as_posix() in self._archive.NameToInfo
 
-    def depth_is_usable(self) -> bool:
-        """Whether depth of the first, the middle or the last image that has some can be read; else an InputWarning."""
-        depths = [file.depth for file in self.files if file.depth is not None]
-        reason = ""
-        for depth in (depths[0], depths[len(depths) // 2], depths[-1]):
-            try:
-                self.load_depth(depth)
-            except InputError as error:
-                reason = reason or str(error)
-            else:
-                return True
-        warnings.warn(f"{reason}; reading the images only", InputWarning, stacklevel=4)
-        return False
-
     def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
         """The image in a part of the archive."""
         return image_in(self._content(path), path, least_bits)
@@ -146,7 +132,7 @@ class Record3d(FolderSequence):
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth in a part of the archive, enlarged to the images; what is not trusted is none."""
         if path.suffix == ".exr":
-            return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height))
+            return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
         shape = self.camera.height, self.camera.width
         depth = _shaped(self._unpacked(path, 4), np.float32, path, self.depth_size[::-1], shape)
         depth = metres_of_floats(depth)
@@ -154,7 +140,7 @@ class Record3d(FolderSequence):
         if self.holds(trusted):
             trust = _shaped(self._unpacked(trusted, 1), np.uint8, trusted, depth.shape, shape)
             depth[trust < _LEAST_CONFIDENCE] = np.nan
-        return enlarged(depth, (self.camera.width, self.camera.height))
+        return enlarged(depth, (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
         """ARKit's poses, camera -> world; the file has them with OpenGL's axes. None where it has none."""

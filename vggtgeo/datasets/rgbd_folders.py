@@ -15,7 +15,7 @@ from typing import Self
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, tell_of_no_depth
 from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MILLIMETRES
-from vggtgeo.datasets.images import image_files, times_by_name
+from vggtgeo.datasets.images import image_files, tell_of_unread, times_by_name
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, list_of, lists_no_times, partners_in_time
 from vggtgeo.geometry.trajectory import Trajectory
@@ -75,11 +75,14 @@ class RgbdFolders(FolderSequence):
         if loose:
             beside = f" beside `{colour.name}`" if colour != folder else ""
             _warn(f"`{folder}`: {len(loose)} images{beside} ({loose[0].name}, ...) are left out")
+        tell_of_unread(colour, images)
+        _tell_of_others(folder, colour)
         times = times_by_name(images)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
         rows = sorted(zip(times, images, partners, strict=True), key=lambda row: row[0])
         files = tuple(FrameFile(index, time, image, partner) for index, (time, image, partner) in enumerate(rows))
         tell_of_no_depth(folder, files)
+        _tell_of_no_image(folder, depths, partners)
         width, height = common_size(str(folder), files)
         camera = (
             camera_from_folder(folder, width, height)
@@ -159,6 +162,13 @@ def _there(folder: Path, names: Sequence[str]) -> Path | None:
 
 def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path | None]:
     """The depth of each image, None where it has none."""
+    if shift := _shift(images, depths):
+        _warn(
+            f"`{folder}`: there are as many depths as images, and their numbers are {abs(shift)} "
+            f"{'higher' if shift > 0 else 'lower'}: they are paired in their order, `{images[0].name}` with "
+            f"`{depths[0].name}`; if that is wrong, give them the same names"
+        )
+        return list(depths)
     for key in (_stem, _number):
         found = _by(key, images, depths)
         if found is not None:
@@ -188,6 +198,34 @@ def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path
     found = [known.get(one) for one in keys[0]]
     paired = len(found) - found.count(None)
     return found if paired >= 0.5 * min(len(images), len(depths)) else None
+
+
+def _shift(images: list[Path], depths: list[Path]) -> int:
+    """By how much all numbers of depths are above those of as many images, which begin to count elsewhere; 0 where they
+    are the same, or differ in another way.
+    """
+    numbers = [[_number(path) for path in paths] for paths in (images, depths)]
+    if len(images) != len(depths) or len(images) < 2 or any(None in own for own in numbers):
+        return 0
+    apart = {int(depth or 0) - int(image or 0) for image, depth in zip(*numbers, strict=True)}
+    return apart.pop() if len(apart) == 1 else 0
+
+
+def _tell_of_others(folder: Path, colour: Path) -> None:
+    """Other folders that are named as one of images is: a half of the recording, maybe."""
+    others = [path for name in COLOUR if (path := _there(folder, [name])) and path != colour and image_files(path)]
+    for path in dict.fromkeys(others):
+        _warn(
+            f"`{folder}` has images in `{colour.name}` and in `{path.name}` ({len(image_files(path))}): those of "
+            f"`{colour.name}` are read; give the other folder to read that"
+        )
+
+
+def _tell_of_no_image(folder: Path, depths: list[Path], partners: Sequence[Path | None]) -> None:
+    """How many depths have no image, where there are as many or fewer images missing than a slower camera leaves."""
+    alone = len(depths) - len({partner for partner in partners if partner is not None})
+    if 0 < alone < 0.5 * len(depths):
+        _warn(f"`{folder}`: {alone} of {len(depths)} depths have no image: are images missing?")
 
 
 def _stem(path: Path) -> str:

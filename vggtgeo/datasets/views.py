@@ -67,6 +67,7 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
         InputError: `rate` is no positive number, or the sequence knows its times.
 
     """
+    check_real("rate", rate, "a positive number of frames a second")
     if not (math.isfinite(rate) and rate > 0):
         raise InputError(f"`rate` is {rate:g}; it must be a positive number of frames a second")
     if isinstance(sequence, VideoFile):
