@@ -1,6 +1,7 @@
 """Folders of images and depth, as people and programs write them: pairs, units, and what is no recording."""
 
 import shutil
+import warnings
 from pathlib import Path
 
 import cv2
@@ -123,6 +124,21 @@ def test_folders_that_cannot_be_paired_are_named(tmp_path: Path) -> None:
     assert len(alone) == tiny.COUNT
     with pytest.raises(InputError, match="no depth files whose unit could be another"):
         with_depth_scale(alone, 5000.0)
+
+
+@pytest.mark.parametrize(
+    ("kept", "told"), [(range(12), 0), (range(0, 12, 2), 0), (range(0, 12, 3), 0), (range(6), 1), (range(1, 12), 1)]
+)
+def test_images_that_are_missing_are_told(kept: range, told: int, tmp_path: Path) -> None:
+    """Of the last half, or of one; not of a colour camera that is slower than that of depth. Oracle: the numbers."""
+    for number in range(12):
+        tiny_sequences.write_image(tmp_path / f"depth/{number}.png", tiny_sequences.depth_codes(number))
+    for number in kept:
+        tiny_sequences.write_image(tmp_path / f"rgb/{number}.png", tiny_sequences.image(number % 3))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        open_sequence(tmp_path)
+    assert sum("depths have no image: are images missing" in str(warning.message) for warning in caught) == told
 
 
 def test_the_result_of_a_run_is_no_recording(tmp_path: Path) -> None:

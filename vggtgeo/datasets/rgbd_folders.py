@@ -10,6 +10,7 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Self
 
@@ -222,9 +223,13 @@ def _tell_of_others(folder: Path, colour: Path) -> None:
 
 
 def _tell_of_no_image(folder: Path, depths: list[Path], partners: Sequence[Path | None]) -> None:
-    """How many depths have no image, where there are as many or fewer images missing than a slower camera leaves."""
-    alone = len(depths) - len({partner for partner in partners if partner is not None})
-    if 0 < alone < 0.5 * len(depths):
+    """How many depths have no image, unless every second or third has one, as where the colour camera is slower."""
+    paired = {partner for partner in partners if partner is not None}
+    alone = len(depths) - len(paired)
+    if not (alone and paired):
+        return
+    longest = max(len(list(run)) for known, run in groupby(depth in paired for depth in depths) if not known)
+    if alone < 0.5 * len(depths) or longest > len(depths) / len(paired) + 1:
         _warn(f"`{folder}`: {alone} of {len(depths)} depths have no image: are images missing?")
 
 
