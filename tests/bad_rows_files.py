@@ -141,6 +141,11 @@ def windows_list(folder: Path) -> None:
     (folder / "rgb.txt").write_bytes(b"\xef\xbb\xbf" + (folder / "rgb.txt").read_bytes().replace(b"\n", b"\r\n"))
 
 
+def wide_list(folder: Path) -> None:
+    """A list as spreadsheets and PowerShell write text."""
+    (folder / "rgb.txt").write_bytes((folder / "rgb.txt").read_text().replace("\n", "\r\n").encode("utf-16"))
+
+
 def cut_problem(folder: Path) -> Path:
     """The first bytes of a problem file."""
     return bad.file("problem.npz", bad.problem()(folder).read_bytes()[:900])(folder)
@@ -225,7 +230,7 @@ LISTS = rows(
         ("a file that is not there", lines("rgb.txt", "10.0 rgb/10.000000.png\n10.1 rgb/no.png\n")),
         ("times out of order", lines("rgb.txt", "10.1 rgb/10.100000.png\n10.0 rgb/10.000000.png\n")),
         ("a time twice", lines("rgb.txt", "10.0 rgb/10.000000.png\n10.0 rgb/10.100000.png\n")),
-        ("UTF-16", bad.rgbd(bad.write("rgb.txt", "10.0 rgb/10.000000.png\n".encode("utf-16")))),
+        ("UTF-16, as spreadsheets write it", bad.rgbd(wide_list)),
         ("a byte order mark and CR LF", bad.rgbd(windows_list)),
         ("truth with seven columns", lines("groundtruth.txt", "10 0 0 0 0 0 1\n"), OPENED),
         ("truth that is a folder", bad.rgbd(truth_folder), OPENED),

@@ -21,6 +21,8 @@ from vggtgeo.cli.jax_flags import check_cache
 from vggtgeo.datasets import open_sequence
 from vggtgeo.geometry.point_cloud import PointCloud
 
+UNDERSCORE = "calibration.txt", "5_0 50 20 15"
+TRUTHS = '{"fx": 50, "fy": 50, "cx": true, "cy": 15}'
 CALIB = "P0: 55 0 20 0 0 55 15 0 0 0 1 0\n"
 
 
@@ -38,6 +40,20 @@ def piped_suite(folder: Path) -> Path:
     """Nobody writes into it."""
     os.mkfifo(folder / "suite.toml")
     return folder / "suite.toml"
+
+
+def listed_twice(folder: Path) -> None:
+    """The first frame once more, at the end."""
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"].append(content["frames"][0])
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def in_microseconds(folder: Path) -> None:
+    """EuRoC's list, divided by a thousand."""
+    file = next(folder.rglob("cam0/data.csv"))
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    file.write_text("\n".join(line[0] if line[0][0] == "#" else f"{int(line[0]) // 1000},{line[1]}" for line in lines))
 
 
 def realsense(coefficients: list[Any], model: str) -> Callable[[Path], None]:
@@ -89,6 +105,7 @@ TIMES = rows(
         ("KITTI's `times.txt` with 1e300", recorded(layouts.kitti, bad.write("times.txt", "0\n1\n1e300\n"))),
         ("KITTI's `times.txt` without a line", recorded(layouts.kitti, bad.write("times.txt", ""))),
         ("Replica's `traj.txt` without a line", recorded(layouts.replica, bad.write("traj.txt", ""))),
+        ("EuRoC's `data.csv` in microseconds", recorded(layouts.euroc, in_microseconds)),
         (
             "Record3D's times, one of 1e300",
             recorded(layouts.record3d, other_numbers("metadata", frameTimestamps=[0.0, 1.0, 1e300])),
@@ -115,6 +132,9 @@ CAMERAS = rows(
         ),
         ("a fourth radial coefficient in it", recorded(layouts.nerfstudio, other_numbers("transforms.json", k4=0.1))),
         ("RealSense's distortion in `intrinsic.json`", recorded(layouts.rgbd, realsense([0.1, 0, 0, 0, 0], "brown"))),
+        ("a number with a `_` in `calibration.txt`", recorded(layouts.rgbd, bad.write(*UNDERSCORE))),
+        ("an image that `transforms.json` lists twice", recorded(layouts.nerfstudio, listed_twice)),
+        ("truth values in `intrinsic.json`", recorded(layouts.rgbd, bad.write("intrinsic.json", TRUTHS))),
         ("words for it", recorded(layouts.rgbd, realsense(["none"], ""))),
     ],
     call=read_frames,

@@ -39,6 +39,7 @@ WIDTH, HEIGHT = 160, 120
 IMAGES = [bad.picture(row, WIDTH, HEIGHT) for row in range(3)]
 DEPTH = np.full((HEIGHT, WIDTH), 2.0, np.float32)
 EYE = np.eye(4)
+TINY = {name: lambda values: 1e-7 * values for name in ("d_init", "d_prior", "d_sigma")}
 
 
 def reconstruct(frames: Any = None, **options: Any) -> Callable[[Path], Any]:
@@ -250,6 +251,8 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`open_sequence` of nothing", lambda _: vg.open_sequence(None)),
     ("`read` of bytes", lambda _: vg.read(b"clip")),
     ("`open_sequence` at a rate that is a text", lambda folder: vg.open_sequence(bad.frames(folder / "a"), rate="30")),
+    ("`load_problem`: lengths in a tenth of a micrometre", lambda made: vg.load_problem(bad.problem(**TINY)(made))),
+    ("`load_problem`: terms that are a number", lambda made: vg.load_problem(bad.problem()(made), terms=3)),
     ("`read` of a name of 5,000 letters", lambda _: vg.read("a" * 5000)),
     ("`read` of half a letter of UTF-16", lambda _: vg.read("\ud800")),
     ("`evaluate` of a name with a zero byte", lambda _: vg.evaluate("a\0b", trajectory([0.0], [EYE])(_))),

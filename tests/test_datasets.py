@@ -164,11 +164,13 @@ def test_images_in_natural_order(tmp_path: Path) -> None:
     [
         (("9.5.png", "10.25.png", "100.0.png"), [9.5, 10.25, 100.0]),
         (("1403636579763555584.png", "1403636579813555456.png"), [1403636579.763555584, 1403636579.813555456]),
+        (("1403636579763555.png", "1403636579813555.png"), [1403636579.763555, 1403636579.813555]),
+        (("1403636579763.png", "1403636579813.png"), [1403636579.763, 1403636579.813]),
         (("000000.png", "000005.png"), [0.0, 1 / 30]),
     ],
 )
 def test_images_named_by_time(tmp_path: Path, names: tuple[str, ...], times: list[float]) -> None:
-    # Proves that names in seconds or nanoseconds are times, and plain counters are not.
+    # Proves that names in seconds, or nano-, micro- or milliseconds are times, and plain counters are not.
     frames = list(open_sequence(tiny.images(tmp_path, names)).frames())
     assert [frame.timestamp for frame in frames] == pytest.approx(times, abs=1e-6)
     assert _numbers(frames) == list(range(len(names)))

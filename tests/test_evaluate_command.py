@@ -44,7 +44,9 @@ def test_json_has_the_metrics(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*map(str, files), "--json", "--delta", "3", "--all-pairs", "--max-dt", "0.02"])
     assert result.exit_code == 0, result.output
     expected = evaluate_trajectory(*_load(files), max_dt=0.02, delta=3, all_pairs=True)
-    assert json.loads(result.output) == json.loads(json.dumps({**expected.as_dict(), "truth_in_metres": None}))
+    assert json.loads(result.output) == json.loads(
+        json.dumps({**expected.as_dict(), "truth_in_metres": None, "comparable": True})
+    )
 
 
 def test_a_run_in_metres_of_another_size_is_of_another_sequence(tmp_path: Path) -> None:
@@ -172,7 +174,10 @@ def test_the_truth_of_another_sequence_is_no_success(tmp_path: Path, truth: Traj
     assert outcome.exit_code == 3
     assert any(said in str(one.message) for one in warned), [str(one.message) for one in warned]
     assert "NOT COMPARABLE" in outcome.stderr
-    assert "ate_se3_m" in json.loads(outcome.stdout)
+    written = json.loads(outcome.stdout)
+    assert "ate_se3_m" in written
+    assert not written["comparable"]
+    assert any(said in text for text in written["warnings"])
 
 
 def test_an_estimate_without_scale_or_of_a_part_is_a_success(tmp_path: Path) -> None:

@@ -253,6 +253,19 @@ def test_an_export_again_replaces_what_an_export_wrote(folder: Path, tmp_path: P
     assert (tmp_path / "out/trajectory.txt").read_text() == "somebody's"
 
 
+def test_no_export_mixes_its_images_with_those_of_a_recording(folder: Path, tmp_path: Path) -> None:
+    # Proves that an export into a recording is refused, whose next run would read both; a second one over the first is
+    # not. Oracle: the files that lie there.
+    recording = tmp_path / "recording"
+    (recording / "images").mkdir(parents=True)
+    shutil.copy(next((folder / "images").iterdir()), recording / "images/mine.jpg")
+    with pytest.raises(vg.InputError, match=r"mine\.jpg` is an image that no export wrote"):
+        export(folder, "nerfstudio", recording)
+    assert [path.name for path in sorted((recording / "images").iterdir())] == ["mine.jpg"]
+    for to in ("nerfstudio", "colmap", "nerfstudio"):
+        export(folder, to, tmp_path / "new")
+
+
 def test_a_full_disk_leaves_the_record_of_what_exports_wrote(folder: Path, tmp_path: Path) -> None:
     # Proves that an export that cannot note its files any more names the folder, and that the next one still knows the
     # files of the one before as its own. Oracle: the record's bytes, and that next export.

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.linearise import MIN_INVERSE_DEPTH, energy_gradient, free_coordinates, linearise
+from vggtgeo.bundle.linearise import energy_gradient, free_coordinates, linearise
 from vggtgeo.bundle.objective import prepared, prepared_energy
-from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
 from vggtgeo.solvers.problem import AbstractArrowProblem

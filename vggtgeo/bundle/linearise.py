@@ -17,15 +17,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.objective import cameras_of, edge_data, hosts_of, motions_of, of_edge, relative_poses, view_of
-from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, times_depth_column
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors
 from vggtgeo.solvers.segments import join_segments
-
-MIN_INVERSE_DEPTH = 1e-6
-"""1/m: the bound of positive inverse depths (1000 km)."""
 
 
 def linearise(

@@ -30,6 +30,7 @@ from vggtgeo.bundle.packing_checks import (
     check_observations,
     check_positive,
     check_size,
+    warn_of_far,
 )
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex, assign_slots, pad_edges, sort_edges
 from vggtgeo.bundle.precision import check_precision, weight_of
@@ -114,6 +115,7 @@ def pack(
     check_kernel("kernel", kernel)
     check_observations(observations, poses)
     check_positive("inverse_depth", inverse_depth, len(observations.host))
+    warn_of_far(inverse_depth)
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
     check_terms(terms, observations, len(poses))
     guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import jax
@@ -11,9 +12,10 @@ import numpy as np
 
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.padding import PaddedSize
+from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.terms.term import check_width
 from vggtgeo.geometry.cameras import AbstractCamera
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_real, check_whole, real_numbers
 
 MOST_PADDED = 10_000_000
@@ -245,6 +247,18 @@ def check_positive(name: str, values: np.ndarray, count: int) -> None:
     if np.any(bad):
         first = int(np.nonzero(bad)[0][0])
         raise InputError(f"`{name}[{first}]` is {values[first]}; it must be positive and finite")
+
+
+def warn_of_far(inverse_depth: np.ndarray) -> None:
+    """An InputWarning where half of the landmarks begin beyond the bound of a solve, which would call that the end."""
+    far = int(np.sum(inverse_depth <= MIN_INVERSE_DEPTH))
+    if far > 0.5 * len(inverse_depth):
+        warnings.warn(
+            f"{far} of {len(inverse_depth)} landmarks begin farther than 1,000 km, where inverse depths have their "
+            "bound: give lengths in a larger unit, metres, say",
+            InputWarning,
+            stacklevel=3,
+        )
 
 
 def check_size(size: PaddedSize, needed: PaddedSize) -> None:

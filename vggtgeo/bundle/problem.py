@@ -22,6 +22,9 @@ from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
+MIN_INVERSE_DEPTH = 1e-6
+"""1/m: the bound of positive inverse depths (1000 km)."""
+
 
 class State(eqx.Module):
     """What bundle adjustment estimates: `n` poses, the camera they share, `s` inverse depths a keyframe.

@@ -79,6 +79,8 @@ def load_problem(
     path = path_of("path", path)
     if dtype is not None:
         check_dtype(dtype)
+    if not isinstance(terms, list | tuple) or not all(isinstance(kind, type) for kind in terms):
+        raise InputError(f"`terms` is {terms!r:.60}; expected a list of classes, as [PositionFix]")
     arrays = _read(path)
     if DESCRIPTION in arrays:
         return _restored(path, arrays, terms, dtype)

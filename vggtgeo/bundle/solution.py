@@ -12,10 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.graduation import Graduation
-from vggtgeo.bundle.linearise import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.pair_checks import check_pair
-from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.solver_choice import default_solver
 from vggtgeo.io.given import check_kind
 from vggtgeo.io.readable import Readable

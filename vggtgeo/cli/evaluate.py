@@ -12,6 +12,7 @@ import typer
 from vggtgeo.cli.options import EXIT_FAILED, JsonOption
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.warned import collected_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,10 +58,12 @@ def evaluate(
     found, scale = load_estimate(estimate, true), load_scale(estimate)
     report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
     metric = metres is not False and scale is not None and scale.startswith("metric")
-    meaningless = warn_of_strangers(found, true, max_dt, metric)
+    with collected_warnings() as warned:
+        meaningless = warn_of_strangers(found, true, max_dt, metric)
     if as_json:
         known = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
-        typer.echo(json.dumps({**report.as_dict(), **known}, indent=2))
+        told = {"warnings": [*report.warnings, *map(str, warned)], "comparable": not meaningless}
+        typer.echo(json.dumps({**report.as_dict(), **known, **told}, indent=2))
     else:
         print_report(report, scale, metres)
     if meaningless:

@@ -17,9 +17,7 @@ from vggtgeo.results.unfinished import check_can_be_shown
 
 def view(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that a run wrote.")],
-    rerun: Annotated[
-        str, typer.Option(metavar="TARGET", help="spawn, serve, or a new file ending with .rrd.")
-    ] = "spawn",
+    rerun: Annotated[str, typer.Option(metavar="TARGET", help="spawn, serve, or a file ending with .rrd.")] = "spawn",
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -20,6 +20,8 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarn
 FRAMES_PER_SECOND = 30.0
 _SECONDS = re.compile(r"-?\d+\.\d+")
 _NANOSECONDS = re.compile(r"\d{18,19}")
+_MICROSECONDS, _MILLISECONDS = re.compile(r"1\d{15}"), re.compile(r"1\d{12}")
+"""Since 1970, from 2001 to 2033."""
 _PREFERRED = (".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp", ".jpg", ".jpeg")
 """Of two formats of the same pictures: what loses nothing first."""
 _DIGITS = re.compile(r"[0-9]+")
@@ -29,6 +31,7 @@ _ALIKE = 0.95
 _NUMBERS = re.compile(r"((?:^-)?\d+)")
 _CAMERAS = re.compile(r"(.*(?:cam|camera|view|sensor|lens|eye)[ ._-]*\d+)(?!\d)(.*)", re.IGNORECASE)
 """Names that say which camera a picture is of, `cam0_17`."""
+_UNITS = ((_SECONDS, 1.0), (_NANOSECONDS, 1e-9), (_MICROSECONDS, 1e-6), (_MILLISECONDS, 1e-3))
 _COUNTED = re.compile(r"-?\d+\.\d+0")
 _NUMBERED = re.compile(r"[^0-9]*([0-9]{1,15})")
 
@@ -37,8 +40,8 @@ _NUMBERED = re.compile(r"[^0-9]*([0-9]{1,15})")
 class ImageFolder(FolderSequence):
     """Images of one folder, without depth. Truth: `groundtruth.txt` (TUM format), where there is one.
 
-    Time is position / 30 s, unless all names are times: seconds with a decimal point (`12.034.png`) or
-    nanoseconds (18 or 19 digits), or `with_rate` says otherwise.
+    Time is position / 30 s, unless all names are times: seconds with a decimal point (`12.034.png`), nanoseconds (18 or
+    19 digits), or micro- or milliseconds since 1970 (16 or 13), or `with_rate` says otherwise.
     """
 
     @classmethod
@@ -199,7 +202,7 @@ def image_files(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list
 def times_by_name(images: list[Path]) -> list[float]:
     """Seconds by the names where all are times, else position / 30 s."""
     stems = [image.stem for image in images]
-    for pattern, unit in ((_SECONDS, 1.0), (_NANOSECONDS, 1e-9)):
+    for pattern, unit in _UNITS:
         if all(pattern.fullmatch(stem) for stem in stems) and not (unit == 1.0 and _are_counted(stems)):
             times = [float(stem) * unit for stem in stems]
             if len(set(times)) == len(times):

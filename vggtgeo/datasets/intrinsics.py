@@ -12,6 +12,7 @@ import numpy as np
 from vggtgeo.datasets.pose_files import read_json, same_size
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
+from vggtgeo.io.text_files import whole_text
 
 NARROWEST, WIDEST = 1.0, 170.0
 """Degrees: fields of view that a pinhole camera may have."""
@@ -266,7 +267,7 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
         found = [matrix[0], matrix[4], *(matrix[2:6:3] if by_row else matrix[6:8])]
     else:
         found = [content.get(name, content.get(other)) for name, other in _JSON_NAMES]
-    if not all(isinstance(number, int | float) for number in found):
+    if not all(isinstance(number, int | float) and not isinstance(number, bool) for number in found):
         raise InputError(f"`{file}`: expected `intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`")
     try:
         return Camera(check_intrinsics(tuple(map(float, found))), width, height, _of_realsense(file, content))
@@ -301,6 +302,8 @@ def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
     if len(words := text.split()) >= 4 and all(map(_DECIMAL_COMMA.fullmatch, words)):
         raise InputError(f"{where}: found {text.strip()!r}; write decimals with a point: {expected}")
     try:
+        if "_" in text:  # which Python takes within a number
+            raise ValueError(text)
         return tuple(float(word) for word in text.replace(",", " ").split())
     except ValueError:
         raise InputError(f"{where}: found {text.strip()!r}; expected the numbers {expected}") from None
@@ -309,7 +312,7 @@ def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
 def _without_comments(file: Path) -> str:
     if file.stat().st_size > MOST_BYTES:
         raise InputError(f"`{file}` has {file.stat().st_size} bytes; expected a few numbers")
-    lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    lines = whole_text(file).splitlines()
     return " ".join(line.split("#", 1)[0] for line in lines)
 
 

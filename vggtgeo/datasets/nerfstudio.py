@@ -63,6 +63,9 @@ class Nerfstudio(FolderSequence):
         images = {_image(folder, file, frame): frame for frame in frames}
         if not images:
             raise InputError(f"`{file}` lists no frames; expected `frames` with `file_path` and `transform_matrix`")
+        if len(images) < len(frames):
+            text = f"{len(frames) - len(images)} of its frames name an image once more: the last pose of each is read"
+            warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=3)
         order = sorted(images, key=lambda path: natural_key(str(path.relative_to(folder))))
         files = tuple(
             FrameFile(index, index / FRAMES_PER_SECOND, image, _depth(folder, file, images[image]))

@@ -1,16 +1,19 @@
 """Which reader a path needs, by looking at it."""
 
+import math
 import os
+import statistics
 import warnings
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Protocol
 
 from vggtgeo.datasets.bags import RosBag, is_bag, no_whole_bag
 from vggtgeo.datasets.euroc import Euroc
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim
 from vggtgeo.datasets.icl_raw import IclNuimRaw
@@ -29,7 +32,7 @@ from vggtgeo.datasets.scannet import ScanNet
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
-from vggtgeo.datasets.video import VideoFile
+from vggtgeo.datasets.video import FASTEST, VideoFile
 from vggtgeo.datasets.views import with_rate
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import path_of
@@ -96,7 +99,18 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
     sequence = _open_place(place, kind)
     if sequence.camera.known:
         check_plausible(f"the camera of `{os.fspath(path)}`", sequence.camera)
+    if isinstance(sequence, FolderSequence):
+        _check_pace(sequence)
     return sequence if rate is None else with_rate(sequence, rate)
+
+
+def _check_pace(sequence: FolderSequence) -> None:
+    """An InputWarning for more frames a second than cameras take: microseconds where nanoseconds are expected, say."""
+    times = [file.timestamp for file in sequence.files]
+    apart = statistics.median(after - before for before, after in pairwise(times)) if len(times) > 1 else math.inf
+    if 0 < apart < 1 / FASTEST:
+        text = f"its frames are {apart:.2g} s apart, more than {FASTEST} a second: are its times in another unit?"
+        warnings.warn(f"`{sequence.folder}`: {text}", InputWarning, stacklevel=3)
 
 
 def is_readable(place: Path) -> bool:

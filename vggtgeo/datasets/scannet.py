@@ -23,7 +23,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, tell_of_no_depth
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
-from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of
+from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_of_other_size
 from vggtgeo.datasets.pose_files import numbers_of, read_matrix, read_text, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -61,7 +61,9 @@ class ScanNet(FolderSequence):
         colour, depth = _intrinsics(folder, "color"), _intrinsics(folder, "depth")
         width, height = _size(folder, files)
         # An absurd ratio of the two cameras would make a filter of any width.
-        check_plausible(f"`{folder}`: the colour camera", Camera(colour, *common_size(str(folder), files)))
+        taken = Camera(colour, *common_size(str(folder), files))
+        check_plausible(f"`{folder}`: the colour camera", taken)
+        warn_of_other_size(f"`{folder}`: the colour camera", taken)
         has_depth = any(file.depth is not None for file in files)
         camera = Camera(depth, width, height)
         return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour)

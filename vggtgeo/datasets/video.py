@@ -35,7 +35,7 @@ _CONTAINERS = (b"\0\0\1\xba", b"\x1aE\xdf\xa3", b"OggS", b"RIFF", b"FLV", b"G", 
 FLV, MPEG transport stream, ASF, NUT, YUV4MPEG2."""
 _BOXES = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"free", b"skip", b"wide")
 """What an MP4 or a MOV begins with, behind four bytes."""
-_FASTEST = 1000
+FASTEST = 1000
 """Frames a second that a header may state."""
 _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 """Control characters other than those of text and terminals; no container of videos is without them."""
@@ -73,10 +73,10 @@ class VideoFile:
             aspect = _pixel_aspect(capture)
         height, width = image.shape[:2]
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
-        known_rate = math.isfinite(rate) and 0 < rate < _FASTEST
+        known_rate = math.isfinite(rate) and 0 < rate < FASTEST
         if not stated > 0 and (what := _without_container(path)):  # a browser's recording states no count, but times
             _warn(InputWarning(f"`{path}` {what}; {rate:g} frames a second are taken: give `--fps` if it has others"))
-        if math.isfinite(rate) and rate > _FASTEST:
+        if math.isfinite(rate) and rate > FASTEST:
             _warn(InputWarning(f"`{path}` states {rate:g} frames a second: give `--fps` if that is not its rate"))
         return cls(path, path.name, camera, rate if known_rate else _FALLBACK_RATE, max(count, 1))
 

@@ -7,10 +7,12 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
+from vggtgeo.datasets.images import image_files
 from vggtgeo.export.colmap import write_colmap
 from vggtgeo.export.contents import EmptyRunError
 from vggtgeo.export.nerfstudio import write_nerfstudio
@@ -162,4 +164,18 @@ def _claim(output: Path, names: list[str], ours: bool) -> None:
             f"`{output / strange[0]}` is there and was not written by an export, which would replace it; give a new "
             "folder with `-o`"
         )
+    if not ours and (image := _another_image(output, names, known)):
+        raise InputError(
+            f"`{image}` is an image that no export wrote, and those of the export would lie among such: is `{output}` "
+            "a recording? Give a new folder with `-o`"
+        )
     write_text(record, "\n".join(sorted({*known, *names})) + "\n")
+
+
+def _another_image(output: Path, names: list[str], known: Collection[str]) -> Path | None:
+    """An image of somebody else in a folder that images are written into."""
+    for folder in sorted({(output / name).parent for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES}):
+        for path in image_files(folder) if folder.is_dir() else ():
+            if path.relative_to(output).as_posix() not in known:
+                return path
+    return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import stat
 from pathlib import Path
 
@@ -13,7 +14,8 @@ larger is something else, a sparse file of any size, say."""
 
 
 def whole_text(file: Path, errors: str = "replace") -> str:
-    """The text of a file of at most `MOST_BYTES` bytes, UTF-8, without the mark that editors of Windows begin it with.
+    """The text of a file of at most `MOST_BYTES` bytes: UTF-8, without the mark that editors of Windows begin it with,
+    or UTF-16 with the one that spreadsheets and PowerShell write.
 
     Raises:
         InputError: the file has more, or may not be read.
@@ -27,6 +29,9 @@ def whole_text(file: Path, errors: str = "replace") -> str:
     if size > MOST_BYTES:
         raise InputError(f"`{file}` has {size} bytes; expected a text of at most {MOST_BYTES}")
     try:
-        return file.read_text(encoding="utf-8-sig", errors=errors)
+        content = file.read_bytes()
     except PermissionError as error:
         raise InputError(f"`{file}` cannot be read: {error.strerror}; allow it, or take the file away") from None
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = content.decode("utf-16" if wide else "utf-8-sig", errors)
+    return text.replace("\r\n", "\n").replace("\r", "\n")  # as Python reads a text
