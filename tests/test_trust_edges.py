@@ -57,6 +57,35 @@ def test_depth_of_another_picture_has_them_elsewhere() -> None:
         assert np.mean(shares(lambda depth, wrong=wrong: np.ascontiguousarray(wrong(depth)))) > MOST_ELSEWHERE
 
 
+def test_depth_that_is_moved_has_them_in_one_other_place() -> None:
+    """15 pixels aside as depth that is not registered, or by as many in a direction of its own in each picture, as an
+    editor's stabiliser leaves it: one place alone, which is no large share of all.
+    """
+    rng = np.random.default_rng(0)
+    turned = lambda depth: np.roll(depth, tuple(np.rint(15 * _direction(rng)).astype(int)), (0, 1))
+    for moved in (lambda depth: np.roll(depth, 15, 1), turned):
+        assert np.mean(shares(moved)) > MOST_ELSEWHERE
+
+
+def test_a_wall_whose_joints_repeat_is_told_nothing() -> None:
+    """A row of pillars, every 24 pixels, and on the wall behind them stripes with more contrast: the depth fits better
+    there, but in no one place. Oracle: the picture, whose depth it is.
+    """
+    columns, rows = np.arange(SIZE[1]), np.arange(SIZE[0])[:, None]
+    pillar, stripe = columns % 24 < 8, (columns - 14) % 24 < 4
+    depth = np.where(pillar & (rows > 170), 2.0, 2.6).astype(np.float32)
+    grey = np.where(pillar & (rows > 170), 100.0, 130.0) + np.where(stripe, 90.0, 0.0)
+    grey += 5 * np.random.default_rng(0).standard_normal(SIZE)
+    found = edges_elsewhere(np.clip(grey, 0, 255).astype(np.uint8), depth)
+    assert found is not None
+    assert found < MOST_ELSEWHERE
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    given = rng.standard_normal(2)
+    return given / np.linalg.norm(given)
+
+
 def test_where_there_is_nothing_to_compare_nothing_is_said() -> None:
     """A flat depth, none, nothing but noise; a black picture; edges in what is no part of the world alone."""
     grey, depth = scene(0)
