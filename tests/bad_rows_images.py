@@ -136,9 +136,18 @@ def read_while_it_grows(folder: Path) -> None:
     assert len(list(frames)) == 2
 
 
+def large_jpeg() -> bytes:
+    """A JPEG of some hundred bytes whose header says 32586 x 2634 pixels."""
+    whole = bytearray(bad.encoded(".jpg"))
+    place = whole.index(b"\xff\xc0") + 5
+    whole[place : place + 4] = (32586).to_bytes(2) + (2634).to_bytes(2)
+    return bytes(whole)
+
+
 IMAGES = rows(
     "Images",
     [
+        ("a small JPEG that declares 86 million pixels", image(large_jpeg(), ".jpg")),
         ("images of two cameras, `left_0.png` and `right_0.png`", beside(two_cameras)),
         ("images of two cameras, `cam0_1.png` and `cam1_1.png`", of_rig),
         ("a JPEG of 12 bits", image(deep_jpeg(), ".jpg")),

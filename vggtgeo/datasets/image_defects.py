@@ -22,6 +22,8 @@ _RARE_FORMATS = {b"qoif": "QOI", b"II\xbc": "JPEG XR", b"\xff\xd8\xff\xf7": "JPE
 _LFS_POINTER = b"version https://git-lfs"
 _LEFT_OVER = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MOST_LEFT_OVER = 4
+_MOST_OF_A_BYTE = 512
+"""Pixels: of each 64 of them a Huffman-coded JPEG has one bit at least."""
 
 
 def defect(content: bytes) -> str:
@@ -49,6 +51,8 @@ def defect(content: bytes) -> str:
     width, height = declared_size(content)
     if width * height > MOST_PIXELS:
         return f"declares {width} x {height} pixels, more than {MOST_PIXELS // 10**6} million: not decoded"
+    if bits and width * height > _MOST_OF_A_BYTE * len(content):
+        return f"is cut off: its {len(content)} bytes are too few for a JPEG of {width} x {height} pixels"
     return ""
 
 

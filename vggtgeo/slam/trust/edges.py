@@ -84,7 +84,8 @@ def edges_elsewhere(grey: np.ndarray, depth: np.ndarray, left_out: np.ndarray | 
 
 
 def _distinct_place(under: np.ndarray, here: float) -> float:
-    """By how much the best shift is better than none, and than any far from it, the lesser of both over its own: 0 to 1.
+    """By how much the best shift is better than none and than any far from it, the lesser of both over its own, 0 to 1.
+
     under: mean strength for each shift. here: the best around no shift.
     """
     row, column = np.unravel_index(under.argmax(), under.shape)
