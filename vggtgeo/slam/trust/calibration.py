@@ -225,8 +225,9 @@ def _check_found_middle(camera: np.ndarray, size: tuple[int, int]) -> list[Findi
     if np.all(np.abs(aside) <= MOST_FOUND_ASIDE * sides):
         return []
     text = (
-        f"nobody gave the camera, and what was found cannot be right: its principal point, {camera[2]:.0f}, "
-        f"{camera[3]:.0f}, is far from the middle of the images of {size[0]} x {size[1]} pixels; give the intrinsics"
+        f"nobody gave the camera, and what was found is no usual one: its principal point, {camera[2]:.0f}, "
+        f"{camera[3]:.0f}, is far from the middle of the images of {size[0]} x {size[1]} pixels; give the intrinsics, "
+        "or, if the images were cut out of larger ones, cut them around the middle"
     )
     return [Finding("calibration", "degraded", text)]
 
