@@ -68,6 +68,12 @@ def copy_of_phone(folder: Path) -> None:
     (folder / "rgb/1.HEIC").write_bytes(b"no")
 
 
+def pictures_of_phone(folder: Path) -> None:
+    """Nobody has converted them."""
+    for file in (folder / "rgb").iterdir():
+        file.rename(file.with_suffix(".HEIC"))
+
+
 def in_icloud(folder: Path) -> None:
     """Two of the images are elsewhere, and so are their depths."""
     for number in (1, 2):
@@ -143,6 +149,7 @@ LEFT_OUT = rows(
     "Images",
     [
         ("AVIF among PNG", recorded(layouts.rgbd, lambda folder: (folder / "rgb/9.avif").write_bytes(b"no"))),
+        ("HEIC alone, beside depth", recorded(layouts.rgbd, pictures_of_phone)),
         ("HEIC beside a PNG of the same name", recorded(layouts.rgbd, copy_of_phone)),
         ("pictures that iCloud has not brought", recorded(layouts.rgbd, in_icloud)),
         ("a picture that is still being copied", recorded(layouts.rgbd, bad.write("rgb/9.png.part", "no"))),

@@ -23,9 +23,12 @@ def reason_not_read(place: Path) -> str | None:
         )
     if packed := next((file for file in files if _archive(file)), None):
         return f"`{packed}` is {_archive(packed)}; unpack it, and give the folder of images or the video that is in it"
-    pictures = files_like(place, "*") if place.is_dir() else []
-    if other := next((file for file in pictures if file.suffix.lower() in OTHER_PICTURES), None):
-        return f"`{place}` holds `{other.name}`, ..., a kind of image that is not read; convert them to PNG or JPEG"
+    folders = [place, *sorted(path for path in place.iterdir() if path.is_dir())] if place.is_dir() else []
+    for folder in folders:
+        if other := next((file for file in files_like(folder, "*") if file.suffix.lower() in OTHER_PICTURES), None):
+            return (
+                f"`{folder}` holds `{other.name}`, ..., a kind of image that is not read; convert them to PNG or JPEG"
+            )
     return None
 
 
