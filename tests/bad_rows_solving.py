@@ -106,6 +106,13 @@ WINDOW = (SCENE.observations, SCENE.start_poses, SCENE.start_intrinsics, SCENE.i
 SHORT = (WINDOW[0], WINDOW[1][:1], *WINDOW[2:])
 
 
+class Nothing(vg.AbstractKernel):
+    """Its author forgot to return."""
+
+    def rho(self, s: jax.Array) -> Any:
+        """Of squared residuals."""
+
+
 def save_turned(file: Path) -> None:
     """The two in each other's place."""
     problem, state, index = SCENE.pack()
@@ -178,6 +185,7 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ),
     ("`load_problem` of an empty name", lambda _: vg.load_problem("")),
     ("`load_problem` of whole numbers", lambda _: vg.load_problem("no.npz", dtype="int32")),
+    ("`pack` with a kernel that gives nothing", lambda _: SCENE.pack(kernel=Nothing())),
     ("`save_problem` without its index", lambda made: vg.save_problem(made / "p.npz", *SCENE.pack()[:2], None)),
     ("`save_problem` of a state and a problem", lambda made: save_turned(made / "p.npz")),
     ("`save_problem` to a number", lambda _: vg.save_problem(1, *SCENE.pack())),
