@@ -35,7 +35,11 @@ def test_frames_come_in_their_order_where_the_list_says_what_each_took(tmp_path:
     assert [int(frame.name[-9:-4]) for frame in frames] == list(range(COUNT))
     np.testing.assert_allclose(np.diff([frame.timestamp for frame in frames]), 1 / 30)
     assert [frame.depth[3, 7] for frame in frames[:2]] == pytest.approx([1.007, 1.017])
-    with pytest.warns(InputWarning, match="sorted by time"):  # whoever asks for that reader gets it
+    # Whoever asks for that reader gets it, and a word about such times.
+    with (
+        pytest.warns(InputWarning, match="sorted by time"),
+        pytest.warns(InputWarning, match="more than 1000 a second"),
+    ):
         assert type(open_sequence(folder, kind="tum")).__name__ == "TumRgbd"
 
 
