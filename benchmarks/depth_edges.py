@@ -2,8 +2,10 @@
 
     D=../shared/data
     .venv/bin/python benchmarks/depth_edges.py $D/corridor-office $D/building-walk $D/icl-office $D/redkitchen
+    .venv/bin/vggtgeo simulate corridor -o runs/corridor --frames 60 --size 320x240    # a simulated scene
+    .venv/bin/python benchmarks/depth_edges.py runs/corridor
 
-A row for each 40 frames of a clip: the mean share of other places where edges fit as well
+A row for each 40 frames of a clip: by how much edges lie elsewhere
 (`vggtgeo/slam/trust/edges.py`, which tells of more than 0.3), of the frames as they are, with pictures that are
 mirrored, or moved by an editor's stabiliser, and with depth of three frames before.
 """

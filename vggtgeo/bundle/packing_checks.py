@@ -52,15 +52,15 @@ def check_kernel(name: str, kernel: Any) -> None:
     if kernel is None or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(kernel)):
         return
     check_width(name, kernel)
-    zero, several = jnp.zeros(()), jnp.zeros(2)
-    found = kernel.rho(several)
-    if not isinstance(found, jax.Array) or found.shape != several.shape:
+    zeros = jnp.zeros(2)
+    found = kernel.rho(zeros)
+    if not isinstance(found, jax.Array) or found.shape != zeros.shape:
         what = getattr(found, "shape", type(found).__name__)
         raise InputError(
             f"`rho` of `{name}`, of type `{type(kernel).__name__}`, gives {what} for an array of 2; expected an array "
             "of the same shape"
         )
-    value, slope = np.asarray(kernel.rho(zero)), np.asarray(kernel.weight(zero))
+    value, slope = np.asarray(found)[0], np.asarray(kernel.weight(zeros))[0]
     if not (np.allclose(value, 0, atol=UNIT) and np.allclose(slope, 1, atol=UNIT)):
         raise InputError(
             f"`{name}` of type `{type(kernel).__name__}` has rho(0) = {value} and rho'(0) = {slope}; they must be "

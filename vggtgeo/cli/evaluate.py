@@ -54,11 +54,11 @@ def evaluate(
     from vggtgeo.evaluation.alignment import AXES
     from vggtgeo.evaluation.resemblance import warn_of_strangers
 
-    true, metres = load_truth(truth)
-    found, scale = load_estimate(estimate, true), load_scale(estimate)
-    report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
-    metric = metres is not False and scale is not None and scale.startswith("metric")
     with collected_warnings() as warned:
+        true, metres = load_truth(truth)
+        found, scale = load_estimate(estimate, true), load_scale(estimate)
+        report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
+        metric = metres is not False and scale is not None and scale.startswith("metric")
         meaningless = warn_of_strangers(found, true, max_dt, metric)
     if as_json:
         known = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}

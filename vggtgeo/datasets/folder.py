@@ -278,8 +278,7 @@ def enlarged(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray
     (rows, columns), (width, height) = depth.shape, size
     if (rows, columns) == (height, width):
         return depth
-    off = abs(columns * height / width - rows)
-    if off >= max(1.0, _SAME_SHAPE * rows) or not width / MOST_ENLARGED <= columns <= width * MOST_ENLARGED:
+    if not _has_the_shape(depth, width, height) or columns > width * MOST_ENLARGED:
         raise InputError(
             _other_size(path, depth, width, height) + ": no such size of the same view; register the depth to the "
             "images, or leave it out with --rgb-only"
@@ -289,8 +288,14 @@ def enlarged(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray
 
 def _is_of_fewer_pixels(depth: np.ndarray, width: int, height: int) -> bool:
     """Whether depth [h, w] has the shape of images of this size, to a pixel, in fewer: that of a phone's LiDAR."""
+    return depth.shape[1] < width and _has_the_shape(depth, width, height)
+
+
+def _has_the_shape(depth: np.ndarray, width: int, height: int) -> bool:
+    """Whether depth [h, w] has the shape of images of this size, to a row or a hundredth, and not hardly any pixels."""
     rows, columns = depth.shape
-    return width / MOST_ENLARGED <= columns < width and abs(columns * height / width - rows) < 1
+    alike = abs(columns * height / width - rows) < max(1.0, _SAME_SHAPE * rows)
+    return alike and columns * MOST_ENLARGED >= width
 
 
 def _spread(files: Sequence[FrameFile]) -> list[FrameFile]:

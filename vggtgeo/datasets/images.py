@@ -129,7 +129,8 @@ def tell_of_unread(folder: Path, images: list[Path]) -> None:
     """
     read = {image.stem for image in images}
     files = [path for path in folder.iterdir() if path.is_file()]
-    other = [path for path in files if path.suffix.lower() in OTHER_PICTURES and path.stem.lstrip(".") not in read]
+    shown = [path for path in files if path.name[0] != "."]
+    other = [path for path in shown if path.suffix.lower() in OTHER_PICTURES and path.stem not in read]
     partial = [
         path
         for path in files
@@ -138,7 +139,7 @@ def tell_of_unread(folder: Path, images: list[Path]) -> None:
         and Path(path.stem.lstrip(".")).stem not in read
     ]
     for found, what in (
-        ([path for path in other if path.name[0] != "."], "of a kind that is not read: convert to PNG or JPEG"),
+        (other, "of a kind that is not read: convert to PNG or JPEG"),
         (partial, "not here, or not whole: wait for the copy"),
     ):
         if found:
