@@ -13,7 +13,7 @@ picture and depth have nothing in common.
 
 Mean over 40 frames, every third of them, in 23 pieces of the four clips (`benchmarks/depth_edges.py`): at most 0.19,
 and 0.02 with many edges; six simulated scenes at most 0.23. Pictures that are blurred, noisy, dark or compressed and
-depth that is noisy or coarse change it by less than 0.10; half of them covered, up to 0.32. With the picture mirrored
+depth that is noisy or coarse raise it by at most 0.03; half of them covered, up to 0.33. With the picture mirrored
 0.24 to 0.65, stabilised 0.37 to 0.95 but for three pieces of a camera that moves slowly (0.13 to 0.30), with depth of
 three frames before 0.33 to 0.90 but for two (0.14, 0.19), of one frame before in redkitchen 0.02 to 0.26. By the share
 alone it was 0.01 to 0.42 in redkitchen and icl-office when stabilised, whose path was 4.7 cm off in 50 frames of
