@@ -193,7 +193,11 @@ def test_a_part_of_a_drive_of_kitti_keeps_its_times_and_its_truth(tmp_path: Path
     (drive / "times.txt").unlink()
     assert [frame.timestamp for frame in tiny.quietly_opened(drive).frames()] == pytest.approx([0, 0.2, 0.4])
     (tmp_path / "dataset/poses/07.txt").write_text("\n".join(poses[:5]))
-    assert tiny.quietly_opened(drive).ground_truth().timestamps == pytest.approx([0, 0.2])
+    with pytest.warns(InputWarning, match=r"1 of 3 images, .* up to 5 .* its end \(poses: 5\)"):
+        assert tiny.quietly_opened(drive).ground_truth().timestamps == pytest.approx([0, 0.2])
+    (drive / "times.txt").write_text("".join(f"{0.1 * number}\n" for number in range(5)))
+    with pytest.raises(InputError, match="3 images, by their numbers up to 5 .* and 5 times"):
+        tiny.quietly_opened(drive)
 
 
 def test_a_part_of_a_room_of_replica_keeps_its_truth(tmp_path: Path) -> None:
@@ -205,6 +209,9 @@ def test_a_part_of_a_room_of_replica_keeps_its_truth(tmp_path: Path) -> None:
     part = tiny.quietly_opened(room)
     assert [frame.timestamp for frame in part.frames()] == pytest.approx([0, 1 / 30])
     np.testing.assert_allclose(part.ground_truth().poses, whole.poses[1:])
+    (room / "traj.txt").write_text(lines[0] + "\n")  # cut: it is not that of the first image that is there
+    with pytest.warns(InputWarning, match="2 of 2 images, .* and have no truth"):
+        assert tiny.quietly_opened(room).ground_truth() is None
     (room / "traj.txt").write_text("\n".join(lines[1:]) + "\n")  # of the images that are there alone
     np.testing.assert_allclose(tiny.quietly_opened(room).ground_truth().poses, whole.poses[1:])
 

@@ -41,9 +41,9 @@ def camera_of(path: Path, infos: Mapping[str, Sequence[Any]], colour: str, size:
                 found = " or ".join(f"{width} x {height}" for width, height in sorted(sizes))
                 _warn(f"{where} has a camera for {found} pixels; the images are {size[0]} x {size[1]}: not used")
             continue
-        if not _matrix(first).any():  # as the message's definition has it
+        if not _matrix(first)[0, 0]:  # as the message's definition has it
             if beside:
-                _warn(f"{where} says that the camera is not calibrated (all zeros): not used")
+                _warn(f"{where} says that the camera is not calibrated (its focal length is 0): not used")
             continue
         if not beside:
             _warn(f"{where} is taken for the camera of `{colour}`; give --intrinsics fx,fy,cx,cy if it is another's")

@@ -53,7 +53,10 @@ class Kitti(FolderSequence):
         times = _times(folder, place)
         rows = rows_of(images[place], len(times) if times else None)
         if times and max(rows) >= len(times):
-            raise InputError(f"`{folder}` has {len(rows)} images and {len(times)} times")
+            raise InputError(
+                f"`{folder}` has {len(rows)} images, by their numbers up to {max(rows)} counted from 0, and "
+                f"{len(times)} times; give those of the whole drive"
+            )
         every = [times[row] if times else (row - rows[0]) / RATE for row in rows]
         files = tuple(FrameFile(index, *pair) for index, pair in enumerate(zip(every, images[place], strict=True)))
         width, height = common_size(str(folder), files)

@@ -79,8 +79,16 @@ def trajectory_of(
 def trajectory_of_rows(
     times: Sequence[float], rows: Sequence[int], poses: np.ndarray, where: Path
 ) -> Trajectory | None:
-    """The same of images whose poses are those lines of a file; images beyond its end have none."""
+    """The same of images whose poses are those lines of a file; images beyond its end have none, with an InputWarning."""
     there = [place for place, row in enumerate(rows) if row < len(poses)]
+    beyond = len(rows) - len(there)
+    if beyond and len(poses):
+        warnings.warn(
+            f"`{where}`: {beyond} of {len(rows)} images, by their numbers up to {max(rows)} counted from 0, are beyond "
+            f"its end (poses: {len(poses)}) and have no truth",
+            InputWarning,
+            stacklevel=3,
+        )
     return trajectory_of([times[place] for place in there], poses[[rows[place] for place in there]], where)
 
 

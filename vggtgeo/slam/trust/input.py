@@ -25,8 +25,9 @@ def check_refusals(refusals: Mapping[str, Refusals]) -> tuple[Finding, ...]:
         Finding(
             "network",
             "degraded",
-            f"the network of {role} answered {counts.without} of {counts.asked} times with nothing that can be, and "
-            f"{counts.refused} of {counts.values} values were out of bounds: they were left out",
+            f"the network of {role} answered {counts.without} of {counts.asked} times with nothing that can be used"
+            + (f", and {counts.refused} of {counts.values} values were out of bounds" if counts.values else "")
+            + ": left out",
         )
         for role, counts in refusals.items()
         if counts.share > MOST_REFUSED
