@@ -1,6 +1,7 @@
 """The camera of a folder: in a file of any name, in what a renamed folder says of itself, in `transforms.json`."""
 
 import json
+import warnings
 import shutil
 from pathlib import Path
 
@@ -67,9 +68,20 @@ def test_the_camera_of_an_export_of_record3d(tmp_path: Path) -> None:
     size = {"w": tiny_sequences.WIDTH, "h": tiny_sequences.HEIGHT}
     (folder / "metadata.json").write_text(json.dumps({**size, "fps": 60, "K": matrix}))
     assert open_sequence(folder).camera == Camera(tiny_sequences.INTRINSICS, *size.values())
-    for other in ({"w": 80, "h": 60, "K": matrix}, {**size, "K": "none"}, {**size, "K": [matrix] * 9}, [1, 2], None):
-        (folder / "metadata.json").write_text("no JSON" if other is None else json.dumps(other))
+    for other in ({"w": 80, "h": 60, "K": matrix}, size, [1, 2]):
+        (folder / "metadata.json").write_text(json.dumps(other))
         assert not tiny.quietly_opened(folder).camera.known
+    for other, told in (
+        ({**size, "K": "none"}, "no matrix"),
+        ({**size, "K": [matrix] * 9}, "no matrix"),
+        (None, "JSON"),
+    ):
+        (folder / "metadata.json").write_text('{"w": 40, "K": [' if other is None else json.dumps(other))
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            assert not open_sequence(folder).camera.known
+        about = [str(warning.message) for warning in warned if "metadata.json" in str(warning.message)]
+        assert [told in text and "not used" in text for text in about] == [True]
 
 
 @pytest.mark.parametrize(

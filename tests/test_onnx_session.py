@@ -85,6 +85,17 @@ def test_an_operator_that_is_not_known_is_named(
         read_signature(tmp_path / "net.onnx")
 
 
+@pytest.mark.parametrize(("opset", "layout", "named"), [(99, 9, r"\(opset of ai.onnx\) 99"), (17, 99, r"\(IR\) 99")])
+def test_a_newer_file_is_no_damaged_one(opset: int, layout: int, named: str, tmp_path: Path) -> None:
+    """What is newer is named, with the newest that is known, as fetching it again would mend nothing."""
+    value = lambda name: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3])
+    graph = helper.make_graph([helper.make_node("Relu", ["image"], ["y"])], "tiny", [value("image")], [value("y")])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=layout)
+    onnx.save(model, tmp_path / "net.onnx")
+    with pytest.raises(NetworkFileError, match=rf"{named}, and onnxruntime \S+ reads up to \d+; export it again"):
+        read_signature(tmp_path / "net.onnx")
+
+
 def _truncated(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 

@@ -42,6 +42,17 @@ def test_a_run_that_never_began_has_failed(healthy: Walk) -> None:
     assert [f.level for f in check_record(replace(healthy.estimate, started=False))] == ["failed"]
 
 
+def test_a_single_frame_is_no_run(healthy: Walk) -> None:
+    """Nothing was compared with it, unless it was found in a map; two frames were."""
+    first = lambda count: replace(
+        healthy.estimate,
+        **{name: getattr(healthy.estimate, name)[:count] for name in ("frames", "times", "poses", "tracked")},
+    )
+    assert [f.level for f in check_record(first(1))] == ["degraded"]
+    assert not check_record(replace(first(1), in_known_map=True))
+    assert not check_record(first(2))
+
+
 def test_a_run_that_is_found_nowhere_in_a_map_says_so(healthy: Walk) -> None:
     """In a known map the reason is that no frame, or one alone, was found there; oracle: the sentence."""
     for found, word in ((0, "none"), (1, "1")):

@@ -308,6 +308,12 @@ def _why_not_opened(path: Path, message: str) -> str:
             f"`{path}` uses the operator `{unknown}`, which onnxruntime {onnxruntime.__version__} does not know; "
             "export it again with standard operators, or update onnxruntime"
         )
+    if newer := _newer_version(reason):
+        kind, found, known = newer
+        return (
+            f"`{path}` is of {kind} {found}, and onnxruntime {onnxruntime.__version__} reads up to {known}; "
+            "export it again with an older one, or update onnxruntime"
+        )
     reason = f"onnxruntime: {reason if len(reason) < 200 else '... ' + reason[-200:]}"
     if "xternal" in message and ("data" in message or "initializer" in message):
         return (
@@ -318,6 +324,15 @@ def _why_not_opened(path: Path, message: str) -> str:
         f"`{path}` is not an ONNX file that can be read: expected a whole one, found {path.stat().st_size} bytes that "
         f"are cut off or something else; export or fetch it again ({reason})"
     )
+
+
+def _newer_version(message: str) -> tuple[str, str, str] | None:
+    """Of an error that says that a file is newer than what is known: of what version, its own, and the newest known."""
+    operators = re.search(r"Opset (\d+) is under development.* domain (\S+) is till opset (\d+)", message)
+    if operators:
+        return f"the operators' version (opset of {operators[2]})", operators[1], operators[3]
+    layout = re.search(r"Unsupported model IR version: (\d+), max supported IR version: (\d+)", message)
+    return ("the layout's version (IR)", layout[1], layout[2]) if layout else None
 
 
 def _unknown_operator(message: str) -> str | None:

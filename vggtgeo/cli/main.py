@@ -20,7 +20,7 @@ from vggtgeo.cli.address_space import check_address_space
 from vggtgeo.cli.jax_flags import check_cache, check_jit, check_xla_flags, set_jax_flags
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.streams import exit_code, use_lasting_streams, use_readable_width
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.interruption import end_on_signals, ignore_signals
 from vggtgeo.io.jax_environment import jax_environment
 from vggtgeo.io.one_line import one_line
@@ -352,7 +352,7 @@ def main() -> None:
 
 
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
-    """A way to show warnings: those about the user's input in one line, all others as before."""
+    """A way to show warnings: those for the user, of the input say, in one line, all others as before."""
 
     def show(
         message: Warning | str,
@@ -362,7 +362,7 @@ def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
         file: TextIO | None = None,
         line: str | None = None,
     ) -> None:
-        if issubclass(category, InputWarning):
+        if issubclass(category, UserWarning):
             print(f"warning: {one_line(str(message))}", file=file or sys.stderr)
         else:
             show_others(message, category, filename, lineno, file, line)

@@ -96,16 +96,21 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
 
 
 def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
-    """The camera of `metadata.json` beside the images of an export of Record3D; None where that is another's file."""
+    """The camera of `metadata.json` beside the images of an export of Record3D; None where that is another's file, or
+    with an InputWarning one that cannot be read or has no camera where it should.
+    """
     file = folder / "metadata.json"
     try:
         content = read_json(file) if file.is_file() else None
-    except InputError:
+    except InputError as error:
+        warnings.warn(f"{error}: not used", InputWarning, stacklevel=5)
         return None
     if not isinstance(content, dict) or not same_size((content.get("w"), content.get("h")), (width, height)):
         return None
     values = record3d_intrinsics(content)
     if values is None:
+        if "K" in content:
+            warnings.warn(f"`{file}`: its `K` is no matrix of a camera: not used", InputWarning, stacklevel=5)
         return None
     camera = Camera(intrinsics_of(file, values), width, height)
     check_plausible(f"`{file}`", camera)

@@ -89,6 +89,8 @@ def trajectory_of_rows(
             InputWarning,
             stacklevel=3,
         )
+        if not there:
+            return None
     return trajectory_of([times[place] for place in there], poses[[rows[place] for place in there]], where)
 
 

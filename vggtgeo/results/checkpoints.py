@@ -37,6 +37,9 @@ from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_st
 from vggtgeo.slam.trust.evidence import EvidenceSoFar, FrameEvidence
 from vggtgeo.slam.window.window_recorder import WindowRecord
 
+_BEFORE, _SHOWN = 30, 110
+"""Letters of a long setting that are shown, and those of them that lie before where it is another one."""
+
 
 @dataclass(frozen=True)
 class Checkpoints:
@@ -160,8 +163,9 @@ def resumed(asked: Checkpoints | None, wanted: Mapping[str, str]) -> RunSoFar | 
     for name in {**known, **wanted}:
         before, now = known.get(name), wanted.get(name)
         if before != now:
+            was, has = _where_they_differ(before, now)
             raise InputError(
-                f"`{asked.path}` is of a run with `{name}` {_short(before)}, and this one has {_short(now)}: give the "
+                f"`{asked.path}` is of a run with `{name}` {was}, and this one has {has}: give the "
                 "same, or begin anew with `--no-resume`"
             )
     try:
@@ -189,8 +193,17 @@ def _facts(path: Path) -> dict[str, Any]:
     return found
 
 
-def _short(value: str | None) -> str:
-    return "nothing" if value is None else f"{value[:80]}..." if len(value) > 80 else value
+def _where_they_differ(before: str | None, now: str | None) -> tuple[str, str]:
+    """Both texts; of long ones the part where they first differ, so that it does not lie in what is cut away."""
+    same = next((at for at, (a, b) in enumerate(zip(before or "", now or "", strict=False)) if a != b), 0)
+    start = max(same - _BEFORE, 0)
+    return _cut(before, start), _cut(now, start)
+
+
+def _cut(value: str | None, start: int) -> str:
+    if value is None or len(value) <= _SHOWN:
+        return "nothing" if value is None else value
+    return f"{'...' * (start > 0)}{value[start : start + _SHOWN]}{'...' * (start + _SHOWN < len(value))}"
 
 
 def frames_kept(path: Path) -> str:

@@ -33,6 +33,9 @@ def check_record(estimate: Estimate) -> list[Finding]:
     if not estimate.started or (len(estimate) > 2 and np.count_nonzero(estimate.tracked) <= 1):
         return [Finding("start", "failed", _never_began(estimate))]
     found = []
+    if len(estimate) == 1 and not estimate.in_known_map:
+        text = "the run is of one frame: there is nothing that its pose and its map could be checked by"
+        found.append(Finding("start", "degraded", text))
     stretches = spans(~estimate.tracked)
     serious = 1 - share > MOST_LOST or bridging_error(estimate) > MOST_BRIDGED
     for first, last in stretches:
