@@ -38,6 +38,12 @@ def backwards(name: str, head: int = 0) -> Callable[[Path], None]:
     return change
 
 
+def later_images(folder: Path) -> None:
+    """A room's images from the second on, and the pose of its first one."""
+    (folder / "results/frame000000.jpg").unlink()
+    (folder / "traj.txt").write_text((folder / "traj.txt").read_text().splitlines()[0] + "\n")
+
+
 def listed(change: Callable[[str], str], file: str = "rgb.txt") -> Callable[[Path], Path]:
     """A TUM folder with a changed list."""
     return bad.rgbd(lambda folder: (folder / file).write_text(change((folder / file).read_text())))
@@ -91,6 +97,8 @@ LISTS = rows(
         ("truth that is a pipe", bad.rgbd(pipe_for("groundtruth.txt")), OPENED),
         ("poses of ARKitScenes out of order", recorded(layouts.arkit, backwards("lowres_wide.traj")), OPENED),
         ("poses of Stray Scanner out of order", recorded(layouts.stray, backwards("odometry.csv", 1)), OPENED),
+        ("Stray Scanner without its poses", recorded(layouts.stray, lambda made: (made / "odometry.csv").unlink())),
+        ("poses of Replica that are cut before the images", recorded(layouts.replica, later_images), OPENED),
         (
             "an alignment of Tanks and Temples that shears",
             recorded(layouts.tanks, bad.write("scan_trans.txt", "1 5 0 0 0 1 0 0 0 0 1 0 0 0 0 1")),

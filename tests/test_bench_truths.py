@@ -81,6 +81,21 @@ def test_a_scene_of_tanks_and_temples_is_compared_with_its_scan(tmp_path: Path) 
     assert "f_score" not in measured(_result(own.trajectory(truth), own.points(made), metric=False), unknown, spec)
 
 
+def test_a_reference_is_read_before_the_run(tmp_path: Path) -> None:
+    # Proves that one that is not there is found before hours of work, and one that is has its error. Oracle: by hand,
+    # as a path of twice the size fits after Sim(3).
+    folder = tiny.tanks(tmp_path / "Ignatius", _walk())
+    line = 'references = { twice = "twice.txt" }'
+    with pytest.raises(InputError, match=r"twice\.txt"):
+        _given(folder, line)
+    truth = _given(folder, "")[0].truth
+    assert truth is not None
+    Similarity(np.eye(3), np.zeros(3), 2.0).trajectory(truth).save_tum(folder / "twice.txt")
+    given, spec = _given(folder, line)
+    row = measured(_result(truth, np.zeros((1, 3)), metric=False), given, spec)
+    assert row["ate_sim3_twice_m"] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_thinned_keeps_one_point_of_a_cube() -> None:
     # Proves that dense parts weigh no more than others. Oracle: by hand.
     points = np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [1.1, 0.1, 0.1], [-0.1, 0.1, 0.1]])

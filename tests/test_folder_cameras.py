@@ -1,8 +1,8 @@
 """The camera of a folder: in a file of any name, in what a renamed folder says of itself, in `transforms.json`."""
 
 import json
-import warnings
 import shutil
+import warnings
 from pathlib import Path
 
 import numpy as np

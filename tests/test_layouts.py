@@ -196,7 +196,7 @@ def test_a_part_of_a_drive_of_kitti_keeps_its_times_and_its_truth(tmp_path: Path
     with pytest.warns(InputWarning, match=r"1 of 3 images, .* up to 5 .* its end \(poses: 5\)"):
         assert tiny.quietly_opened(drive).ground_truth().timestamps == pytest.approx([0, 0.2])
     (drive / "times.txt").write_text("".join(f"{0.1 * number}\n" for number in range(5)))
-    with pytest.raises(InputError, match="3 images, by their numbers up to 5 .* and 5 times"):
+    with pytest.raises(InputError, match=r"3 images, by their numbers up to 5 .* and 5 times"):
         tiny.quietly_opened(drive)
 
 

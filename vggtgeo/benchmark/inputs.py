@@ -7,7 +7,7 @@ import json
 import os
 import pickle
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +73,7 @@ def _is_there(path: Path) -> bool:
 class Input:
     """sequence: what the run reads. perception: who looks at it. exact: the depth and poses that its surfaces are known
     by, of a walk that is read as it was rendered, or of a recording whose depth is exact. scan: of a scene that was
-    scanned, too. simulated: nothing was recorded.
+    scanned, too. simulated: nothing was recorded. references: other truths, by their names.
     """
 
     sequence: Sequence
@@ -81,6 +81,7 @@ class Input:
     exact: ExactFrames | None = None
     scan: TanksAndTemples | None = None
     simulated: bool = False
+    references: Mapping[str, Trajectory] = field(default_factory=dict)
 
     @property
     def truth(self) -> Trajectory | None:
@@ -98,9 +99,11 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
         sequence = _without(recorded, spec)
         exact = RecordedFrames.of(recorded) if spec["exact_depth"] else None
         scan = recorded if isinstance(recorded, TanksAndTemples) else None
+        # What is wrong with these would be found behind the run, which may take hours.
         if scan is not None:
-            scan.scanned_points()  # what is wrong with it would be found behind the run, which may take hours
-        return Input(sequence, _perceived(spec, sequence.has_depth), exact, scan)
+            scan.scanned_points()
+        references = {name: Trajectory.load_tum(Path(spec["path"]) / file) for name, file in spec["references"].items()}
+        return Input(sequence, _perceived(spec, sequence.has_depth), exact, scan, references=references)
     rendered = _rendered(spec["simulate"], seed, scratch)
     if spec["perception"] == "simulated":
         if spec["degrade"] != "base":

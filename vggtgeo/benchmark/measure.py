@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,8 +45,7 @@ def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str,
     if truth is not None:
         errors, alignment = trajectory_errors(estimate, truth, result.metric, vertical=spec["vertical"])
         row |= errors
-    for name, file in spec["references"].items():
-        reference = Trajectory.load_tum(Path(spec["path"]) / file)
+    for name, reference in given.references.items():
         found, _ = trajectory_errors(estimate, reference, metric=False)
         row[f"ate_sim3_{name}_m"] = found.get("ate_sim3_m")
     if truth is not None and alignment is not None:

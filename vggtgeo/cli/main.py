@@ -293,7 +293,13 @@ def _usage_message(error: Any, command: str) -> str:
     that the error itself knows.
     """
     message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
-    command = error.ctx.command_path if error.ctx is not None else command
+    if error.ctx is not None:
+        command = error.ctx.command_path
+        in_use = error.ctx.params.get("settings")
+        parameter = getattr(error, "param", None)
+        source = parameter and error.ctx.get_parameter_source(parameter.name)
+        if source is not None and source.name == "DEFAULT_MAP" and getattr(in_use, "file", None):
+            message = f"`{in_use.file}`: {message}"
     return f"{message} (see `{command} --help`)"
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vggtgeo.cli.settings_file import SettingsInUse
+from vggtgeo.io.errors import InputError
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import Tables, parsed, updated
 
@@ -31,4 +32,17 @@ def pipeline_settings(in_use: SettingsInUse | None, assignments: Iterable[str], 
     for tables in layers:
         for group, values in tables.items():
             together[group] = {**together.get(group, {}), **values}
-    return updated(SlamSettings(), together)
+    try:
+        return updated(SlamSettings(), together)
+    except InputError:
+        if in_use is not None and in_use.tables:
+            _check_tables(in_use)
+        raise
+
+
+def _check_tables(in_use: SettingsInUse) -> None:
+    """InputError that names the file where it is the file's own tables that are wrong."""
+    try:
+        updated(SlamSettings(), in_use.tables)
+    except InputError as error:
+        raise InputError(f"`{in_use.file}`: {error}") from None

@@ -39,6 +39,7 @@ class SettingsInUse:
     """The command's context."""
     tables: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """The file's tables, by the names of group and field."""
+    file: Path | None = None
 
     def values(self) -> dict[str, Any]:
         """Each flag and argument by its key, in the order of the help; None where not set."""
@@ -60,7 +61,7 @@ def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
     tables = {key: value for key, value in given.items() if piped and isinstance(value, dict)}
     flags = {key: value for key, value in given.items() if key not in tables}
     context.default_map = _checked(path, _affirmed(path, flags, context), _keys(context), _types(context), piped)
-    return SettingsInUse(context, tables)
+    return SettingsInUse(context, tables, path)
 
 
 def _settings_by_group() -> dict[str, list[str]]:

@@ -38,6 +38,8 @@ LARGEST = 960
 _LEAST_CONFIDENCE = 1
 """Of 0 (low), 1 and 2."""
 _CONFIDENCE = "confidence"
+_LISTS = "odometry.csv", "camera_matrix.csv"
+"""What Stray Scanner writes beside the video."""
 _MOST_DELAY = 0.02
 
 
@@ -54,12 +56,18 @@ class StrayScanner:
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `rgb.mp4` and `odometry.csv`."""
-        return (folder / "rgb.mp4").is_file() and (folder / "odometry.csv").is_file()
+        """Whether `folder` has `rgb.mp4` and one of the app's two lists; without the other it is a damaged recording."""
+        return (folder / "rgb.mp4").is_file() and any((folder / name).is_file() for name in _LISTS)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Opens the video; images are reduced to at most 960 pixels, by a whole number."""
+        absent = [folder / name for name in _LISTS if not (folder / name).is_file()]
+        if absent:
+            raise InputError(
+                f"`{absent[0]}` is missing, which Stray Scanner writes beside `rgb.mp4`: copy the whole recording, or "
+                "give `rgb.mp4` alone, as a video"
+            )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)  # the video alone has no intrinsics; the folder has
             video = VideoFile.open(folder / "rgb.mp4")

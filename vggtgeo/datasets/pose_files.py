@@ -79,7 +79,7 @@ def trajectory_of(
 def trajectory_of_rows(
     times: Sequence[float], rows: Sequence[int], poses: np.ndarray, where: Path
 ) -> Trajectory | None:
-    """The same of images whose poses are those lines of a file; images beyond its end have none, with an InputWarning."""
+    """The same of images whose poses are those lines of a file. Those beyond its end have none: an InputWarning."""
     there = [place for place, row in enumerate(rows) if row < len(poses)]
     beyond = len(rows) - len(there)
     if beyond and len(poses):

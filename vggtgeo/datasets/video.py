@@ -127,7 +127,7 @@ class VideoFile:
         wanted = self.count if end is None else min(end, self.count)
         if index < wanted:
             counts = f"ends after {index} frames; its header says {self.count}"
-            text = f"`{self.name}` {counts}: is the file cut off, or damaged?"
+            text = f"`{self.name}` {counts}: is the file cut off, or damaged, or was it trimmed?"
             _warn(InputWarning(text))  # not as left out: where the rate varies, the header of an MKV only guesses
 
     @contextmanager

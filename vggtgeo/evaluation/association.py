@@ -54,7 +54,7 @@ def associate(
         estimate_rows, truth_rows = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)
         times = estimate.timestamps[estimate_rows]
     if len(times) == 0:
-        raise InputError(f"no pose of the two trajectories matches within {max_dt:g} s: {_spans(estimate, truth)}")
+        raise InputError(f"no pose of the two trajectories matches within {max_dt:g} s: {spans(estimate, truth)}")
     return Trajectory(times, estimate.poses[estimate_rows]), Trajectory(times, truth.poses[truth_rows])
 
 
@@ -64,7 +64,8 @@ def check_trajectories(estimate: Trajectory, truth: Trajectory) -> None:
         check_kind(name, given, Trajectory, "a `Trajectory`, such as `Trajectory.load_tum` gives")
 
 
-def _spans(estimate: Trajectory, truth: Trajectory) -> str:
+def spans(estimate: Trajectory, truth: Trajectory) -> str:
+    """From when to when both are, seconds, and what to do where they do not match."""
     parts = []
     for name, trajectory in (("`estimate`", estimate), ("`truth`", truth)):
         times = trajectory.timestamps

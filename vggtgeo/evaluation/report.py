@@ -7,7 +7,7 @@ import numpy as np
 
 from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
 from vggtgeo.evaluation.alignment import VERTICAL
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check_trajectories
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check_trajectories, spans
 from vggtgeo.evaluation.relative import RelativeError, Unit, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -130,8 +130,8 @@ def evaluate_trajectory(
     matched, reference = associate(estimate, truth, max_dt)
     if len(matched) < MINIMUM_MATCHES:
         raise InputError(
-            f"{len(matched)} poses match within {max_dt:g} s; at least {MINIMUM_MATCHES} are needed: allow a "
-            "larger `max_dt`, or give longer trajectories"
+            f"{len(matched)} poses match within {max_dt:g} s; at least {MINIMUM_MATCHES} are needed: "
+            f"{spans(estimate, truth)}"
         )
     sim3 = absolute_error(matched, reference, "sim3")
     compared = {"estimate": matched, "truth": reference}
