@@ -56,7 +56,7 @@ class StrayScanner:
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `rgb.mp4` and one of the app's two lists; without the other it is a damaged recording."""
+        """Whether `folder` has `rgb.mp4` and one of the two lists; without the other it is a damaged recording."""
         return (folder / "rgb.mp4").is_file() and any((folder / name).is_file() for name in _LISTS)
 
     @classmethod
