@@ -187,3 +187,11 @@ def test_a_step_over_missing_frames_may_be_larger() -> None:
     assert check_enlargements(late(5), over(1.4)) == []
     assert len(check_enlargements(late(0), over(1.4))) == 1
     assert len(check_enlargements(late(1), over(1.7))) == 1
+
+
+def test_many_are_one_sentence() -> None:
+    """Each third depth image in another unit gave thirty reasons that hid the others; oracle: the sentence."""
+    estimate = walk(count=40).estimate
+    (found,) = check_enlargements(estimate, np.where(np.arange(40) % 3 == 1, np.log(0.1), 0.0))
+    assert found.text.startswith("frames 0 to 1: the whole picture is 0.10 times as large at once, and so on, 13 times")
+    assert "is their depth in another unit?" in found.text

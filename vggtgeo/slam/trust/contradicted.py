@@ -76,8 +76,8 @@ WRONG_START = (
     "without depth a map may begin wrongly, of a wall above all: begin at another frame (`--start`), or give depth"
 )
 WRONG_DEPTH = (
-    "depth that does not belong to these images makes such poses, or a calibration that does not: look at the depth "
-    "images, or leave them out (`--rgb-only`)"
+    "depth that does not belong to these images makes such poses, or a calibration that does not (look at the depth "
+    "images, or leave them out: `--rgb-only`); or a screen, a reflection, or blended frames make such matches"
 )
 
 

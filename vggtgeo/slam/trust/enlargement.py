@@ -15,7 +15,7 @@ import numpy as np
 
 from vggtgeo.models.classical import SiftMatcher
 from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.finding import Finding
+from vggtgeo.slam.trust.finding import MOST_NAMED, Finding
 
 MOST = 0.2
 """Logarithm of the factor, its own and beyond that of either neighbour; as many times that as a step takes longer than
@@ -103,12 +103,15 @@ def check_enlargements(estimate: Estimate, enlarged: np.ndarray) -> list[Finding
     # A camera goes farther where frames are missing.
     taken = np.append(0.0, np.diff(estimate.times))
     most = MOST * np.maximum(taken / max(float(np.median(taken[1:])), 1e-9), 1.0)
-    found = []
-    for row in np.flatnonzero(apart > most):
-        first, last = int(estimate.frames[row - 1]), int(estimate.frames[row])
-        text = (
-            f"frames {first} to {last}: the whole picture is {np.exp(enlarged[row]):.2f} times as large at once: was "
-            "the lens changed, or are frames out of order? One focal length is assumed for all"
-        )
-        found.append(Finding("calibration", "degraded", text))
-    return found
+    rows = np.flatnonzero(apart > most)
+    why = "was the lens changed, or are frames out of order? One focal length is assumed for all"
+    if estimate.metric:
+        why = "was the lens changed, are frames out of order, or is their depth in another unit?"
+    steps = [
+        f"frames {estimate.frames[row - 1]} to {estimate.frames[row]}: the whole picture is "
+        f"{np.exp(enlarged[row]):.2f} times as large at once"
+        for row in rows
+    ]
+    if len(steps) > MOST_NAMED:
+        steps = [f"{steps[0]}, and so on, {len(steps)} times in all"]
+    return [Finding("calibration", "degraded", f"{step}: {why}") for step in steps]

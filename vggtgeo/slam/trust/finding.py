@@ -10,6 +10,8 @@ import numpy as np
 
 Level = Literal["good", "degraded", "failed"]
 LEVELS: tuple[Level, ...] = get_args(Level)
+MOST_NAMED = 5
+"""Places of one kind, stretches of lost frames say, that have a sentence each; more have one together."""
 
 
 @dataclass(frozen=True)

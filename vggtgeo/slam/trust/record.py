@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.finding import Finding, spans
+from vggtgeo.slam.trust.finding import MOST_NAMED, Finding, spans
 
 ACCELERATION = 1.0
 """m/s^2."""
@@ -21,8 +21,6 @@ MOST_BRIDGED = 0.04
 MOST_LOST = 0.10
 LEAST_TRACKED = 0.5
 """Share of frames below which the run is not to be used."""
-MOST_NAMED = 5
-"""Stretches of lost frames that have a sentence each; more have one together. The segments hold them either way."""
 
 
 def check_record(estimate: Estimate) -> list[Finding]:
