@@ -16,7 +16,7 @@ from pathlib import Path
 import onnxruntime
 
 _log = logging.getLogger(__name__)
-TOLD = 60.0
+TOLD = 15.0
 """Seconds until a call that goes on is told."""
 LONGEST = 7200.0
 """Seconds of a call. VGGT takes minutes for ten views on six processors, and work that is slow is not to be lost."""
