@@ -309,9 +309,9 @@ def _why_not_opened(path: Path, message: str) -> str:
             "export it again with standard operators, or update onnxruntime"
         )
     if newer := _newer_version(reason):
-        kind, found, known = newer
+        kind, version, newest = newer
         return (
-            f"`{path}` is of {kind} {found}, and onnxruntime {onnxruntime.__version__} reads up to {known}; "
+            f"`{path}` is of {kind} {version}, and onnxruntime {onnxruntime.__version__} reads up to {newest}; "
             "export it again with an older one, or update onnxruntime"
         )
     reason = f"onnxruntime: {reason if len(reason) < 200 else '... ' + reason[-200:]}"

@@ -11,6 +11,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn, TextIO
 
 import typer
@@ -293,14 +294,18 @@ def _usage_message(error: Any, command: str) -> str:
     that the error itself knows.
     """
     message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
-    if error.ctx is not None:
-        command = error.ctx.command_path
-        in_use = error.ctx.params.get("settings")
-        parameter = getattr(error, "param", None)
-        source = parameter and error.ctx.get_parameter_source(parameter.name)
-        if source is not None and source.name == "DEFAULT_MAP" and getattr(in_use, "file", None):
-            message = f"`{in_use.file}`: {message}"
-    return f"{message} (see `{command} --help`)"
+    command = error.ctx.command_path if error.ctx is not None else command
+    file = _settings_file(error)
+    return f"{f'`{file}`: ' if file else ''}{message} (see `{command} --help`)"
+
+
+def _settings_file(error: Any) -> Path | None:
+    """The settings file that the wrong value is from; None of one that was given as a flag."""
+    if error.ctx is None or getattr(error, "param", None) is None:
+        return None
+    source = error.ctx.get_parameter_source(error.param.name)
+    in_file = source is not None and source.name == "DEFAULT_MAP"
+    return error.ctx.params["settings"].file if in_file else None
 
 
 def _version(asked: bool) -> bool:
