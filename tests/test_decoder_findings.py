@@ -84,7 +84,7 @@ def test_answers_that_lost_some_bytes_are_computed_again(tmp_path: Path) -> None
     header[whole.index(b"\x93NUMPY")] = 0
     entry = whole.index(b"PK\x01\x02")
     header[entry + 16 : entry + 28] = bytes(12)  # its check sum and its sizes
-    grown = bytearray(whole)  # a number that is another one, in a member that is longer than the file, as the list has it
+    grown = bytearray(whole)  # another number in a member that is longer than the file by the list
     grown[whole.index(b"\x93NUMPY") + 128 + 9] ^= 0xFF
     grown[entry + 20 : entry + 28] = 2 * (0xFFFFFF).to_bytes(4, "little")
     for content in (*shortened, bytes(header), bytes(grown), b"\x93NUMPY\x01\x00\x00\x00", b"\x80\x04.", b""):
