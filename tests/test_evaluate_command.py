@@ -1,6 +1,7 @@
 """`vggtgeo evaluate`: what it prints is what the metrics say."""
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -178,6 +179,24 @@ def test_the_truth_of_another_sequence_is_no_success(tmp_path: Path, truth: Traj
     assert "ate_se3_m" in written
     assert not written["comparable"]
     assert any(said in text for text in written["warnings"])
+
+
+@pytest.mark.parametrize("inverted", [False, True], ids=["itself", "world to camera"])
+def test_a_camera_that_hardly_turns_tells_of_strangers_over_longer_times(tmp_path: Path, inverted: bool) -> None:
+    # Proves that poses of the other direction are told where a camera turns by 1 degree in a tenth of the sequence, of
+    # which rotations were not asked, and the right ones are not. Oracle: which of both was written.
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[:, 0, 3] = np.linspace(0, 2, 200)
+    poses[:, 1, 3] = 0.3 * np.sin(np.linspace(0, 3, 200))
+    poses[:, :3, :3] = Rotation.from_rotvec(np.radians(np.linspace(0, 10, 200))[:, None] * [0, 1, 0]).as_matrix()
+    times = np.arange(200) / 30
+    Trajectory(times, poses).save_tum(tmp_path / "truth.txt")
+    Trajectory(times, np.linalg.inv(poses) if inverted else poses).save_tum(tmp_path / "trajectory.txt")
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        outcome = CliRunner().invoke(app, [str(tmp_path / "trajectory.txt"), str(tmp_path / "truth.txt")])
+    assert outcome.exit_code == 0, outcome.output
+    assert [True for one in warned if "hardly turns" in str(one.message)] == [True] * inverted
 
 
 def test_an_estimate_without_scale_or_of_a_part_is_a_success(tmp_path: Path) -> None:

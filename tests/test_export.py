@@ -259,11 +259,15 @@ def test_no_export_mixes_its_images_with_those_of_a_recording(folder: Path, tmp_
     recording = tmp_path / "recording"
     (recording / "images").mkdir(parents=True)
     shutil.copy(next((folder / "images").iterdir()), recording / "images/mine.jpg")
-    with pytest.raises(vg.InputError, match=r"mine\.jpg` is an image that no export wrote"):
-        export(folder, "nerfstudio", recording)
+    for to in ("nerfstudio", "tum"):
+        with pytest.raises(vg.InputError, match="recording` is a recording; give another folder"):
+            export(folder, to, recording)
     assert [path.name for path in sorted((recording / "images").iterdir())] == ["mine.jpg"]
     for to in ("nerfstudio", "colmap", "nerfstudio"):
         export(folder, to, tmp_path / "new")
+    shutil.copy(recording / "images/mine.jpg", tmp_path / "new/images")
+    with pytest.raises(vg.InputError, match=r"mine\.jpg` is an image that no export wrote"):
+        export(folder, "nerfstudio", tmp_path / "new")
 
 
 def test_a_full_disk_leaves_the_record_of_what_exports_wrote(folder: Path, tmp_path: Path) -> None:

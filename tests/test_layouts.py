@@ -195,6 +195,11 @@ def test_a_part_of_a_drive_of_kitti_keeps_its_times_and_its_truth(tmp_path: Path
     (tmp_path / "dataset/poses/07.txt").write_text("\n".join(poses[:5]))
     with pytest.warns(InputWarning, match=r"1 of 3 images, .* up to 5 .* its end \(poses: 5\)"):
         assert tiny.quietly_opened(drive).ground_truth().timestamps == pytest.approx([0, 0.2])
+    (drive / "times.txt").write_text("0.1\n0.3\n0.5\n")  # of these images alone, and the poses of all
+    (tmp_path / "dataset/poses/07.txt").write_text("\n".join(poses))
+    sequence = tiny.quietly_opened(drive)
+    assert [frame.timestamp for frame in sequence.frames()] == pytest.approx([0.1, 0.3, 0.5])
+    np.testing.assert_allclose(sequence.ground_truth().positions[:, 0], [0.94, 2.94, 4.94])
     (drive / "times.txt").write_text("".join(f"{0.1 * number}\n" for number in range(5)))
     with pytest.raises(InputError, match=r"3 images, by their numbers up to 5 .* and 5 times"):
         tiny.quietly_opened(drive)

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from vggtgeo.datasets import Frame
+from vggtgeo.evaluation.report import ABSURD_SCALE
 from vggtgeo.io.one_line import one_line
 from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback
@@ -109,7 +110,10 @@ def errors_line(truth: Mapping[str, Any], free: bool) -> str:
         return f"ATE {sim3:.4g} after Sim(3) alignment, in the unit of the true poses, which is not the metre"
     if free:
         return f"ATE {100 * sim3:.2f} cm after Sim(3) alignment (the scale is free)"
-    return f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment"
+    line = f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment"
+    scale = truth["scale"]
+    other = not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE
+    return f"{line}, which takes lengths {scale:.3g} times: are depth and truth in one unit?" if other else line
 
 
 def print_result(console: Console, result: Result, summary: Mapping[str, Any], folder: Path) -> None:

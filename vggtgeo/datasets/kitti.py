@@ -34,8 +34,6 @@ class Kitti(FolderSequence):
 
     baseline: float = 0.0
     """Metres along x from the left grey camera, which the truth belongs to, to this one."""
-    rows: tuple[int, ...] = ()
-    """Of each image the line of the lists of times and true poses."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -65,7 +63,7 @@ class Kitti(FolderSequence):
                 f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", NoteWarning, stacklevel=3
             )
         camera, baseline = _camera(folder, place.relative_to(folder).parts[0], width, height)
-        return cls(folder, folder.resolve().name, camera, files, baseline=baseline, rows=rows)
+        return cls(folder, folder.resolve().name, camera, files, baseline=baseline)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses of the camera that is read."""
@@ -78,7 +76,8 @@ class Kitti(FolderSequence):
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3] = rows.reshape(-1, 3, 4)
         poses[:, :3, 3] += self.baseline * poses[:, :3, 0]
-        return trajectory_of_rows([one.timestamp for one in self.files], self.rows, poses, file)
+        places = rows_of([one.image for one in self.files], len(poses))  # another list than that of times, maybe cut
+        return trajectory_of_rows([one.timestamp for one in self.files], places, poses, file)
 
 
 def _times(folder: Path, place: Path) -> list[float]:

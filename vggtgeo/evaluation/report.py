@@ -77,6 +77,7 @@ class TrajectoryReport:
         return (
             f"{self.matched} poses: ATE {se3:.3f} m after SE(3), {sim3:.3f} m after Sim(3) (scale "
             f"{self.sim3.alignment.scale:.4f}); RPE over {pairs.interval}: {moved:.3f} m, {turned:.3f} deg"
+            + "".join(f"; {warning}" for warning in self.warnings)
         )
 
     __repr__ = __str__

@@ -3,7 +3,8 @@
 Times alone do not tell: most sequences begin at zero and have 30 frames a second. Nor does the ATE in metres, which an
 alignment of two straight walks makes small; over the extent of the path it does. Rotations do, too: over a tenth of the
 sequence, an estimate of the same camera has less error than the camera has motion, and one of another camera has more,
-sqrt(2) times as much if the two move alike.
+sqrt(2) times as much if the two move alike. Where the camera hardly turns over a tenth, over up to a half, which is
+told and no more: there, an estimate of the same camera may have drifted as far.
 """
 
 import warnings
@@ -55,6 +56,12 @@ def warn_of_strangers(
             f"the estimate explains the true rotations no better than a camera that stands still (error / motion "
             f"{ratio:.2f}): it is of another sequence, or it failed"
         )
+    longer = rotation_misfit(matched, reference, longest=0.5) if ratio is None else None
+    if longer is not None and longer >= 1.0:
+        _warn(
+            f"the camera hardly turns, and what it turns the estimate explains no better than one that stands still "
+            f"(error / motion {longer:.2f}): are both of one sequence, with poses camera to world?"
+        )
     share = place_misfit(matched, reference)
     elsewhere = share is not None and share >= WORST_SHARE
     if elsewhere:
@@ -102,17 +109,21 @@ def orientation_gap(matched: Trajectory, reference: Trajectory) -> float | None:
     return float(np.median(rotation_angle(aligned.rotations.swapaxes(1, 2) @ reference.rotations)))
 
 
-def rotation_misfit(matched: Trajectory, reference: Trajectory) -> float | None:
-    """RMS rotation error over RMS rotation of the truth, over pairs a tenth of the sequence apart; None where the
-    camera hardly turns.
+def rotation_misfit(matched: Trajectory, reference: Trajectory, longest: float = 0.1) -> float | None:
+    """RMS rotation error over RMS rotation of the truth, over pairs a tenth of the sequence apart, or twice as far, and
+    so on up to the share `longest`, where the camera turns enough; None where it never does.
     """
     delta = max(len(matched) // 10, 1)
-    if len(matched) <= delta:
-        return None
-    first = np.arange(len(matched) - delta)
-    turned = rotation_angle(reference.rotations[first].swapaxes(1, 2) @ reference.rotations[first + delta])
-    motion = float(np.sqrt(np.mean(turned**2)))
-    if motion < LEAST_TURN:
-        return None
+    while True:
+        if len(matched) <= delta:
+            return None
+        first = np.arange(len(matched) - delta)
+        turned = rotation_angle(reference.rotations[first].swapaxes(1, 2) @ reference.rotations[first + delta])
+        motion = float(np.sqrt(np.mean(turned**2)))
+        if motion >= LEAST_TURN:
+            break
+        if 2 * delta > longest * len(matched):
+            return None
+        delta *= 2
     error = relative_error(matched, reference, delta, all_pairs=True).rotation
     return float(np.sqrt(np.mean(error**2))) / motion

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import image_files
+from vggtgeo.datasets.opening import FOLDER_KINDS
 from vggtgeo.export.colmap import write_colmap
 from vggtgeo.export.contents import EmptyRunError
 from vggtgeo.export.nerfstudio import write_nerfstudio
@@ -140,12 +141,19 @@ def _check_target(output: Path, run: Path) -> None:
     """InputError where the files of an export would lie among those of the run, or in no folder."""
     if whole_path(output) == whole_path(run):
         raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
+    if output.is_dir() and not (output / _RECORD).is_file() and _is_recording(output):
+        raise InputError(f"`{output}` is a recording; give another folder for the export with `-o`")
     for name in ("images", "depth"):
         if whole_path(output).is_relative_to(whole_path(run / name)):
             raise InputError(f"`{output}` is in `{run / name}`, which is the run's own; give another for the export")
     for folder in (output, *output.parents):
         if os.path.lexists(folder) and not folder.is_dir():
             raise InputError(f"`{folder}` is no folder; give a new one for the export with `-o`")
+
+
+def _is_recording(folder: Path) -> bool:
+    """Whether it has the layout of one; pictures alone may be anything."""
+    return any(reader.matches(folder) for name, reader in FOLDER_KINDS.items() if name != "images")
 
 
 def _claim(output: Path, names: list[str], ours: bool) -> None:

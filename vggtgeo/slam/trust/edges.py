@@ -119,7 +119,7 @@ def check_edges(estimate: Estimate, shares: np.ndarray) -> list[Finding]:
 def _jumps(depth: np.ndarray) -> np.ndarray:
     """Where the depth, float32 [h, w], 0 = none, jumps, bool [h, w]."""
     smooth = cv2.medianBlur(depth, 5)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.where((depth > 0) & (smooth > 0), np.log(smooth), np.nan)
     found = np.zeros(depth.shape, bool)
     with np.errstate(invalid="ignore"):
