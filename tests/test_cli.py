@@ -109,6 +109,20 @@ def test_an_error_is_one_line_and_a_code(failing, error: BaseException, code: in
     assert result.stdout == ""
 
 
+def test_a_warning_for_the_user_is_one_line_and_no_line_of_code(tmp_path: Path) -> None:
+    """Of the input or not, as of a network's answers that cannot be kept; others are shown as Python shows them."""
+    program = (
+        "import importlib, warnings; module = importlib.import_module('vggtgeo.cli.main')\n"
+        "def app():\n    warnings.warn('first\\nsecond', UserWarning); warnings.warn('odd', RuntimeWarning)\n"
+        "module.make_app = lambda: lambda prog_name: app()\n"
+        "module.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path)
+    first, *others = done.stderr.splitlines()
+    assert first == "warning: first second"
+    assert "RuntimeWarning: odd" in others[0]
+
+
 def test_debug_shows_the_traceback(failing) -> None:
     # Proves that `--debug` lets the exception through, with its traceback.
     failing(InputError("wrong"))

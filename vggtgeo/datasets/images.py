@@ -220,13 +220,13 @@ def _are_counted(stems: list[str]) -> bool:
 
 
 def rows_of(images: list[Path], lines: int | None) -> tuple[int, ...]:
-    """The line of each image in lists of a whole recording: the number that its name ends with, so that a part of the
+    """The line of each image in a list of a whole recording: the number that its name ends with, so that a part of the
     recording, or one with holes, keeps its times and its truth; those beyond the last line have none. Its place where
     names have no numbers, or others: each image has its line, then.
     """
     found = [_NUMBERED.fullmatch(image.stem) for image in images]
     numbers = [int(match.group(1)) for match in found if match]
     apart = len(set(numbers)) == len(images)
-    if apart and (lines is None or max(numbers, default=0) < lines or lines != len(images)):
+    if apart and (lines != len(images) or max(numbers, default=0) < lines):
         return tuple(numbers)
     return tuple(range(len(images)))
