@@ -69,7 +69,7 @@ class Verdict:
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.Result.of(next(vg.run(vg.simulate("room", 3, size=(160, 120))))).verdict
+        >>> vg.Result.of(list(vg.run(vg.simulate("room", 3, size=(160, 120))))[-1]).verdict
         Verdict(good)
 
     """
