@@ -100,6 +100,10 @@ def test_a_place_that_is_no_file(tmp_path: Path) -> None:
 def test_a_setting_that_is_another_one_is_shown_where_it_differs(tmp_path: Path) -> None:
     """Long ones are alike at their beginning; what differs must not lie in what is cut away."""
     matcher = f"SiftMatcher({'count=1500, ' * 30}seed={{}})"
-    CHECKPOINT.write(tmp_path / "kept.npz", run(), {**FACTS, "identity": {"points": matcher.format(0)}})
+    known = {"points": matcher.format(0), "seed": "0"}
+    CHECKPOINT.write(tmp_path / "kept.npz", run(), {**FACTS, "identity": known})
+    kept = Checkpoints(tmp_path / "kept.npz", resume=True)
     with pytest.raises(InputError, match=r"with `points` \.\.\..*seed=0\), and this one has \.\.\..*seed=5\): give"):
-        resumed(Checkpoints(tmp_path / "kept.npz", resume=True), {"points": matcher.format(5)})
+        resumed(kept, {**known, "points": matcher.format(5)})
+    with pytest.raises(InputError, match=r"with `seed` 0, and this one has 5: give"):  # the plainest of both
+        resumed(kept, {"points": matcher.format(5), "seed": "5"})

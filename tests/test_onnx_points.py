@@ -1,7 +1,9 @@
 """MASt3R, ALIKE, XFeat and DINOv3 behind ONNX, and the cache of what networks answer."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plane_views as views
@@ -16,7 +18,7 @@ from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher, confidence_of, corners
 from vggtgeo.models.onnx.reciprocal import nearest, reciprocal
-from vggtgeo.models.onnx.session import Session, open_session
+from vggtgeo.models.onnx.session import NetworkValueError, Session, open_session
 from vggtgeo.models.roles import DenseConfidence, PointMatcher
 
 MOTION = views.pose((1.0, -2.0, 3.0), (0.1, -0.05, 0.05))
@@ -201,6 +203,25 @@ def test_certainty_becomes_a_confidence() -> None:
 
 
 # --- DINOv3 ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("attention", [-0.5, 0.0])
+def test_attention_that_is_no_share_is_refused(
+    attention: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    # Proves that negative attention, which would be a confidence of 1 everywhere, and none at all, which would be one
+    # of 0, are errors that the bounds count. Oracle: the sentence; with the answer of the file there is none.
+    role = DinoFeatures(open_session(tiny.dinov3(tmp_path / "dinov3.onnx", (96, 128)), contracts.DINOV3))
+    image, whole = np.zeros((96, 128, 3), np.uint8), Session.run
+    assert np.isfinite(role.confidence(image)).all()
+
+    def changed(session: Session, *arguments: Any) -> dict[str, np.ndarray]:
+        found = whole(session, *arguments)
+        return {**found, "attention": np.full_like(found["attention"], attention)}
+
+    monkeypatch.setattr(Session, "run", changed)
+    with pytest.raises(NetworkValueError, match=rf"dinov3.onnx` gave an `attention` of {attention:.3g} to"):
+        replace(role, cache=MemoryCache()).confidence(image)
 
 
 def test_saliency_is_attention_relative_to_the_mean() -> None:

@@ -61,6 +61,9 @@ def test_a_file_says_what_flags_say(tmp_path: Path) -> None:
         assert seen_by_the_command("--settings", file_with(tmp_path, text + negation)) == by_flags
     expected = {"path": "clip", "count": 7, "scale": 2.0, "rgb-only": True, "lines": False, "mode": "slow"}
     assert by_flags == {**expected, "json": True}
+    path = file_with(tmp_path, "")
+    Path(path).write_text(f"{text}lines = false\n", encoding="utf-16", newline="\r\n")  # as PowerShell has it
+    assert seen_by_the_command("--settings", path) == by_flags
 
 
 def test_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from vggtgeo.models.checks import check_image
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import DINOV3
 from vggtgeo.models.onnx.fit import Fit, at_multiples
-from vggtgeo.models.onnx.session import Session
+from vggtgeo.models.onnx.session import NetworkValueError, Session
 
 PREFIX = 5
 """Tokens before the patches: the class token and four registers."""
@@ -73,6 +73,12 @@ class DinoFeatures:
 
     def _run(self, image: np.ndarray, fit: Fit) -> Outputs:
         found = self.session.run({"image": DINOV3.normalisation.apply(fit.resize(image))[None]})
+        patches = found["attention"][0, :, 0, PREFIX:]
+        if patches.min() < 0 or not patches.any():  # its rows are shares, which add up to 1
+            raise NetworkValueError(
+                f"`{self.session.path}` gave an `attention` of {patches.min():.3g} to {patches.max():.3g}; expected "
+                "shares, at least 0 and not all of them 0"
+            )
         # Half the bits are plenty for descriptors that are compared by angle, and halve a cache of them.
         return {
             "attention": found["attention"][0, :, 0, :],

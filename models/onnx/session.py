@@ -68,7 +68,7 @@ class NetworkRunError(RuntimeError):
 
 
 class NetworkValueError(NetworkRunError):
-    """A network ran and gave values that are not finite."""
+    """A network ran and gave values that are not finite, or that its role cannot have."""
 
 
 @dataclass(frozen=True)

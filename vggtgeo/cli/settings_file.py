@@ -8,6 +8,7 @@ The file takes the place of the defaults, so a flag that is given wins over it.
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import os
 import tomllib
@@ -101,7 +102,9 @@ def _read(path: Path) -> dict[str, Any]:
     if len(content) > _MOST_BYTES:  # a device that never ends, or something that is no settings file
         raise InputError(f"`--settings` is `{path}`, which has more than {_MOST_BYTES} bytes; give a TOML file")
     try:
-        return tomllib.loads(content.decode("utf-8-sig"))
+        # UTF-16 with its mark, as PowerShell writes it.
+        wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        return tomllib.loads(content.decode("utf-16" if wide else "utf-8-sig"))
     except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
         raise InputError(f"`{path}` is no TOML file: {error}; a line is `key = value`, text in quotes") from None
 
