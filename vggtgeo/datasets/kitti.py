@@ -76,8 +76,8 @@ class Kitti(FolderSequence):
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3] = rows.reshape(-1, 3, 4)
         poses[:, :3, 3] += self.baseline * poses[:, :3, 0]
-        places = rows_of([one.image for one in self.files], len(poses))  # another list than that of times, maybe cut
-        return trajectory_of_rows([one.timestamp for one in self.files], places, poses, file)
+        lines = rows_of([one.image for one in self.files], len(poses))  # another list than that of times, maybe cut
+        return trajectory_of_rows([one.timestamp for one in self.files], lines, poses, file)
 
 
 def _times(folder: Path, place: Path) -> list[float]:
