@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import vggtgeo.cli.evaluate
 from vggtgeo.cli.evaluate import evaluate
+from vggtgeo.cli.progress import errors_line
 from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import MAX_TIME_DIFFERENCE, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
@@ -197,6 +198,19 @@ def test_a_camera_that_hardly_turns_tells_of_strangers_over_longer_times(tmp_pat
         outcome = CliRunner().invoke(app, [str(tmp_path / "trajectory.txt"), str(tmp_path / "truth.txt")])
     assert outcome.exit_code == 0, outcome.output
     assert [True for one in warned if "hardly turns" in str(one.message)] == [True] * inverted
+
+
+def test_lengths_in_another_unit_are_told_where_they_are_compared() -> None:
+    # Proves that a metric run beside a truth of five times its size says so in its line and in the report's, and one of
+    # its own size does not. Oracle: the factor.
+    truth = _walk(1, turning=True)
+    for factor in (1.0, 5.0):
+        poses = truth.poses.copy()
+        poses[:, :3, 3] /= factor
+        report = evaluate_trajectory(Trajectory(truth.timestamps, poses), truth)
+        line = errors_line({**report.as_dict(), "in_metres": True}, free=False)
+        assert ("takes lengths 5 times: are depth and truth in one unit?" in line) == (factor == 5.0)
+        assert ("the scale is 5: the two are not in one unit" in str(report)) == (factor == 5.0)
 
 
 def test_an_estimate_without_scale_or_of_a_part_is_a_success(tmp_path: Path) -> None:

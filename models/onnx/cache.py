@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import secrets
+import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -103,15 +105,13 @@ def key_of(networks: Sequence[str], settings: tuple[object, ...], images: Sequen
 
 def _read(path: Path) -> Outputs | None:
     try:
-        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-            # NumPy reads as much as an array's header says, and zip's checksum is asked where the member ends: of one
-            # whose size is damaged, too, it never is.
-            if file.zip.testzip() is not None:
-                return None
-            found = {name: file[name] for name in file.files}
-            named = found.pop(_NAMES).tolist()
-            arrays = all(isinstance(value, np.ndarray) for value in found.values())  # no such member: its raw bytes
-            return found if arrays and sorted(found) == named else None
+        # Each member to its end, where zip asks for its checksum: `numpy.load` reads as much as an array's header says,
+        # and of a member whose size is damaged, too, it would never be asked.
+        with path.open("rb") as handle, zipfile.ZipFile(handle) as file:
+            members = {name.removesuffix(".npy"): io.BytesIO(file.read(name)) for name in file.namelist()}
+        found = {name: np.lib.format.read_array(member, allow_pickle=False) for name, member in members.items()}
+        named = found.pop(_NAMES).tolist()
+        return found if sorted(found) == named else None
     except UNREADABLE:
         return None
 

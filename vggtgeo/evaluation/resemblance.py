@@ -114,16 +114,14 @@ def rotation_misfit(matched: Trajectory, reference: Trajectory, longest: float =
     so on up to the share `longest`, where the camera turns enough; None where it never does.
     """
     delta = max(len(matched) // 10, 1)
-    while True:
-        if len(matched) <= delta:
-            return None
+    while delta < len(matched):
         first = np.arange(len(matched) - delta)
         turned = rotation_angle(reference.rotations[first].swapaxes(1, 2) @ reference.rotations[first + delta])
         motion = float(np.sqrt(np.mean(turned**2)))
         if motion >= LEAST_TURN:
-            break
-        if 2 * delta > longest * len(matched):
-            return None
+            error = relative_error(matched, reference, delta, all_pairs=True).rotation
+            return float(np.sqrt(np.mean(error**2))) / motion
         delta *= 2
-    error = relative_error(matched, reference, delta, all_pairs=True).rotation
-    return float(np.sqrt(np.mean(error**2))) / motion
+        if delta > longest * len(matched):
+            break
+    return None
