@@ -43,10 +43,10 @@ from vggtgeo.solvers.arrow import (
     moving_landmarks,
 )
 from vggtgeo.solvers.exact_model import ExactModel, exact_model
+from vggtgeo.solvers.landmark_basis import expand, restrict
 from vggtgeo.solvers.levenberg_marquardt import LevenbergMarquardtState, SchurLevenbergMarquardt
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced import AbstractReducedSolver
-from vggtgeo.solvers.segments import expand, restrict
 
 STATIONARY = 1e-6
 """Gradient left after the polish, each entry in units of the root of its curvature (the unit of `sqrt(energy)`), above
@@ -271,11 +271,11 @@ def _along(system: ArrowSystem, problem: AbstractArrowProblem) -> ArrowSystem:
 
 
 def _expanded(system: ArrowSystem, step: ArrowVector) -> ArrowVector:
-    return ArrowVector(step.dense, expand(system.segments, step.landmarks))
+    return ArrowVector(step.dense, expand(system.basis, step.landmarks))
 
 
 def _restricted(system: ArrowSystem, gradient: ArrowVector) -> ArrowVector:
-    return ArrowVector(gradient.dense, restrict(system.segments, gradient.landmarks))
+    return ArrowVector(gradient.dense, restrict(system.basis, gradient.landmarks))
 
 
 def _free(vector: ArrowVector, system: ArrowSystem) -> ArrowVector:

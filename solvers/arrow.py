@@ -18,6 +18,7 @@ Levenberg-Marquardt damping multiplies the diagonal: `V (1 + l)`, `H + l diag(H)
 from __future__ import annotations
 
 import abc
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -67,6 +68,24 @@ class SegmentLandmarks(eqx.Module):
         return jnp.stack([first, jnp.where(self.determined[..., None], second, 0.0)], -1)
 
 
+class TripleLandmarks(eqx.Module):
+    """The factors of `L` of landmarks of three unknowns, see `triples.py`."""
+
+    ratio_u: Float[Array, "n p"]
+    """`a`, of `u` and `d`."""
+    ratio_v: Float[Array, "n p"]
+    """`b`, of `v` and `d`."""
+    ratio_uv: Float[Array, "n p"]
+    """`c`, of `u` and `v`."""
+
+
+class LandmarkBasis(NamedTuple):
+    """The coordinates in which a system holds landmarks that depend on each other, see `landmark_basis.py`."""
+
+    segments: SegmentLandmarks | None
+    triples: TripleLandmarks | None
+
+
 class NodeFactors(eqx.Module):
     """Second-order models of what touches one node or two, and the shared coordinates, but no landmark.
 
@@ -107,6 +126,17 @@ class ArrowSystem(eqx.Module):
     """Landmarks that stay where they are, at a bound that they press against; None = none."""
     segments: SegmentLandmarks | None = None
     """Where the last `2 g` landmarks are coordinates of segments of `q` samples."""
+    blocks: Float[Array, "n 3 t"] | None = None
+    """Where the first `3 t` landmarks are `t` of three unknowns, all `u`, all `v`, all `d`: second derivatives
+    `uu, vv, uv`. The last row of `cross` then holds `ud, vd` for `u` and `v`. None once `join_triples` has made the
+    blocks diagonal."""
+    triples: TripleLandmarks | None = None
+    """The coordinates that `join_triples` chose."""
+
+    @property
+    def basis(self) -> LandmarkBasis:
+        """Coordinates of the landmarks."""
+        return LandmarkBasis(self.segments, self.triples)
 
     @property
     def landmark_gradient(self) -> Float[Array, "n s"]:

@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, inverse_landmark_hessian, moving_landmarks
+from vggtgeo.solvers.landmark_basis import expand, expand_variance
 from vggtgeo.solvers.local_inverse import LocalInverse, to_relative, visible
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
-from vggtgeo.solvers.segments import expand, expand_variance
 
 
 class ArrowCovariance(eqx.Module):
@@ -67,14 +67,14 @@ def covariance(
 def _landmarks(system: ArrowSystem, found: LocalInverse, hosts: Int[Array, " h"]) -> Float[Array, "h s"]:
     """`V^-1 + V^-1 W' S^-1 W V^-1`, its diagonal."""
     hessian_inverse, cross = inverse_landmark_hessian(system)[hosts], system.cross[hosts, :-2]
-    segments = jax.tree.map(lambda leaf: leaf[hosts], system.segments)
+    basis = jax.tree.map(lambda leaf: leaf[hosts], system.basis)
     # In this order: the square of a large inverse overflows, its product with the coupling does not.
-    pulled = expand(segments, hessian_inverse[:, None] * cross)
+    pulled = expand(basis, hessian_inverse[:, None] * cross)
     spread = lambda local, rows: jnp.einsum("nrs,nrt,nts->ns", rows, to_relative(system, hosts, local), rows)
-    variance = expand_variance(segments, hessian_inverse) + spread(found.covariance, pulled)
+    variance = expand_variance(basis, hessian_inverse) + spread(found.covariance, pulled)
     lost = hessian_inverse * spread(found.null, cross) > visible(cross.dtype)
     unknown = (system.landmark_hessian[hosts] == 0) | lost
-    known = (expand_variance(segments, unknown.astype(cross.dtype)) == 0) & jnp.isfinite(variance)
+    known = (expand_variance(basis, unknown.astype(cross.dtype)) == 0) & jnp.isfinite(variance)
     return jnp.where(known, variance, jnp.inf)
 
 

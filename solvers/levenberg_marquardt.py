@@ -25,9 +25,9 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_gradient
+from vggtgeo.solvers.landmark_basis import expand
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
-from vggtgeo.solvers.segments import expand
 
 
 class Termination(eqx.Enumeration):
@@ -315,7 +315,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ) -> _Try:
         """Take the step if it keeps its promise, else shrink the trust region."""
         energy = state.energy
-        candidate = problem.retract(point, ArrowVector(step.dense, expand(system.segments, step.landmarks)))
+        candidate = problem.retract(point, ArrowVector(step.dense, expand(system.basis, step.landmarks)))
         new_energy = problem.energy(candidate)
         gain = (energy - new_energy) / jnp.where(predicted > 0, predicted, 1.0)
         accepted = jnp.isfinite(new_energy) & (predicted > 0) & (gain > 1e-3)

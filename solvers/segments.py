@@ -7,7 +7,7 @@ the segment: `z_s = (1 - t_s) a + t_s b`. In `(a, b)` the landmark block `V` has
     z_s = (1 - t_s) y_a + (t_s - l (1 - t_s)) y_b,      V_y = diag(V_aa, V_bb - l V_ab),
 
 so that all that is written for scalar landmarks (Schur complement, damping, covariance) holds for segments as well.
-Only what enters and leaves the system passes through this basis, `expand` and its transpose `restrict`.
+Only what enters and leaves the system passes through this basis, see `landmark_basis.py`.
 """
 
 from __future__ import annotations
@@ -41,20 +41,18 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
     return eqx.tree_at(lambda s: (s.cross, s.segments, s.held), system, changed, is_leaf=lambda leaf: leaf is None)
 
 
-def expand(segments: SegmentLandmarks | None, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
+def expand_segments(segments: SegmentLandmarks, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
     """From the system's landmarks to those of the problem: the samples of the segments."""
-    return landmarks if segments is None else _expanded(segments.basis, landmarks)
+    return _expanded(segments.basis, landmarks)
 
 
-def expand_variance(segments: SegmentLandmarks | None, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
+def expand_segments_variance(segments: SegmentLandmarks, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
     """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
-    return variance if segments is None else _expanded(segments.basis**2, variance)
+    return _expanded(segments.basis**2, variance)
 
 
-def restrict(segments: SegmentLandmarks | None, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:
-    """The transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
-    if segments is None:
-        return landmarks
+def restrict_segments(segments: SegmentLandmarks, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:
+    """The transpose of `expand_segments`: a gradient by the problem's landmarks as one by the system's."""
     hosts, count, samples = segments.fraction.shape
     alone = landmarks.shape[-1] - count * samples
     values = landmarks[:, alone:].reshape(hosts, count, samples)

@@ -214,7 +214,7 @@ def test_a_size_that_is_too_small_is_refused(name: str) -> None:
         ({"intrinsics_mean": np.full(4, np.nan)}, "expected 4 finite numbers"),
         ({"intrinsics_sigma": np.nan}, "`intrinsics_sigma` is nan; it must be positive"),
         ({"intrinsics_sigma": 1e-200}, r"`intrinsics_sigma` is 1e-200; 1 / sigma\^2 is beyond the numbers of float64"),
-        ({"intrinsics_sigma": 1e-30, "dtype": np.float32}, "is 1e-30; .* of float32: give a larger one, or hold the"),
+        ({"intrinsics_sigma": 1e-30, "dtype": np.float32}, "`intrinsics_sigma` is 1e-30"),
         ({"kernel": Huber(jnp.asarray(1e-50)), "dtype": np.float32}, "`kernel.delta` is 1e-50; float32 holds numbers"),
         ({"fixed_intrinsics": 1}, "`fixed_intrinsics` is 1; expected True, False, or 4 of them"),
         ({"fixed_intrinsics": [True, False]}, "expected True, False, or 4 of them"),

@@ -11,9 +11,9 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import Scene, make_scene
 from vggtgeo.solvers.arrow import ArrowVector, multiply
+from vggtgeo.solvers.landmark_basis import expand, restrict
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
-from vggtgeo.solvers.segments import expand, restrict
 
 from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
@@ -82,7 +82,7 @@ def reduced_to_ends(problem: Problem, state: State) -> tuple[np.ndarray, np.ndar
 def newton(problem: Problem, state: State) -> ArrowVector:
     system, solver = BundleAdjustment(problem).linearise(state), DenseCholesky()
     step, _ = solver.step(system, solver.prepare(system), jnp.asarray(0.0))
-    return ArrowVector(step.dense, expand(system.segments, step.landmarks))
+    return ArrowVector(step.dense, expand(system.basis, step.landmarks))
 
 
 def test_the_step_is_the_constrained_dense_step() -> None:
@@ -103,7 +103,7 @@ def test_restrict_is_the_transpose_of_expand() -> None:
     rng = np.random.default_rng(0)
     inner = jnp.asarray(rng.normal(size=system.landmark_hessian.shape))
     outer = jnp.asarray(rng.normal(size=state.inverse_depth.shape))
-    left, right = jnp.sum(expand(system.segments, inner) * outer), jnp.sum(inner * restrict(system.segments, outer))
+    left, right = jnp.sum(expand(system.basis, inner) * outer), jnp.sum(inner * restrict(system.basis, outer))
     assert float(left) == pytest.approx(float(right), rel=1e-12)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.linearise import energy_gradient, free_coordinates, linearise
+from vggtgeo.bundle.linearise import energy_gradient, free_coordinates, linearise, num_offsets, offsets_of
 from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.geometry import lie
@@ -45,12 +45,16 @@ class BundleAdjustment(AbstractArrowProblem[State]):
 
     def retract(self, point: State, step: ArrowVector) -> State:
         """Poses move by `exp(xi) T`, the camera and inverse depths by addition, those as far as their bound."""
-        moved = point.inverse_depth + step.landmarks
+        first = num_offsets(point)
+        moved = point.inverse_depth + step.landmarks[:, first:]
         poses = self.problem.num_camera - self.problem.num_parameters
         return State(
             poses=lie.move(point.poses, step.dense[:poses].reshape(-1, lie.TANGENT)),
             intrinsics=point.intrinsics + step.dense[poses:].reshape(point.intrinsics.shape),
             inverse_depth=self._bounded(point.inverse_depth, moved) if self.problem.positive_depth else moved,
+            pixel_offset=None
+            if point.pixel_offset is None
+            else point.pixel_offset + offsets_of(step.landmarks[:, :first]),
         )
 
     def _bounded(self, depth: Float[Array, "n s"], moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
@@ -65,7 +69,8 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         fixed_pose = self.problem.fixed_pose[:, None]
         poses = jnp.where(fixed_pose, initial.poses.wxyz_xyz, point.poses.wxyz_xyz)
         intrinsics = jnp.where(self.problem.fixed_intrinsics, initial.intrinsics, point.intrinsics)
-        return State(jaxlie.SE3(poses), intrinsics, self._along_segments(point.inverse_depth))
+        depth = self._along_segments(point.inverse_depth)
+        return State(jaxlie.SE3(poses), intrinsics, depth, point.pixel_offset)
 
     def straightened(self, point: State) -> State:
         """`point` with the inverse depths of each segment on the straight line nearest to them (or at their mean, where
@@ -79,7 +84,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         straight = level + slopes(point.inverse_depth, fraction) * (fraction - centre)
         straight = jnp.where(jnp.min(straight, -1, keepdims=True) > 0, straight, level)
         depth = point.inverse_depth.at[:, self.problem.first_segment :].set(straight.reshape(len(lines), -1))
-        return State(point.poses, point.intrinsics, depth)
+        return State(point.poses, point.intrinsics, depth, point.pixel_offset)
 
     def _along_segments(self, depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
         """The same depths, with their derivative by the fractions: a line stays where it is, its samples move on it."""
@@ -100,7 +105,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
     def zero_step(self, point: State) -> ArrowVector:
         return ArrowVector(
             jnp.zeros(free_coordinates(self.problem).shape, point.inverse_depth.dtype),
-            jnp.zeros_like(point.inverse_depth),
+            jnp.pad(jnp.zeros_like(point.inverse_depth), ((0, 0), (num_offsets(point), 0))),
         )
 
 

@@ -9,6 +9,7 @@ and the dense ones one small matrix (layout chosen by measurement on CPU, see `b
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -18,46 +19,55 @@ from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.objective import cameras_of, edge_data, hosts_of, motions_of, of_edge, relative_poses, view_of
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, times_depth_column
+from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors
 from vggtgeo.solvers.segments import join_segments
+from vggtgeo.solvers.triples import depth_gradient, join_triples
 
 
 def linearise(
-    problem: Problem, state: State, correction: Float[Array, ""] | None = None, exact: bool = False
+    problem: Problem,
+    state: State,
+    correction: Float[Array, ""] | None = None,
+    exact: bool = False,
+    joined: bool = True,
 ) -> ArrowSystem:
     """Second-order model of the energy of a prepared problem at `state`, with its exact gradient.
 
     The Hessian is the reweighted Gauss-Newton one, or the exact one (in the coordinates of `exp(x) T` and additive
     camera parameters and inverse depths). With a `correction` the reweighted one is corrected for that part of the
-    kernels' curvature, see `terms/term.py`.
+    kernels' curvature, see `terms/term.py`. Not `joined`: landmarks that depend on each other (segments, points with
+    free pixels) are not in the basis that makes them scalars, so that systems may be added.
     """
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
     degree, size = problem.edges.of_host.shape[1], lie.TANGENT + problem.num_parameters
     wide = lie.TANGENT * degree
 
-    def body(cross: Array, edge: Any) -> tuple[Array, Array]:
-        ends, index, motion, data = edge
+    sizes = num_offsets(state) // 2, state.inverse_depth.shape[1]
+
+    def body(carry: tuple[Array, Array | None], edge: Any) -> tuple[tuple[Array, Array | None], Array]:
+        (cross, blocks), (ends, index, motion, data) = carry, edge
         host = ends[0]
         seen = of_edge(problem, view_of(cameras, hosts, ends, motion), data)
-        gram, coupled = (_exact if exact else _reweighted)(seen, correction, state.inverse_depth.shape[1])
+        gram, coupled, own = (_exact if exact else _reweighted)(seen, correction, sizes)
         zero = jnp.zeros_like(host)
-        cross = jax.lax.dynamic_update_slice(cross, coupled[None, : lie.TANGENT], (host, lie.TANGENT * index, zero))
-        tail = coupled[None, lie.TANGENT :]
-        shared = jax.lax.dynamic_slice(cross, (host, zero + wide, zero), (1, *tail.shape[1:]))
-        return jax.lax.dynamic_update_slice(cross, shared + tail, (host, zero + wide, zero)), gram
+        for first, part in coupled:
+            place, tail = (host, lie.TANGENT * index, zero + first), (host, zero + wide, zero + first)
+            cross = jax.lax.dynamic_update_slice(cross, part[None, : lie.TANGENT], place)
+            shared = jax.lax.dynamic_slice(cross, tail, (1, len(part) - lie.TANGENT, part.shape[1]))
+            cross = jax.lax.dynamic_update_slice(cross, shared + part[None, lie.TANGENT :], tail)
+        return (cross, blocks if blocks is None or own is None else blocks.at[host].add(own)), gram
 
-    cross = _slot_terms(problem, state, wide, correction, exact)
+    cross, blocks = _landmark_terms(problem, state, wide, correction, exact)
     if problem.edge_terms:
         edges = (problem.edges.ends, problem.edges.index_at_host, motions_of(relative), edge_data(problem))
-        cross, gram = jax.lax.scan(body, cross, edges)
+        (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
     force = gram[:, : lie.TANGENT, size]
     hessian, gradient = _dense_terms(problem, state, correction, exact)
-    held = _held(problem, state, cross[:, -2])
     system = ArrowSystem(
         graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
         source_adjoint=lie.adjoint(relative),
@@ -71,8 +81,13 @@ def linearise(
         free=free_coordinates(problem),
         gauge=scale_direction(problem, state),
         factors=_node_factors(problem, state, correction, exact),
-        held=held,
+        blocks=blocks,
     )
+    if not joined:
+        return system
+    # In this order: what reads the cross terms as they were before would make XLA copy them.
+    system = join_triples(system)
+    system = replace(system, held=_held(problem, state, depth_gradient(system)))
     return system if problem.fraction is None else join_segments(system, jax.lax.stop_gradient(problem.fraction))
 
 
@@ -83,9 +98,12 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     part by the relative pose of an edge goes to its two poses through `eta = x_j - Ad(M) x_i`.
     """
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
-    landmarks = jnp.zeros_like(state.inverse_depth)
+    first = num_offsets(state)
+    landmarks = jnp.pad(jnp.zeros_like(state.inverse_depth), ((0, 0), (first, 0)))
     for term in problem.slot_terms:
-        landmarks += term.gradient(state.inverse_depth)
+        landmarks = landmarks.at[:, first:].add(term.gradient(state.inverse_depth))
+    for pixel in problem.pixel_terms:
+        landmarks = landmarks.at[:, :first].add(_as_landmarks(pixel.gradient(state.pixel_offset)))
     dense = _dense_terms(problem, state, None, False)[1]
     factors = _node_factors(problem, state, None, False)
     if factors is not None:
@@ -93,13 +111,17 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     if not problem.edge_terms:
         return ArrowVector(dense, landmarks)
 
+    sizes = first // 2, state.inverse_depth.shape[1]
+
     def edge(ends: tuple[Array, Array], motion: Any, data: Any) -> tuple[Array, Array]:
-        local, slots = jnp.zeros(lie.TANGENT + problem.num_parameters, landmarks.dtype), jnp.zeros_like(landmarks[0])
+        local, own = jnp.zeros(lie.TANGENT + problem.num_parameters, landmarks.dtype), jnp.zeros_like(landmarks[0])
         for term, seen in of_edge(problem, view_of(cameras, hosts, ends, motion), data):
-            by_shared, by_depth = term.gradient(seen)
-            local += by_shared
-            slots = slots.at[term.first_slot : term.first_slot + len(by_depth)].add(by_depth)
-        return local, slots
+            found = term.gradient(seen)
+            local += found.shared
+            parts = [found.depth] if found.pixel is None else [*found.pixel, found.depth]
+            for start, part in _places(term, seen, jnp.concatenate(parts)[None], sizes):
+                own = own.at[start : start + part.shape[1]].add(part[0])
+        return local, own
 
     local, by_depth = jax.vmap(edge)(problem.edges.ends, motions_of(relative), edge_data(problem))
     eta = local[:, : lie.TANGENT]
@@ -142,59 +164,124 @@ def _skew(v: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
 
 
 Seen = Sequence[tuple[EdgeTerm, EdgeView]]
+Columns = list[tuple[int, Float[Array, "r _"]]]
+"""Blocks of columns, each with its first column."""
+Coupled = tuple[Array, Columns, Array | None]
+"""Gram matrix `[d + 1, d + 1]` of one edge, its cross terms `[d + 2, 2 p + s]`, and the blocks `[3, p]` of landmarks
+with free pixels."""
 
 
-def _reweighted(seen: Seen, correction: Float[Array, ""] | None, slots: int) -> tuple[Array, Array]:
-    """Gram matrix `[d + 1, d + 1]` and cross terms `[d + 2, s]` of one edge."""
+def num_offsets(state: State) -> int:
+    """`2 p`: unknowns that are coordinates of free pixels, the first landmarks of each keyframe: all `u`, all `v`."""
+    return 0 if state.pixel_offset is None else 2 * state.pixel_offset.shape[1]
+
+
+def offsets_of(landmarks: Float[Array, "n t"]) -> Float[Array, "n p 2"]:
+    """The unknowns of free pixels as offsets."""
+    return jnp.swapaxes(landmarks.reshape(len(landmarks), 2, -1), 1, 2)
+
+
+def _as_landmarks(offsets: Float[Array, "n p 2"]) -> Float[Array, "n t"]:
+    return jnp.swapaxes(offsets, 1, 2).reshape(len(offsets), -1)
+
+
+def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
     parts = [term.columns(view, correction) for term, view in seen]
+    shared = [part[: view.size + 2] for part, (_, view) in zip(parts, seen, strict=True)]
+    by_pixel = [part[view.size + 2 :] for part, (_, view) in zip(parts, seen, strict=True)]
     # The barrier keeps XLA from forming the columns again in each product.
-    columns = jax.lax.optimization_barrier(jnp.concatenate(parts, 1))
+    columns, by_pixel = jax.lax.optimization_barrier((jnp.concatenate(shared, 1), by_pixel))
     starts = np.cumsum([0, *(part.shape[1] for part in parts)])
-    coupled = [
-        times_depth_column(columns[:, start : start + part.shape[1]], len(view.inverse_depth))
-        for start, part, (_, view) in zip(starts, parts, seen, strict=False)
-    ]
-    return (columns @ columns.T)[:-1, :-1], _placed(seen, coupled, slots)
+    coupled, blocks = [], []
+    for pixels, start, end, (_, view) in zip(by_pixel, starts, starts[1:], seen, strict=False):
+        own, slots = columns[:, start:end], len(view.inverse_depth)
+        if not view.free_pixels:
+            coupled.append(products(own, own[-1], slots))
+            blocks.append(None)
+            continue
+        unknowns = jnp.concatenate([pixels, own[-1:]])
+        coupled.append(products(own[:, None], unknowns, slots).reshape(len(own), -1))
+        blocks.append(products(pixels[np.array([0, 1, 0])], pixels[np.array([0, 1, 1])], slots))
+    return (columns @ columns.T)[:-1, :-1], *_placed(seen, coupled, blocks, sizes)
 
 
-def _exact(seen: Seen, correction: Float[Array, ""] | None, slots: int) -> tuple[Array, Array]:
+def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
     models: list[LocalModel] = [term.model(view) for term, view in seen]
-    gram = models[0].gram
+    gram, coupled, blocks = models[0].gram, [], []
     for model in models[1:]:
         gram = gram + model.gram
-    return gram, _placed(seen, [model.coupled for model in models], slots)
+    for model in models:
+        own = [] if model.pixels is None else [model.pixels.coupled[:, 0], model.pixels.coupled[:, 1]]
+        coupled.append(jnp.concatenate([*own, model.coupled], 1))
+        blocks.append(None if model.pixels is None else model.pixels.blocks)
+    return gram, *_placed(seen, coupled, blocks, sizes)
 
 
-def _placed(seen: Seen, parts: list[Float[Array, "r _"]], slots: int) -> Float[Array, "r s"]:
-    """The terms' cross terms at their slots, added up."""
-    first = [term.first_slot for term, _ in seen]
-    ends = [start + part.shape[1] for start, part in zip(first, parts, strict=True)]
-    if [0, *ends] == [*first, slots]:
-        return jnp.concatenate(parts, 1)  # one after the other, as points and lines: no padding, no sum
-    total = jnp.zeros((len(parts[0]), slots), parts[0].dtype)
-    for start, end, part in zip(first, ends, parts, strict=True):
-        total = total.at[:, start:end].add(part)
-    return total
+def _placed(
+    seen: Seen, coupled: list[Array], blocks: list[Array | None], sizes: tuple[int, int]
+) -> tuple[Columns, Array | None]:
+    """The terms' cross terms and blocks at their landmarks, added up."""
+    parts = [part for (term, view), own in zip(seen, coupled, strict=True) for part in _places(term, view, own, sizes)]
+    pixels = [
+        (term.first_slot, own[:, : view.free_pixels])
+        for (term, view), own in zip(seen, blocks, strict=True)
+        if own is not None
+    ]
+    free, slots = sizes
+    joint = jnp.concatenate([part for _, part in _joined(pixels, free)], 1) if pixels else None
+    return _joined(parts, 2 * free + slots), joint
 
 
-def _slot_terms(
+def _places(term: EdgeTerm, view: EdgeView, own: Array, sizes: tuple[int, int]) -> Columns:
+    """Where the columns of a term (those by `u`, `v`, inverse depth of its slots) are among the landmarks."""
+    first, slots, free, points = term.first_slot, len(view.inverse_depth), view.free_pixels, sizes[0]
+    if not free:
+        return [(2 * points + first, own)]
+    if free == slots == points:
+        return [(0, own)]
+    pixels = [(first + axis * points, own[:, axis * slots : axis * slots + free]) for axis in range(2)]
+    return [*pixels, (2 * points + first, own[:, 2 * slots :])]
+
+
+def _joined(parts: Columns, size: int) -> Columns:
+    """Blocks of columns that cover all `size` columns once, each with its first column."""
+    ends = [start + part.shape[1] for start, part in parts]
+    if [0, *ends] == [*(start for start, _ in parts), size]:
+        return parts  # one after the other, as points and lines: no padding, no sum
+    total = jnp.zeros((len(parts[0][1]), size), parts[0][1].dtype)
+    for start, part in parts:
+        total = total.at[:, start : start + part.shape[1]].add(part)
+    return [(0, total)]
+
+
+def _landmark_terms(
     problem: Problem, state: State, wide: int, correction: Float[Array, ""] | None, exact: bool
-) -> Float[Array, "n r s"]:
-    """Cross terms before any edge: gradient and curvature of the terms on landmarks in the last two rows."""
-    keyframes, slots = state.inverse_depth.shape
-    cross = jnp.zeros((keyframes, wide + problem.num_parameters + 2, slots), state.inverse_depth.dtype)
+) -> tuple[Float[Array, "n r s"], Float[Array, "n 3 p"] | None]:
+    """Cross terms before any edge: gradient and curvature of the terms on landmarks in the last two rows; and the
+    blocks of landmarks with free pixels.
+    """
+    (keyframes, slots), first = state.inverse_depth.shape, num_offsets(state)
+    cross = jnp.zeros((keyframes, wide + problem.num_parameters + 2, first + slots), state.inverse_depth.dtype)
     for term in problem.slot_terms:
         gradient, curvature = term.derivatives(state.inverse_depth, correction, exact)
-        cross = cross.at[:, -2].add(gradient).at[:, -1].add(curvature)
-    return cross
+        cross = cross.at[:, -2, first:].add(gradient).at[:, -1, first:].add(curvature)
+    if state.pixel_offset is None:
+        return cross, None
+    blocks = jnp.zeros((keyframes, 3, first // 2), cross.dtype)
+    for pixel in problem.pixel_terms:
+        hessian, force = pixel.model(state.pixel_offset, correction, exact)
+        cross = cross.at[:, -2, :first].add(_as_landmarks(force))
+        blocks += jnp.stack([hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1]], 1)
+    return cross, blocks
 
 
-def _held(problem: Problem, state: State, gradient: Float[Array, "n s"]) -> Bool[Array, "n s"] | None:
+def _held(problem: Problem, state: State, gradient: Float[Array, "n s"]) -> Bool[Array, "n t"] | None:
     """Landmarks on their bound that the energy presses against it; those of segments move as a whole and never are."""
     if not problem.positive_depth:
         return None
     alone = jnp.arange(gradient.shape[1]) < problem.first_segment
-    return (state.inverse_depth <= MIN_INVERSE_DEPTH) & (gradient > 0) & alone
+    held = (state.inverse_depth <= MIN_INVERSE_DEPTH) & (gradient > 0) & alone
+    return jnp.pad(held, ((0, 0), (num_offsets(state), 0)))
 
 
 def _node_factors(

@@ -26,6 +26,7 @@ from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
@@ -136,6 +137,7 @@ def _linearisation_point(prior: MarginalPrior, state: State) -> State:
         jaxlie.SE3(jnp.where(pose_known[:, None], prior.poses.wxyz_xyz, state.poses.wxyz_xyz)),
         jnp.where(intrinsics_known, prior.intrinsics, state.parameters).reshape(state.intrinsics.shape),
         state.inverse_depth,
+        state.pixel_offset,
     )
 
 
@@ -151,7 +153,7 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""]) -> A
     goes: Array
     if isinstance(term, EdgeTerm):
         goes = (problem.edges.source == leaving)[:, None]
-    elif isinstance(term, SlotTerm):
+    elif isinstance(term, SlotTerm | HostPixel):
         goes = (jnp.arange(problem.num_keyframes) == leaving)[:, None]
     elif isinstance(term, PoseTerm):
         goes = term.keyframe == leaving

@@ -89,6 +89,8 @@ def _without_edges(problem: Problem, state: State) -> Float[Array, ""]:
     total = jnp.zeros((), state.inverse_depth.dtype)
     for slot in problem.slot_terms:
         total += robust_energy(slot.kernel, slot.weights, slot.residuals(state.inverse_depth))
+    for pixel in problem.pixel_terms:
+        total += robust_energy(pixel.kernel, pixel.weights, pixel.residuals(state.pixel_offset))
     for node in problem.node_terms:
         total += robust_energy(node.kernel, node.weights, node_residuals(node, poses, cameras))
     for own in problem.camera_terms:
@@ -115,6 +117,8 @@ class Hosts(NamedTuple):
     pixels: Float[Array, "n 2 s"]
     rays: tuple[Float[Array, "n s"], Float[Array, "n s"]] | None
     inverse_depth: Float[Array, "n s"]
+    offset: Float[Array, "n p 2"] | None
+    """Of the pixels that are unknowns, which `pixels` and `rays` contain."""
 
 
 class Motions(NamedTuple):
@@ -127,12 +131,14 @@ class Motions(NamedTuple):
 
 def hosts_of(problem: Problem, state: State) -> Hosts:
     """The slots of all hosts; with viewing rays where the hand-written derivatives know the camera."""
-    pixels, rays = jnp.swapaxes(problem.pixels, 1, 2), None
+    pixels, rays = problem.pixels, None
+    if state.pixel_offset is not None:
+        pixels = pixels.at[:, : state.pixel_offset.shape[1]].add(state.pixel_offset)
     known = pinhole_parameters(cameras_of(problem, state))
     if known is not None:
         fx, fy, cx, cy = known
-        rays = ((problem.pixels[..., 0] - cx) / fx, (problem.pixels[..., 1] - cy) / fy)
-    return Hosts(pixels, rays, state.inverse_depth)
+        rays = ((pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy)
+    return Hosts(jnp.swapaxes(pixels, 1, 2), rays, state.inverse_depth, state.pixel_offset)
 
 
 def motions_of(relative: jaxlie.SE3) -> Motions:
@@ -148,7 +154,8 @@ def view_of(cameras: Cameras, hosts: Hosts, ends: tuple[Array, Array], motion: M
     if own.rays is not None and known is not None:
         fast = pinhole.OneEdge(known, motion.rotation, motion.translation)
         projection = pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, fast)
-    return EdgeView(motion.relative, cameras, ends, own.pixels, own.inverse_depth, fast, projection)
+    free = 0 if hosts.offset is None else hosts.offset.shape[1]
+    return EdgeView(motion.relative, cameras, ends, own.pixels, own.inverse_depth, fast, projection, free)
 
 
 def edge_data(problem: Problem) -> EdgeData:

@@ -58,6 +58,9 @@ class Observations:
     depth_weight: np.ndarray | None = None
     """`[D]`: its confidence; 0 = none."""
     alpha: float = 2.0
+    pixel_sigma: np.ndarray | float | None = None
+    """`[D]` or one for all, pixels: standard deviation of `pixel`, where a point was observed in its host, in the unit
+    of the matches' `1 / sqrt(weight)`; None: exact. Samples of lines have none."""
     segment: np.ndarray | None = None
     """int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples then lie on a
     straight line (two unknowns a segment); None: each sample has its own."""

@@ -38,6 +38,7 @@ from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.term_checks import check_terms
 from vggtgeo.bundle.term_padding import padded, placed
 from vggtgeo.bundle.terms.depth import DepthPrior
+from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.point import PointTerm
@@ -136,13 +137,14 @@ def pack(
     )
     problem = _of_type(problem, dtype)
     check_observed(problem)
+    offset = jnp.zeros((size.keyframes, size.points, 2), dtype) if problem.pixel_terms else None
     depths = _per_slot(index, inverse_depth, 1.0, dtype)
     if observations.segment is not None:
         present = _per_slot(index, np.ones(len(observations.host)), 0.0, dtype)
         problem, depths = _with_segments(problem, depths, present, size)
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
     start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
-    return problem, State(start, jnp.asarray(intrinsics, dtype), depths), index
+    return problem, State(start, jnp.asarray(intrinsics, dtype), depths, offset), index
 
 
 def _of_type(problem: Problem, dtype: DTypeLike) -> Problem:
@@ -183,16 +185,24 @@ def _seen(
     points = {"target": seen.point_target.astype(float), "weight": seen.point_weight, "kernel": kernel}
     lines = {"coefficients": seen.line_coefficients.astype(float), "weight": seen.line_weight, "kernel": kernel}
     end = size.points + size.lines
-    return (
+    terms = (
         placed(FlatTerm(PointTerm, points, seen.point_landmark, seen.point_edge), index, (0, size.points), dtype),
         placed(FlatTerm(LineTerm, lines, seen.line_landmark, seen.line_edge), index, (size.points, end), dtype),
         placed(FlatTerm(DepthPrior, _depth_prior(seen, kernel, dtype), every), index, (0, end), dtype),
     )
+    if seen.pixel_sigma is None or not size.points:
+        return terms
+    sigma = np.broadcast_to(np.asarray(seen.pixel_sigma, float), len(seen.host))
+    check_positive("pixel_sigma", sigma, len(seen.host))
+    points = np.flatnonzero(index.slot < size.points)
+    pixels = FlatTerm(HostPixel, {"weight": weight_of("pixel_sigma", sigma[points], dtype)}, points)
+    return (*terms, placed(pixels, index, (0, size.points), dtype))
 
 
 def _intrinsics_prior(mean: np.ndarray, sigma: Any, shape: tuple[int, ...], dtype: DTypeLike) -> IntrinsicsPrior:
     check_intrinsics_prior(mean, sigma, shape)
-    weight = np.zeros(mean.shape) if sigma is None else np.broadcast_to(weight_of(sigma, dtype), mean.shape)
+    known = 0.0 if sigma is None else weight_of("intrinsics_sigma", sigma, dtype)
+    weight = np.broadcast_to(known, mean.shape)
     return IntrinsicsPrior(
         index=jnp.arange(mean.size), mean=jnp.asarray(mean.ravel(), dtype), weight=jnp.asarray(weight.ravel(), dtype)
     )

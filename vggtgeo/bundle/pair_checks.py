@@ -45,6 +45,13 @@ def check_pair(problem: Any, state: Any, name: str = "state") -> None:
                 f"`{name}.{field}` has the shape {jnp.shape(jax.tree.leaves(getattr(state, field))[0])}; the problem "
                 f"has {wanted[0]} keyframes of {wanted[1]} slots: give the state that was packed with it"
             )
+    for term in problem.pixel_terms:
+        if state.pixel_offset is None or jnp.shape(state.pixel_offset)[:2] != jnp.shape(term.weight):
+            offset = None if state.pixel_offset is None else jnp.shape(state.pixel_offset)
+            raise InputError(
+                f"`{name}.pixel_offset` has the shape {offset}; the term `{term.name}` of the problem has weights of "
+                f"{jnp.shape(term.weight)}: give the state that was packed with it"
+            )
     of_problem, of_state = jnp.result_type(problem.pixels), jnp.result_type(*jax.tree.leaves(state))
     if any(jnp.result_type(leaf) != of_problem for leaf in jax.tree.leaves(state)):
         raise InputError(

@@ -42,8 +42,8 @@ def check_precision(given: Mapping[str, Any], dtype: DTypeLike | None, positive:
             )
 
 
-def weight_of(sigma: Any, dtype: DTypeLike) -> Any:
-    """`1 / sigma^2` of the intrinsics' prior; a deviation so large that its square is no number weighs nothing.
+def weight_of(name: str, sigma: Any, dtype: DTypeLike) -> Any:
+    """`1 / sigma^2` of the argument `name`; a deviation so large that its square is no number weighs nothing.
 
     Raises:
         InputError: a deviation so small that its weight is infinite.
@@ -53,7 +53,7 @@ def weight_of(sigma: Any, dtype: DTypeLike) -> Any:
         weight = 1 / np.square(np.asarray(sigma, np.float64))
     if not np.all(weight <= float(jnp.finfo(dtype).max)):
         raise InputError(
-            f"`intrinsics_sigma` is {sigma}; 1 / sigma^2 is beyond the numbers of {jnp.dtype(dtype)}: give a larger "
-            "one, or hold the parameter with `fixed_intrinsics`"
+            f"`{name}` is {sigma}; 1 / sigma^2 is beyond the numbers of {jnp.dtype(dtype)}: give a larger one, or hold "
+            "what is exact (`fixed_intrinsics`)"
         )
     return weight

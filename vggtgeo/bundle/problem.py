@@ -14,6 +14,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
@@ -47,6 +48,9 @@ class State(eqx.Module):
     cameras."""
     inverse_depth: Float[Array, "n s"]
     """1/m, along the optical axis of the host keyframe, one a slot."""
+    pixel_offset: Float[Array, "n p 2"] | None = None
+    """Pixels from where a landmark was observed in its host to where it is, of the first `p` slots (the points); None:
+    the observed pixels are exact."""
 
     @property
     def parameters(self) -> Float[Array, " q"]:
@@ -56,16 +60,26 @@ class State(eqx.Module):
     def moved(self, step: Float[Array, " t"]) -> State:
         """The state that a step leads to, in the coordinates of every Hessian and covariance of this package.
 
-        step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), the cameras' parameters (pixels), then the
-        inverse depths (1/m), keyframe by keyframe. Pure; the derivative at a zero step is the tangent map.
+        step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), the cameras' parameters (pixels), the inverse
+        depths (1/m), keyframe by keyframe, then the pixel offsets, if there are any, in the order of their array. Pure;
+        the derivative at a zero step is the tangent map.
         """
         poses = lie.TANGENT * len(self.inverse_depth)
         dense = poses + self.intrinsics.size
+        landmarks = dense + self.inverse_depth.size
+        offset = self.pixel_offset
         return State(
             lie.move(self.poses, step[:poses].reshape(-1, lie.TANGENT)),
             self.intrinsics + step[poses:dense].reshape(self.intrinsics.shape),
-            self.inverse_depth + step[dense:].reshape(self.inverse_depth.shape),
+            self.inverse_depth + step[dense:landmarks].reshape(self.inverse_depth.shape),
+            None if offset is None else offset + step[landmarks:].reshape(offset.shape),
         )
+
+    @property
+    def num_unknowns(self) -> int:
+        """Length of a step of `moved`."""
+        offsets = 0 if self.pixel_offset is None else self.pixel_offset.size
+        return lie.TANGENT * len(self.inverse_depth) + self.intrinsics.size + self.inverse_depth.size + offsets
 
 
 class Edges(eqx.Module):
@@ -173,6 +187,11 @@ class Problem(eqx.Module):
     def slot_terms(self) -> tuple[SlotTerm, ...]:
         """Terms on landmarks."""
         return tuple(self._of_kind(SlotTerm))
+
+    @property
+    def pixel_terms(self) -> tuple[HostPixel, ...]:
+        """Terms on the pixels of landmarks in their host."""
+        return tuple(self._of_kind(HostPixel))
 
     @property
     def node_terms(self) -> tuple[PoseTerm | PairTerm, ...]:

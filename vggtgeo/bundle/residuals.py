@@ -22,6 +22,7 @@ from vggtgeo.bundle.objective import (
 from vggtgeo.bundle.pair_checks import check_kinds, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm, node_residuals
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
@@ -133,6 +134,8 @@ def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[
     cameras = cameras_of(problem, state)
     if isinstance(term, SlotTerm):
         return term.residuals(state.inverse_depth)
+    if isinstance(term, HostPixel):
+        return term.residuals(state.pixel_offset)
     if isinstance(term, PoseTerm | PairTerm):
         return node_residuals(term, state.poses.wxyz_xyz, cameras)
     if isinstance(term, CameraTerm):

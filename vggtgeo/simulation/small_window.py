@@ -106,6 +106,7 @@ def simulate_window(
     outliers: float = 0.0,
     depth_error: float = 0.03,
     start_error: float = 0.03,
+    host_noise: bool = False,
     seed: int = 0,
 ) -> SimulatedWindow:
     """A window of `keyframes` cameras, 0.15 m apart, that look at one place.
@@ -118,6 +119,7 @@ def simulate_window(
         outliers: share of the point matches that are wrong, by 10 to 30 pixels.
         depth_error: relative standard deviation of the depth prior.
         start_error: standard deviation of the starting positions, metres.
+        host_noise: whether the points' pixels in their hosts have that noise, too, and say so (`pixel_sigma`).
         seed: of everything random.
 
     Raises:
@@ -166,10 +168,13 @@ def simulate_window(
     coefficients[:, 2] += _one_each(segment, noise, rng)
     inverse = 1 / np.concatenate([depth, line_depth])
     mean = inverse * np.exp(depth_error * rng.normal(size=len(inverse)))
+    start = poses.copy()
+    start[1:, 4:] += rng.normal(0, start_error, (keyframes - 1, 3))
+    seen = pixel + rng.normal(0, noise, pixel.shape) if host_noise else pixel
     observations = Observations(
         edges=edges,
         host=np.concatenate([host, line_host]),
-        pixel=np.concatenate([pixel, line_pixel]),
+        pixel=np.concatenate([seen, line_pixel]),
         point_edge=point_edge,
         point_landmark=point_landmark,
         point_target=target,
@@ -180,9 +185,8 @@ def simulate_window(
         line_weight=np.ones(len(line_edge)),
         depth_mean=mean,
         depth_sigma=max(depth_error, 1e-3) * mean,
+        pixel_sigma=1.0 if host_noise else None,
     )
-    start = poses.copy()
-    start[1:, 4:] += rng.normal(0, start_error, (keyframes - 1, 3))
     return SimulatedWindow(observations, poses, inverse, start, outlier, noise)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.analysis.redundancy import changing
-from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
@@ -172,7 +172,7 @@ def _covariances_jit(
     return Covariances(
         poses=found.nodes,
         intrinsics=found.shared,
-        inverse_depth=found.landmarks,
+        inverse_depth=found.landmarks[:, num_offsets(state) :],
         neighbours=found.neighbours,
         variance_factor=variance_factor(ready, state, found.rank),
         parameters=problem.parameter_names,

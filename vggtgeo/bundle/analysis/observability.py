@@ -21,7 +21,6 @@ Cost: one linearisation a term, and for `k` terms `2 k + 1` Schur complements an
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -34,7 +33,7 @@ from jaxtyping import Array, Bool, Float
 from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
-from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
@@ -43,8 +42,8 @@ from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, Blocks, NodeFactors, Reduced, dense_gradient, reduce
 from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
+from vggtgeo.solvers.landmark_basis import join_landmarks
 from vggtgeo.solvers.local_inverse import balance
-from vggtgeo.solvers.segments import join_segments
 
 DENSE_KEYFRAMES = 300
 """Most keyframes whose spectra are computed whole: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
@@ -104,7 +103,7 @@ def _selections(count: int, state: State) -> Float[Array, "m k"]:
 def _found(
     problem: Problem, state: State, systems: list[ArrowSystem], coordinates: _Coordinates, spectra: Spectra
 ) -> Observability:
-    count, directions = len(systems), coordinates.common
+    count, directions, first = len(systems), coordinates.common, num_offsets(state)
     part = lambda start, end: jax.tree.map(lambda leaf: leaf[start:end], spectra)
     balanced = directions * coordinates.scale
     size = jnp.linalg.norm(balanced, axis=1, keepdims=True)
@@ -114,7 +113,7 @@ def _found(
         without=part(1 + count, None),
         common=balanced / jnp.where(size > 0, size, 1.0),
         free=coordinates.free,
-        landmark_information=sum(system.landmark_hessian for system in systems) * state.inverse_depth**2,
+        landmark_information=sum(system.landmark_hessian[:, first:] for system in systems) * state.inverse_depth**2,
         landmark_used=_used(problem),
         terms=tuple(term.name for term in problem.terms),
         keyframes=problem.num_keyframes,
@@ -159,7 +158,7 @@ class _Coordinates(NamedTuple):
 def _linearise_each(problem: Problem, state: State) -> tuple[list[ArrowSystem], ArrowSystem, _Coordinates]:
     """One system a term, landmarks of segments not joined yet; that of all terms, and its coordinates."""
     ready = prepared(problem)
-    systems = [linearise(replace(ready.with_terms((term,)), fraction=None), state) for term in ready.terms]
+    systems = [linearise(ready.with_terms((term,)), state, joined=False) for term in ready.terms]
     everything = _combine(systems, jnp.ones(len(systems), state.inverse_depth.dtype), problem.fraction)
     scale, free = balance(everything, dense_gradient(everything)[1]), everything.free
     directions = jnp.where(free, common_directions(problem, state), 0.0)
@@ -189,16 +188,17 @@ def _combine(
         if own is not None
     ]
     system = eqx.tree_at(
-        lambda s: (s.gram, s.cross, s.prior_hessian, s.factors, s.held),
+        lambda s: (s.gram, s.cross, s.blocks, s.prior_hessian, s.factors, s.held),
         systems[0],
         (
             *(total([system.gram for system in systems]), total([system.cross for system in systems])),
+            None if systems[0].blocks is None else total([system.blocks for system in systems]),
             *(total(priors), jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *factors) if factors else None),
             None,
         ),
         is_leaf=lambda leaf: leaf is None,
     )
-    return system if fraction is None else join_segments(system, fraction)
+    return join_landmarks(system, fraction)
 
 
 def _spectrum(reduced: Reduced, coordinates: _Coordinates) -> Spectra:

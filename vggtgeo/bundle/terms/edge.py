@@ -2,7 +2,8 @@
 
 Local coordinates of one edge: the left tangent `eta` of the relative pose (6), the parameters of all cameras (q), and
 the inverse depth of each landmark. Slots come last in every array, so that each quantity is contiguous: columns are
-`[6 + q + 2, m p]`, in the order eta, camera, residual, inverse depth, for `m` residual rows after one another.
+`[6 + q + 2, m p]`, in the order eta, camera, residual, inverse depth, for `m` residual rows after one another. Where
+the pixels of the slots in their host are unknowns, too (`terms/host_pixel.py`), two rows follow: by `u`, by `v`.
 """
 
 from __future__ import annotations
@@ -45,6 +46,8 @@ class EdgeView(eqx.Module):
     inverse_depth: Float[Array, " p"]
     fast: pinhole.OneEdge | None
     projection: Projection | None
+    free_pixels: int = eqx.field(static=True, default=0)
+    """The first slots, so many, have a pixel that is an unknown."""
 
     @property
     def size(self) -> int:
@@ -65,16 +68,39 @@ class EdgeView(eqx.Module):
         part = lambda leaf: leaf[..., first : first + count]
         projection = jax.tree.map(part, self.projection)
         own = part(self.pixels), part(self.inverse_depth)
-        return EdgeView(self.relative, self.cameras, self.ends, *own, self.fast, projection)
+        free = min(max(self.free_pixels - first, 0), count)
+        return EdgeView(self.relative, self.cameras, self.ends, *own, self.fast, projection, free)
+
+
+class Gradient(NamedTuple):
+    """Of one edge's energy."""
+
+    shared: Float[Array, " d"]
+    """By relative pose and camera."""
+    depth: Float[Array, " p"]
+    """By each inverse depth."""
+    pixel: Float[Array, "2 p"] | None
+    """By each pixel in the host, where those are unknowns."""
 
 
 class LocalModel(NamedTuple):
-    """Exact second-order model of one edge's energy; `d = 6 + q`."""
+    """Second-order model of one edge's energy; `d = 6 + q`."""
 
     gram: Float[Array, "d+1 d+1"]
     """Hessian by the shared coordinates, with the gradient as last row and column (the corner is unused)."""
     coupled: Float[Array, "d+2 p"]
     """Mixed derivatives with each inverse depth, then its gradient and its curvature."""
+    pixels: PixelModel | None = None
+    """The same for the pixels of the slots, where those are unknowns."""
+
+
+class PixelModel(NamedTuple):
+    """What one edge says of the pixels of `p` slots in their host."""
+
+    coupled: Float[Array, "d+2 2 p"]
+    """Mixed derivatives by `u` and `v` with the shared coordinates, their gradient, and those with inverse depth."""
+    blocks: Float[Array, "3 p"]
+    """Second derivatives `uu, vv, uv`."""
 
 
 class EdgeTerm(AbstractTerm):
@@ -123,30 +149,57 @@ class EdgeTerm(AbstractTerm):
         shared = jax.vmap(by_shared)(jnp.eye(view.size, dtype=zero.dtype))
         ones = jnp.ones_like(view.inverse_depth)
         residual, depth = jax.jvp(lambda d: self._moved(view, zero, d), (view.inverse_depth,), (ones,))
-        jacobian = jnp.concatenate([shared, depth[None]])
+        jacobian = jnp.concatenate([shared, depth[None], *self._by_pixel(view, zero)])
         rows, pull = reweighted_rows(self.kernel, self.weights, residual, jacobian, correction)
-        return jnp.concatenate([rows[:-1], pull[None], rows[-1:]]).reshape(len(rows) + 1, -1)
+        return jnp.concatenate([rows[: view.size], pull[None], rows[view.size :]]).reshape(len(rows) + 1, -1)
 
-    def gradient(self, view: EdgeView) -> tuple[Float[Array, " d"], Float[Array, " p"]]:
-        """Gradient of one edge's energy by relative pose and camera, and by each inverse depth."""
+    def gradient(self, view: EdgeView) -> Gradient:
+        """Gradient of one edge's energy by relative pose and camera, by each inverse depth, and by the pixels."""
         zero = jnp.zeros(view.size, view.inverse_depth.dtype)
-        return jax.grad(self._energy_at, (1, 2))(view, zero, view.inverse_depth)
+        by_shared, by_depth, by_pixel = jax.grad(self._energy_at, (1, 2, 3))(
+            view, zero, view.inverse_depth, view.pixels
+        )
+        return Gradient(by_shared, by_depth, by_pixel if view.free_pixels else None)
 
     def model(self, view: EdgeView) -> LocalModel:
         """Exact Hessian and gradient of one edge."""
-        zero, depth = jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth
-        gradient = lambda x, d: jax.grad(self._energy_at, (1, 2))(view, x, d)
-        along = lambda tangent: jax.jvp(lambda x: gradient(x, depth), (zero,), (tangent,))[1]
-        hessian, mixed = jax.vmap(along)(jnp.eye(view.size, dtype=zero.dtype))
-        (shared, own), (_, curvature) = jax.jvp(lambda d: gradient(zero, d), (depth,), (jnp.ones_like(depth),))
+        zero, depth, pixels = jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth, view.pixels
+        gradient = lambda x, d, u: jax.grad(self._energy_at, (1, 2, 3))(view, x, d, u)
+        along = lambda tangent: jax.jvp(lambda x: gradient(x, depth, pixels), (zero,), (tangent,))[1]
+        hessian, mixed, mixed_pixels = jax.vmap(along)(jnp.eye(view.size, dtype=zero.dtype))
+        ones = jnp.ones_like(depth)
+        (shared, own, force), (_, curvature, coupling) = jax.jvp(lambda d: gradient(zero, d, pixels), (depth,), (ones,))
         gram = jnp.pad(hessian, (0, 1)).at[-1, :-1].set(shared).at[:-1, -1].set(shared)
-        return LocalModel(gram, jnp.concatenate([mixed, own[None], curvature[None]]))
+        coupled = jnp.concatenate([mixed, own[None], curvature[None]])
+        if not view.free_pixels:
+            return LocalModel(gram, coupled)
+        # A residual sees the pixel of one slot: one product with ones has the blocks of all slots.
+        bend = lambda axis: jax.jvp(
+            lambda u: gradient(zero, depth, u)[2], (pixels,), (jnp.zeros_like(pixels).at[axis].set(1.0),)
+        )[1]
+        (by_uu, by_uv), (_, by_vv) = bend(0), bend(1)
+        by_pixels = jnp.concatenate([mixed_pixels, force[None], coupling[None]])
+        return LocalModel(gram, coupled, PixelModel(by_pixels, jnp.stack([by_uu, by_vv, by_uv])))
 
-    def _energy_at(self, view: EdgeView, shared: Array, depth: Array) -> Float[Array, ""]:
-        return robust_energy(self.kernel, self.weights, self._moved(view, shared, depth))
+    def _by_pixel(self, view: EdgeView, shared: Float[Array, " d"]) -> list[Float[Array, "2 m p"]]:
+        """Derivatives of the residuals by `u` and `v` in the host, where those are unknowns."""
+        if not view.free_pixels:
+            return []
+        residuals = lambda pixels: self._moved(view, shared, view.inverse_depth, pixels)
+        axes = [jnp.zeros_like(view.pixels).at[axis].set(1.0) for axis in range(2)]
+        return [jnp.stack([jax.jvp(residuals, (view.pixels,), (axis,))[1] for axis in axes])]
 
-    def _moved(self, view: EdgeView, shared: Float[Array, " d"], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
-        """Residuals after a step of the shared coordinates, at the given depths."""
+    def _energy_at(self, view: EdgeView, shared: Array, depth: Array, pixels: Array) -> Float[Array, ""]:
+        return robust_energy(self.kernel, self.weights, self._moved(view, shared, depth, pixels))
+
+    def _moved(
+        self,
+        view: EdgeView,
+        shared: Float[Array, " d"],
+        depth: Float[Array, " p"],
+        pixels: Float[Array, "2 p"] | None = None,
+    ) -> Float[Array, "m p"]:
+        """Residuals after a step of the shared coordinates, at the given depths and, if any, pixels in the host."""
         relative = lie.move(view.relative, shared[: lie.TANGENT])
         cameras = view.cameras.moved(shared[lie.TANGENT :])
         host, camera = (cameras.of(keyframe) for keyframe in view.ends)
@@ -154,9 +207,12 @@ class EdgeTerm(AbstractTerm):
         def one(data: dict, pixel: Array, inverse_depth: Array) -> Array:
             return check_residual(self, self.holding(data).residual(View(relative, camera, pixel, inverse_depth, host)))
 
-        return jax.vmap(one, in_axes=-1, out_axes=-1)(self.data(), view.pixels, depth)
+        pixels = view.pixels if pixels is None else pixels
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(self.data(), pixels, depth)
 
 
+_CENTRE = lie.TANGENT + 2
+"""Where a row has its derivative by the principal point."""
 _WITH_ENTRIES = 3
 """Axes of prepared data that have entries beside edge and slot."""
 
@@ -208,17 +264,21 @@ class ImageTerm(EdgeTerm):
         for i, r in enumerate(residual):
             a, b = (scale.root * (of[i] - pulled * r) for of, pulled in zip(normal, along, strict=True))
             row = pinhole.row(view.fast, view.projection, a, b)
-            parts.append(jnp.stack([*view.tied(row[:-1]), scale.root * r / scale.soft, row[-1]]))
+            # The centre moves the pixel in the target and, the other way, the ray in the host.
+            own = [a - row[_CENTRE], b - row[_CENTRE + 1]] if view.free_pixels else []
+            parts.append(jnp.stack([*view.tied(row[:-1]), scale.root * r / scale.soft, row[-1], *own]))
         return jnp.concatenate(parts, 1)
 
-    def gradient(self, view: EdgeView) -> tuple[Float[Array, " d"], Float[Array, " p"]]:
+    def gradient(self, view: EdgeView) -> Gradient:
         if view.fast is None or view.projection is None:
             return super().gradient(view)
-        row = pinhole.row(view.fast, view.projection, *self._force(view, view.projection))
-        return jnp.stack([jnp.sum(column) for column in view.tied(row[:-1])]), row[-1]
+        a, b = self._force(view, view.projection)
+        row = pinhole.row(view.fast, view.projection, a, b)
+        own = jnp.stack([a - row[_CENTRE], b - row[_CENTRE + 1]]) if view.free_pixels else None
+        return Gradient(jnp.stack([jnp.sum(column) for column in view.tied(row[:-1])]), row[-1], own)
 
     def model(self, view: EdgeView) -> LocalModel:
-        if view.fast is None or view.projection is None:
+        if view.fast is None or view.projection is None or view.free_pixels:
             return super().model(view)
         edge, at = view.fast, view.projection
         residual, normal = self._image(view, at)
@@ -283,11 +343,11 @@ def _tied_model(view: EdgeView, model: LocalModel) -> LocalModel:
     return LocalModel(jnp.stack(view.tied(list(once.T))), jnp.stack(view.tied(list(model.coupled))))
 
 
-def times_depth_column(columns: Float[Array, "c mp"], slots: int) -> Float[Array, "c p"]:
-    """Each column times the depth column, the rows of an observation added; gradient and curvature come last."""
-    depth = columns[-1]
+def products(left: Float[Array, "... mp"], right: Float[Array, "... mp"], slots: int) -> Float[Array, "... p"]:
+    """Products of columns (each with that by the inverse depth, say), the rows of an observation added."""
     parts = [
-        columns[:, start : start + slots] * depth[start : start + slots] for start in range(0, columns.shape[1], slots)
+        left[..., start : start + slots] * right[..., start : start + slots]
+        for start in range(0, left.shape[-1], slots)
     ]
     return sum(parts[1:], parts[0])
 

@@ -1,0 +1,38 @@
+"""From the landmarks of a problem to the coordinates in which a system holds them as independent scalars, and back.
+
+Two changes of basis, each about landmarks of its own: those of three unknowns (`triples.py`), the first of a host, and
+those on straight segments (`segments.py`), the last.
+"""
+
+from __future__ import annotations
+
+from jaxtyping import Array, Float
+from vggtgeo.solvers import segments, triples
+from vggtgeo.solvers.arrow import ArrowSystem, LandmarkBasis
+
+
+def join_landmarks(system: ArrowSystem, fraction: Float[Array, "n m q"] | None) -> ArrowSystem:
+    """The system with scalar landmarks alone: triples and, where there is a `fraction`, segments in their basis."""
+    system = triples.join_triples(system)
+    return system if fraction is None else segments.join_segments(system, fraction)
+
+
+def expand(basis: LandmarkBasis, landmarks: Float[Array, "n *rows s"]) -> Float[Array, "n *rows z"]:
+    """A step of the system's landmarks as one of the problem's."""
+    if basis.segments is not None:
+        landmarks = segments.expand_segments(basis.segments, landmarks)
+    return landmarks if basis.triples is None else triples.expand_triples(basis.triples, landmarks)
+
+
+def expand_variance(basis: LandmarkBasis, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
+    """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
+    if basis.segments is not None:
+        variance = segments.expand_segments_variance(basis.segments, variance)
+    return variance if basis.triples is None else triples.expand_triples_variance(basis.triples, variance)
+
+
+def restrict(basis: LandmarkBasis, gradient: Float[Array, "n z"]) -> Float[Array, "n s"]:
+    """The transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
+    if basis.segments is not None:
+        gradient = segments.restrict_segments(basis.segments, gradient)
+    return gradient if basis.triples is None else triples.restrict_triples(basis.triples, gradient)

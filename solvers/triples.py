@@ -1,0 +1,101 @@
+"""Landmarks of three unknowns, eliminated one by one: a scalar each once their own block is diagonal.
+
+Each of `p` landmarks `z_d` of a host may have two more unknowns `z_u` and `z_v`, which no other landmark shares. The
+landmarks of a host are then all `z_u`, all `z_v`, all `z_d`, and last the others. The block of one is symmetric,
+`V = L D L'` with a unit lower triangle `L` in the order `u, v, d`:
+
+    a = V_ud / V_uu,   c = V_uv / V_uu,   b = (V_vd - c V_ud) / D_v,
+    D_u = V_uu,        D_v = V_vv - c V_uv,        D_d = V_dd - a V_ud - b (V_vd - c V_ud).
+
+In the coordinates `y = L' z` it is `D`, so that all that is written for scalar landmarks (Schur complement, damping,
+covariance) holds for triples, too. Only what enters and leaves the system passes through this basis:
+
+    rows of the cross terms and gradients   w_y = L^-1 w_z:   w_v -= c w_u,    w_d -= a w_u + b w_v     (`restrict`)
+    steps                                   z = L'^-1 y:      z_d = y_d,  z_v = y_v - b y_d,  z_u = y_u - c z_v - a z_d
+
+`z_d` is eliminated last, so it is `y_d`: a landmark that is held stays where it is in both. Cost: three more products a
+cross term, and a Schur product of `s + 2 p` columns in place of `s`.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from vggtgeo.solvers.arrow import ArrowSystem, TripleLandmarks
+
+
+def join_triples(system: ArrowSystem) -> ArrowSystem:
+    """The system in coordinates in which the blocks of its triples are diagonal."""
+    if system.blocks is None:
+        return system
+    hessian_u, hessian_v, mixed_uv = (system.blocks[:, k] for k in range(3))
+    count = hessian_u.shape[-1]
+    mixed_u, mixed_v, hessian_d, _ = _split(system.cross[:, -1], count)
+    ratio_u, ratio_uv = _divided(mixed_u, hessian_u), _divided(mixed_uv, hessian_u)
+    rest_v = mixed_v - ratio_uv * mixed_u
+    # Where one match alone sees a landmark that its host does not, a pivot is rounding error.
+    own_v = _pivot(hessian_v - ratio_uv * mixed_uv, hessian_v)
+    ratio_v = _divided(rest_v, own_v)
+    own_d = _pivot(hessian_d - ratio_u * mixed_u - ratio_v * rest_v, hessian_d)
+    triples = TripleLandmarks(ratio_u, ratio_v, ratio_uv)
+    by_u, by_v, by_d, _ = _split(system.cross, count)
+    by_v = by_v - ratio_uv[:, None] * by_u
+    by_d = by_d - ratio_u[:, None] * by_u - ratio_v[:, None] * by_v
+    # Stacked, not concatenated: on a CPU fifteen times as fast.
+    rows = jnp.stack([by_u, by_v, by_d], 2).at[:, -1].set(jnp.stack([hessian_u, own_v, own_d], 1))
+    cross = jax.lax.dynamic_update_slice(system.cross, rows.reshape(*rows.shape[:2], 3 * count), (0, 0, 0))
+    return eqx.tree_at(
+        lambda s: (s.cross, s.triples, s.blocks), system, (cross, triples, None), is_leaf=lambda leaf: leaf is None
+    )
+
+
+def restrict_triples(triples: TripleLandmarks, gradient: Float[Array, "n s"]) -> Float[Array, "n s"]:
+    """`L^-1 w`: a gradient by the unknowns of the landmarks as one by the system's coordinates."""
+    by_u, by_v, by_d, others = _split(gradient, triples.ratio_u.shape[-1])
+    by_v = by_v - triples.ratio_uv * by_u
+    by_d = by_d - triples.ratio_u * by_u - triples.ratio_v * by_v
+    return jnp.concatenate([by_u, by_v, by_d, others], -1)
+
+
+def depth_gradient(system: ArrowSystem) -> Float[Array, "n s"]:
+    """The gradient by `z_d` and the other landmarks, before triples were made scalars: `h_d + a h_u + b h_v`."""
+    if system.triples is None:
+        return system.landmark_gradient
+    by_u, by_v, by_d, others = _split(system.landmark_gradient, system.triples.ratio_u.shape[-1])
+    by_d = by_d + system.triples.ratio_u * by_u + system.triples.ratio_v * by_v
+    return jnp.concatenate([by_d, others], -1)
+
+
+def expand_triples(triples: TripleLandmarks, landmarks: Float[Array, "n *rows s"]) -> Float[Array, "n *rows s"]:
+    """`L'^-1 y`: a step of the system's landmarks as one of the problem's."""
+    wide = lambda leaf: leaf.reshape(leaf.shape[0], *(1,) * (landmarks.ndim - 2), leaf.shape[1])
+    y_u, y_v, z_d, others = _split(landmarks, triples.ratio_u.shape[-1])
+    z_v = y_v - wide(triples.ratio_v) * z_d
+    z_u = y_u - wide(triples.ratio_uv) * z_v - wide(triples.ratio_u) * z_d
+    return jnp.concatenate([z_u, z_v, z_d, others], -1)
+
+
+def expand_triples_variance(triples: TripleLandmarks, variance: Float[Array, "n s"]) -> Float[Array, "n s"]:
+    """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
+    of_u, of_v, of_d, others = _split(variance, triples.ratio_u.shape[-1])
+    z_v = of_v + triples.ratio_v**2 * of_d
+    z_u = of_u + triples.ratio_uv**2 * of_v + (triples.ratio_uv * triples.ratio_v - triples.ratio_u) ** 2 * of_d
+    return jnp.concatenate([z_u, z_v, of_d, others], -1)
+
+
+def _split(values: Array, count: int) -> tuple[Array, Array, Array, Array]:
+    """`u, v, d` of the triples and the other landmarks, out of the last axis."""
+    parts = (slice(0, count), slice(count, 2 * count), slice(2 * count, 3 * count), slice(3 * count, None))
+    u, v, d, others = (values[..., part] for part in parts)
+    return u, v, d, others
+
+
+def _divided(value: Array, by: Array) -> Array:
+    return jnp.where(by != 0, value / jnp.where(by != 0, by, 1.0), 0.0)
+
+
+def _pivot(value: Array, whole: Array) -> Array:
+    """A pivot, zero where it is no more than the rounding error of what it was subtracted from."""
+    return jnp.where(jnp.abs(value) > 1e3 * jnp.finfo(value.dtype).eps * jnp.abs(whole), value, 0.0)

@@ -1,0 +1,52 @@
+"""The observation of a landmark in its host image, which has noise as its matches have."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, local_model
+
+
+class HostPixel(AbstractTerm):
+    """`r = offset`, pixels: the landmark's pixel in its host, minus where it was observed (`Problem.pixels`).
+
+    Without it the bearing of a landmark is exact by construction, and the noise of the host's key point, which all its
+    matches share, is taken for theirs. With it a landmark has three unknowns: `State.pixel_offset` and its inverse
+    depth, which is bundle adjustment over points in space. `weight` has the axes `[n, p]`: keyframe and point slot.
+
+    Example:
+        >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
+        >>> problem.host_pixels.weight.shape, initial.pixel_offset.shape
+        ((3, 10), (3, 10, 2))
+
+    """
+
+    name = "host_pixels"
+    unit = "px"
+
+    def residual(self, offset: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Of one landmark, pixels."""
+        return offset
+
+    def residuals(self, offset: Float[Array, "n p 2"]) -> Float[Array, "2 n p"]:
+        """Of all of them, the residual's own axis first."""
+        each = lambda data, one: check_residual(self, self.holding(data).residual(one))
+        return jax.vmap(jax.vmap(each, out_axes=-1), out_axes=1)(self.data(), offset)
+
+    def model(
+        self, offset: Float[Array, "n p 2"], correction: Float[Array, ""] | None, exact: bool
+    ) -> tuple[Float[Array, "n p 2 2"], Float[Array, "n p 2"]]:
+        """Hessian and gradient of the energy of each landmark; of a prepared term."""
+
+        def one(data: dict, weight: Array, at: Array) -> tuple[Array, Array]:
+            residual = lambda step: check_residual(self, self.holding(data).residual(at + step))
+            return local_model(self, weight, residual, 2, correction, exact)
+
+        return jax.vmap(jax.vmap(one))(self.data(), self.weights, offset)
+
+    def gradient(self, offset: Float[Array, "n p 2"]) -> Float[Array, "n p 2"]:
+        """First derivative of the energy, differentiable once more."""
+        pull = self.weights * self.kernel.weight(self.weights * jnp.sum(offset**2, -1))
+        return pull[..., None] * offset
