@@ -12,9 +12,10 @@ from layout_checks import checked
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets import open_sequence
-from vggtgeo.datasets.registration import registered_depth
+from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.datasets.seven_scenes import _TO_COLOUR
 from vggtgeo.datasets.tanks import inside_crop
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.results.source import opened
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -292,10 +293,10 @@ def test_registered_depth_keeps_the_nearer_surface() -> None:
     rng = np.random.default_rng(0)
     depth = rng.uniform(1, 3, (30, 40)).astype(np.float32)
     depth[rng.random((30, 40)) < 0.3] = np.nan
-    same = registered_depth(depth, tiny_sequences.INTRINSICS, tiny_sequences.INTRINSICS, np.eye(4), (40, 30))
-    np.testing.assert_allclose(same, depth, rtol=1e-6)
-    small = registered_depth(depth, (35.0, 35.0, 20.0, 15.0), (0.01, 0.01, 0.0, 0.0), np.eye(4), (1, 1))
-    assert small[0, 0] == np.nanmin(depth)
+    own = Camera(tiny_sequences.INTRINSICS, 40, 30)
+    np.testing.assert_allclose(DepthRegistration.of(own, own, np.eye(4))(depth), depth, rtol=1e-6)
+    small = Camera((0.01, 0.01, 0.0, 0.0), 1, 1)
+    assert DepthRegistration.of(own, small, np.eye(4))(depth)[0, 0] == np.nanmin(depth)
     behind = np.eye(4)
     behind[2, 3] = -5.0
-    assert np.isnan(registered_depth(depth, (35.0, 35.0, 20.0, 15.0), (35.0, 35.0, 20.0, 15.0), behind, (40, 30))).all()
+    assert np.isnan(DepthRegistration.of(own, own, behind)(depth)).all()
