@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tiny_layouts as tiny
@@ -46,6 +47,33 @@ def test_scannet_brings_images_to_the_depth_camera(tmp_path: Path, write: Callab
     assert frames[2].depth[3, 7] == pytest.approx(1.027)
     with pytest.warns(InputWarning, match="1 of 3 poses have a NaN or an infinity"):
         assert sequence.ground_truth().positions[:, 0].tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("write", [tiny.scannet, tiny.scannet_flat])
+def test_scannet_s_cameras_at_two_places(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    # Proves that extrinsics of the cameras move depth and poses to the colour camera. Oracle: a wall 2 m away that
+    # begins in the column 20 of the depth, seen from 10 cm to its left, and the place of the colour camera.
+    folder = write(tmp_path / "scene0000_00")
+    matrix = np.eye(4)
+    matrix[0, 3] = 0.1  # a point of the rig, which is the depth camera, is 10 cm to the right in the colour camera
+    numbers = " ".join(map(str, matrix.ravel()))
+    if (folder / "intrinsic").is_dir():
+        (folder / "intrinsic/extrinsic_color.txt").write_text(numbers)
+    else:
+        with (folder / "_info.txt").open("a") as info:
+            info.write(f"m_calibrationColorExtrinsic = {numbers}\n")
+    codes = np.zeros((30, 40), np.uint16)
+    codes[:, 20:] = 2000
+    for file in (*folder.glob("depth/*"), *folder.glob("*.depth.pgm")):
+        cv2.imwrite(str(file), codes)
+    sequence = tiny.quietly_opened(folder)
+    shift = round(sequence.camera.intrinsics[0] * 0.1 / 2.0)
+    depth = next(sequence.frames()).depth
+    assert shift > 1
+    assert (depth[:, 20 + shift :] == 2.0).all()
+    assert np.isnan(depth[:, : 20 + shift]).all()
+    with pytest.warns(InputWarning, match="1 of 3 poses"):
+        assert sequence.ground_truth().positions[:, 0].tolist() == pytest.approx([-0.1, 1.9])
 
 
 def test_euroc_is_the_left_camera(tmp_path: Path) -> None:
