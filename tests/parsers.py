@@ -198,6 +198,8 @@ KINDS = (
     layout("ARKit poses", layouts.arkit, "data/lowres_wide.traj"),
     layout("ARKit camera", layouts.arkit, "data/lowres_wide_intrinsics/41069021_305.477.pincam"),
     layout("Record3D", layouts.record3d, "data/metadata"),
+    layout("3D Scanner App", layouts.scanner3d, "data/frame_00002.json"),
+    layout("Polycam", layouts.polycam, "data/keyframes/cameras/6234600000.json"),
     layout("Stray poses", layouts.stray, "data/odometry.csv", count=8),
     layout("Stray camera", layouts.stray, "data/camera_matrix.csv", count=8),
     Kind("problem", "p.npz", lambda folder: bad.problem()(folder).read_bytes(), finite_problem, 60),

@@ -24,6 +24,7 @@ from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.not_read import reason_not_read
+from vggtgeo.datasets.phone_exports import Polycam, Scanner3d
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
 from vggtgeo.datasets.replica import Replica
@@ -64,6 +65,8 @@ FOLDER_KINDS: dict[str, FolderReader] = {
     "7scenes": SevenScenes,
     "tum": TumRgbd,
     "nerfstudio": Nerfstudio,
+    "3dscanner": Scanner3d,
+    "polycam": Polycam,
     "rgbd": RgbdFolders,
     "images": ImageFolder,
 }
