@@ -151,7 +151,7 @@ def _open_place(place: Path, kind: str | None, depth: bool) -> Sequence:
     if place.is_file() and (kind == "record3d" or (kind is None and Record3d.matches(place))):
         return Record3d.open(place)
     if kind == "video" or (kind is None and not place.is_dir()):
-        return _open_video(place)
+        return _open_video(place, depth)
     if not place.is_dir():
         raise InputError(f"`{place}` is a file; the reader {kind!r} needs a folder")
     return _open_folder(place, kind)
@@ -196,7 +196,7 @@ def _dead_links(folder: Path) -> str:
     )
 
 
-def _open_video(file: Path) -> Sequence:
+def _open_video(file: Path, depth: bool) -> Sequence:
     if file.is_dir():
         raise InputError(f"`{file}` is a folder; the reader 'video' needs a file")
     if not file.is_file():
@@ -214,7 +214,7 @@ def _open_video(file: Path) -> Sequence:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
     if reason := reason_not_read(file):
         raise InputError(reason)
-    return VideoFile.open(file)
+    return VideoFile.open(file, depth)
 
 
 _PNG = b"\x89PNG\r\n\x1a\n"

@@ -70,7 +70,7 @@ class StrayScanner:
             )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)  # the video alone has no intrinsics; the folder has
-            video = VideoFile.open(folder / "rgb.mp4")
+            video = VideoFile.open(folder / "rgb.mp4", depth=False)
         width, height = video.camera.width, video.camera.height
         reduction = -(-max(width, height) // LARGEST)
         file = folder / "camera_matrix.csv"

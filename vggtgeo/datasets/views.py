@@ -108,5 +108,6 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
 
 def without_depth(sequence: Sequence) -> Sequence:
     """The colour images alone; depth files are not even decoded."""
-    source = replace(sequence, has_depth=False) if isinstance(sequence, FolderSequence) else sequence
+    known = isinstance(sequence, FolderSequence | RosBag | VideoFile)
+    source = replace(sequence, has_depth=False) if known else sequence  # type: ignore[type-var]
     return SequenceView(source, sequence.camera, has_depth=False)
