@@ -112,8 +112,13 @@ def test_two_cameras_in_one_frame_need_no_transform(tmp_path: Path) -> None:
         ({"tf": steps(moving=True)}, "", "tf_static"),
         ({"tf__static": steps()}, "c_depth_info", "`CameraInfo` of `/c/depth/image`"),
         ({"tf__static": steps()}, "c_color_info", "`CameraInfo` of `/c/color/image`"),
+        (
+            {"tf__static": steps(), "c_info": of_frame(info((64, 48), matrix(DEPTH)), FRAMES[1])},
+            "c_depth_info",
+            "`CameraInfo` of `/c/depth/image`",
+        ),
     ],
-    ids=["no transform", "one that changes", "no camera of the depth", "no camera of the images"],
+    ids=["no transform", "one that changes", "no camera of the depth", "no camera of the images", "one of both topics"],
 )
 def test_depth_that_cannot_be_registered_is_refused(
     tmp_path: Path, more: dict[str, Topic], gone: str, missing: str

@@ -48,10 +48,10 @@ def depth_camera_of(
 
     """
     image, size = cameras
-    beside = {name: messages for name, messages in infos.items() if is_beside(name, chosen.depth)}
-    own = camera_of(path, beside, chosen.depth, size)
     frames = [frame_name(first[topic].header.frame_id) for topic in (chosen.depth, chosen.colour)]
     stated = all(frames)
+    beside = {name: messages for name, messages in infos.items() if _may_be_of_depth(name, messages, chosen, frames[0])}
+    own = camera_of(path, beside, chosen.depth, size)
     if own is None and (not stated or frames[0] == frames[1] or is_registered(chosen.depth)):
         return None
     if own is not None and own == image and (not stated or frames[0] == frames[1]):
@@ -64,6 +64,13 @@ def depth_camera_of(
     if own is None or image is None or motion is None:
         raise InputError(_refusal(path, chosen, frames, (own, image), motion))
     return DepthCamera(own, motion)
+
+
+def _may_be_of_depth(info: str, messages: Sequence[Any], chosen: Chosen, frame: str) -> bool:
+    """One beside both topics is that of the depth if it states its frame, or none."""
+    if not messages or not is_beside(info, chosen.depth):
+        return False
+    return not is_beside(info, chosen.colour) or frame_name(messages[0].header.frame_id) in ("", frame)
 
 
 def _refusal(
