@@ -155,6 +155,18 @@ def _distances(path: Path) -> None:
     assert not (depth <= 0).any()
 
 
+def _alone(make: Callable[[Path], Path], name: str) -> Callable[[Path], Path]:
+    """The same recording with the one file of JSON that has this name: of several, a damaged one is left out."""
+
+    def made(folder: Path) -> Path:
+        for file in make(folder).rglob("*.json"):
+            if file.name != name:
+                file.unlink()
+        return folder
+
+    return made
+
+
 KINDS = (
     Kind("trajectory", "t.txt", lambda folder: bad.walk(folder / "g.txt", 0, 6).read_bytes(), Trajectory.load_tum, 300),
     Kind("calibration", "calibration.txt", lambda _: b"55 55 31.5 23.5 0.1 0.1 0 0\n", _camera, 300),
@@ -198,6 +210,8 @@ KINDS = (
     layout("ARKit poses", layouts.arkit, "data/lowres_wide.traj"),
     layout("ARKit camera", layouts.arkit, "data/lowres_wide_intrinsics/41069021_305.477.pincam"),
     layout("Record3D", layouts.record3d, "data/metadata"),
+    layout("3D Scanner App", _alone(layouts.scanner3d, "frame_00002.json"), "data/frame_00002.json"),
+    layout("Polycam", _alone(layouts.polycam, "6234600000.json"), "data/keyframes/cameras/6234600000.json"),
     layout("Stray poses", layouts.stray, "data/odometry.csv", count=8),
     layout("Stray camera", layouts.stray, "data/camera_matrix.csv", count=8),
     Kind("problem", "p.npz", lambda folder: bad.problem()(folder).read_bytes(), finite_problem, 60),

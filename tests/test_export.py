@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -13,6 +14,7 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 import pytest
+from plyfile import PlyData
 from recorded_run import recorded_run
 from scipy.spatial.transform import Rotation
 from small_disk import small_disk
@@ -150,8 +152,74 @@ def test_the_mesh_opens_elsewhere(folder: Path, tmp_path: Path) -> None:
     assert counts == {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     assert len(found.faces) == len(mesh.faces) > 100
     np.testing.assert_allclose(found.bounds, _bounds(mesh.vertices * [1, -1, -1]), atol=1e-5)
-    np.testing.assert_array_equal(found.visual.vertex_attributes["color"][:, :3], mesh.colours)
     assert found.visual.material.metallicFactor == 0
+
+
+def _shown_glb(place: Path) -> np.ndarray:
+    """Colours of a GLB as a viewer shows them: linear factors (glTF 2.0, 3.9.2), by the transfer function of sRGB."""
+    raw = (place / "map.glb").read_bytes()
+    length = struct.unpack_from("<I", raw, 12)[0]
+    head, content = json.loads(raw[20 : 20 + length]), raw[20 + length + 8 :]
+    accessor = head["accessors"][head["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    view = head["bufferViews"][accessor["bufferView"]]
+    kind, full = {5121: (np.uint8, 255), 5123: (np.uint16, 65535), 5126: (np.float32, 1)}[accessor["componentType"]]
+    assert accessor.get("normalized", False) == (full != 1)
+    assert view["byteOffset"] % 4 == 0
+    width = {"VEC3": 3, "VEC4": 4}[accessor["type"]]
+    values = np.frombuffer(content, kind, width * accessor["count"], view["byteOffset"]).reshape(-1, width) / full
+    assert (values[:, 3:] == 1).all()
+    linear = values[:, :3]
+    return np.rint(255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+
+
+def _shown_las(place: Path) -> np.ndarray:
+    laspy = pytest.importorskip("laspy")
+    points = laspy.read(place / "map.las")
+    return np.column_stack([points.red, points.green, points.blue]) / 257
+
+
+def _shown_ply(name: str) -> Callable[[Path], np.ndarray]:
+    def shown(place: Path) -> np.ndarray:
+        vertices = PlyData.read(str(place / name))["vertex"]
+        return np.column_stack([vertices[channel] for channel in ("red", "green", "blue")])
+
+    return shown
+
+
+def _shown_colmap(place: Path) -> np.ndarray:
+    pycolmap = pytest.importorskip("pycolmap")
+    points = pycolmap.Reconstruction(str(place / "sparse/0")).points3D
+    return np.array([points[number].color for number in sorted(points)])
+
+
+@pytest.mark.parametrize(
+    ("to", "shown", "own"),
+    [
+        ("glb", _shown_glb, lambda folder: Mesh.load_ply(folder / "mesh.ply").colours),
+        ("ply", _shown_ply("mesh.ply"), lambda folder: Mesh.load_ply(folder / "mesh.ply").colours),
+        ("ply", _shown_ply("cloud.ply"), lambda folder: PointCloud.load_ply(folder / "map.ply").colours),
+        ("nerfstudio", _shown_ply("points.ply"), lambda folder: PointCloud.load_ply(folder / "map.ply").colours),
+        ("las", _shown_las, lambda folder: PointCloud.load_ply(folder / "map.ply").colours),
+        ("colmap", _shown_colmap, lambda folder: Scene.load(folder).tracks.colours),
+    ],
+    ids=["glb", "mesh.ply", "cloud.ply", "points.ply", "las", "colmap"],
+)
+def test_colours_are_shown_as_those_of_the_pictures(
+    folder: Path,
+    tmp_path: Path,
+    to: str,
+    shown: Callable[[Path], np.ndarray],
+    own: Callable[[Path], np.ndarray],
+) -> None:
+    # Proves that a reader which follows each format shows the run's colours, to the last bit, dark ones included.
+    # Oracle: the formats' descriptions; the colours of the run's own files, some of them all tones of grey.
+    run = shutil.copytree(folder, tmp_path / "run")
+    for name, kind in (("map.ply", PointCloud), ("mesh.ply", Mesh)):
+        made = kind.load_ply(run / name)
+        tones = np.arange(len(made.colours), dtype=np.int64) % 256
+        replace(made, colours=np.column_stack([tones, 255 - tones, tones // 8]).astype(np.uint8)).save_ply(run / name)
+    export(run, to, tmp_path / "out")
+    np.testing.assert_array_equal(shown(tmp_path / "out"), own(run))
 
 
 @pytest.mark.long

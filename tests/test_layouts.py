@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tiny_layouts as tiny
@@ -12,9 +13,10 @@ from layout_checks import checked
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets import open_sequence
-from vggtgeo.datasets.registration import registered_depth
+from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.datasets.seven_scenes import _TO_COLOUR
 from vggtgeo.datasets.tanks import inside_crop
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.results.source import opened
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -45,6 +47,33 @@ def test_scannet_brings_images_to_the_depth_camera(tmp_path: Path, write: Callab
     assert frames[2].depth[3, 7] == pytest.approx(1.027)
     with pytest.warns(InputWarning, match="1 of 3 poses have a NaN or an infinity"):
         assert sequence.ground_truth().positions[:, 0].tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("write", [tiny.scannet, tiny.scannet_flat])
+def test_scannet_s_cameras_at_two_places(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    # Proves that extrinsics of the cameras move depth and poses to the colour camera. Oracle: a wall 2 m away that
+    # begins in the column 20 of the depth, seen from 10 cm to its left, and the place of the colour camera.
+    folder = write(tmp_path / "scene0000_00")
+    matrix = np.eye(4)
+    matrix[0, 3] = 0.1  # a point of the rig, which is the depth camera, is 10 cm to the right in the colour camera
+    numbers = " ".join(map(str, matrix.ravel()))
+    if (folder / "intrinsic").is_dir():
+        (folder / "intrinsic/extrinsic_color.txt").write_text(numbers)
+    else:
+        with (folder / "_info.txt").open("a") as info:
+            info.write(f"m_calibrationColorExtrinsic = {numbers}\n")
+    codes = np.zeros((30, 40), np.uint16)
+    codes[:, 20:] = 2000
+    for file in (*folder.glob("depth/*"), *folder.glob("*.depth.pgm")):
+        cv2.imwrite(str(file), codes)
+    sequence = tiny.quietly_opened(folder)
+    shift = round(sequence.camera.intrinsics[0] * 0.1 / 2.0)
+    depth = next(sequence.frames()).depth
+    assert shift > 1
+    assert (depth[:, 20 + shift :] == 2.0).all()
+    assert np.isnan(depth[:, : 20 + shift]).all()
+    with pytest.warns(InputWarning, match="1 of 3 poses"):
+        assert sequence.ground_truth().positions[:, 0].tolist() == pytest.approx([-0.1, 1.9])
 
 
 def test_euroc_is_the_left_camera(tmp_path: Path) -> None:
@@ -292,10 +321,10 @@ def test_registered_depth_keeps_the_nearer_surface() -> None:
     rng = np.random.default_rng(0)
     depth = rng.uniform(1, 3, (30, 40)).astype(np.float32)
     depth[rng.random((30, 40)) < 0.3] = np.nan
-    same = registered_depth(depth, tiny_sequences.INTRINSICS, tiny_sequences.INTRINSICS, np.eye(4), (40, 30))
-    np.testing.assert_allclose(same, depth, rtol=1e-6)
-    small = registered_depth(depth, (35.0, 35.0, 20.0, 15.0), (0.01, 0.01, 0.0, 0.0), np.eye(4), (1, 1))
-    assert small[0, 0] == np.nanmin(depth)
+    own = Camera(tiny_sequences.INTRINSICS, 40, 30)
+    np.testing.assert_allclose(DepthRegistration.of(own, own, np.eye(4))(depth), depth, rtol=1e-6)
+    small = Camera((0.01, 0.01, 0.0, 0.0), 1, 1)
+    assert DepthRegistration.of(own, small, np.eye(4))(depth)[0, 0] == np.nanmin(depth)
     behind = np.eye(4)
     behind[2, 3] = -5.0
-    assert np.isnan(registered_depth(depth, (35.0, 35.0, 20.0, 15.0), (35.0, 35.0, 20.0, 15.0), behind, (40, 30))).all()
+    assert np.isnan(DepthRegistration.of(own, own, behind)(depth)).all()

@@ -1,5 +1,7 @@
 """Readers of what phones' programs write, each on a tiny recording of just that layout."""
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,9 @@ import pytest
 import tiny_layouts as tiny
 from layout_checks import checked
 
-from vggtgeo.datasets import with_rate
+from vggtgeo.datasets import Sequence, open_sequence, with_rate
+from vggtgeo.datasets.check import inspect
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 
 def test_arkit_scenes(tmp_path: Path) -> None:
@@ -33,6 +37,74 @@ def test_stray_scanner(tmp_path: Path) -> None:
     assert frames[1].depth[3, 900] == pytest.approx(1.010 + 0.060)
     assert np.isnan(frames[1].depth[15 * 5 + 7, 900])
     assert sequence.ground_truth().positions[:, 0].tolist() == [0, 1, 2]
+
+
+def _exported(sequence: Sequence, kind: str) -> None:
+    frames = checked(sequence, kind)
+    assert frames[1].depth.shape == (30, 40)
+    assert frames[1].depth[9, 14:16] == pytest.approx([1.017, 1.017])
+    assert np.isnan(frames[1].depth[:2]).all()
+    assert [frame.timestamp - frames[0].timestamp for frame in frames] == pytest.approx([0.0, 0.1, 0.2])
+
+
+@pytest.mark.parametrize("by_columns", [False, True])
+def test_3d_scanner_app(tmp_path: Path, by_columns: bool) -> None:
+    # Proves images alone as frames (no thumbnail, no confidence), depth without trust left out, camera, times, and
+    # poses with OpenGL's axes, by rows or by columns. Oracle: what was written.
+    folder = tiny.scanner3d(tmp_path / "scan", by_columns)
+    sequence = open_sequence(folder)
+    _exported(sequence, "Scanner3d")
+    np.testing.assert_allclose(sequence.ground_truth().poses, tiny.POSES, atol=1e-12)
+    assert [text for text in inspect(folder).problems if "truth moves" not in text] == []
+
+
+@pytest.mark.parametrize("corrected", [False, True])
+@pytest.mark.parametrize("inside", ["", "keyframes"])
+def test_polycam(tmp_path: Path, corrected: bool, inside: str) -> None:
+    # Proves the same of Polycam's folders, given whole or from inside, and that what the app corrected goes before.
+    # Oracle: what was written.
+    sequence = open_sequence(tiny.polycam(tmp_path / "scan", corrected) / inside)
+    _exported(sequence, "Polycam")
+    truth = sequence.ground_truth()
+    np.testing.assert_allclose(truth.positions[:, 0], [number + corrected for number in range(3)], atol=1e-12)
+    assert truth.timestamps[0] == pytest.approx(6234.5)
+
+
+def test_phone_exports_that_are_damaged(tmp_path: Path) -> None:
+    # Proves that an image without its camera is left out, that depth whose confidence is missing is used with a
+    # warning, and that cameras of other images are refused. Oracle: the names of the files.
+    folder = tiny.scanner3d(tmp_path / "a")
+    (folder / "frame_00002.json").write_text("{")
+    (folder / "conf_00004.png").write_bytes(b"")
+    with pytest.warns(LeftOutWarning, match=r"frame_00002.json.*frame_00002.jpg` is left out"):
+        sequence = open_sequence(folder)
+    assert [file.image.name for file in sequence.files] == ["frame_00000.jpg", "frame_00004.jpg"]
+    with pytest.warns(InputWarning, match=r"conf_00004.png.*all depth"):
+        assert [np.isfinite(frame.depth[0, 4]) for frame in sequence.frames()] == [False, True]
+    folder = tiny.polycam(tmp_path / "b")
+    for file in folder.rglob("cameras/*.json"):
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"width": 30, "height": 40}))
+    with pytest.raises(InputError, match=r"30 x 40 pixels; those here are 40 x 30"):
+        open_sequence(folder)
+    shutil.rmtree(folder / "keyframes/cameras")
+    with pytest.raises(InputError, match="keyframes/cameras"):
+        open_sequence(folder, "polycam")
+
+
+def test_confidence_is_no_image(tmp_path: Path) -> None:
+    # Proves that pictures of confidence are none of the recording in folders of no app, and that a thumbnail beside
+    # larger folders is told. Oracle: the names of the files.
+    folder = tiny.scanner3d(tmp_path / "a")
+    for file in (*folder.glob("*.json"), folder / "thumb_00.jpg"):
+        file.unlink()
+    with pytest.warns(InputWarning):
+        sequence = open_sequence(folder)
+    assert {file.image.name.split("_")[0] for file in sequence.files} == {"frame"}
+    assert {file.depth.name.split("_")[0] for file in sequence.files} == {"depth"}
+    folder = tiny.polycam(tmp_path / "b")
+    (folder / "keyframes").rename(folder / "other")
+    shutil.rmtree(folder / "other/cameras")
+    assert any("`other/images` in it has 3" in text for text in inspect(folder).problems)
 
 
 @pytest.mark.parametrize("per_frame", [False, True])

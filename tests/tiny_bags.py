@@ -9,11 +9,19 @@ from typing import Any
 import cv2
 import numpy as np
 import tiny_layouts as tiny
+from scipy.spatial.transform import Rotation
 
-IMAGE, COMPRESSED, INFO, POSE = (
+IMAGE, COMPRESSED, INFO, POSE, TRANSFORM, EXTRINSICS = (
     *(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo")),
     "geometry_msgs/msg/PoseStamped",
+    "tf2_msgs/msg/TFMessage",
+    "realsense2_camera/msg/Extrinsics",
 )
+_OTHERS = {
+    TRANSFORM: "geometry_msgs/TransformStamped[] transforms",
+    EXTRINSICS: "std_msgs/Header header\nfloat64[9] rotation\nfloat64[3] translation",
+}
+"""Types that the package has not for ROS 1: their definitions."""
 SIZE = tiny.WIDTH, tiny.HEIGHT
 COUNT = 4
 MATRIX = (50, 0, 20, 0, 50, 15, 0, 0, 1)
@@ -28,14 +36,17 @@ def stamp(number: int, later: float = 0.0) -> float:
 
 
 def write(path: Path, **topics: Topic) -> Path:
-    """A bag of these topics, `_` in their names for `/`."""
+    """A bag of these topics, `_` in their names for `/`, `__` for `_`."""
     from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC)
+    for other, definition in _OTHERS.items():
+        store.register(get_types_from_msg(definition, other))
     with Writer(path) as writer:
         for name, (kind, content) in topics.items():
-            connection = writer.add_connection("/" + name.replace("_", "/"), kind, typestore=store)
+            place = "/" + name.replace("__", " ").replace("_", "/").replace(" ", "_")
+            connection = writer.add_connection(place, kind, typestore=store)
             for number in range(COUNT):
                 fields = content(number)
                 if fields is not None:
@@ -71,8 +82,10 @@ def _made(store: Any, kind: str, fields: Fields) -> Any:
     seconds = fields["time"]
     parts = (int(seconds), round(seconds % 1 * 1e9)) if isinstance(seconds, float) else seconds
     time = kinds["builtin_interfaces/msg/Time"](*parts)
-    header = kinds["std_msgs/msg/Header"](0, time, "c")
-    rest = [value for name, value in fields.items() if name != "time"]
+    header = kinds["std_msgs/msg/Header"](0, time, fields.get("frame", "c"))
+    rest = [value for name, value in fields.items() if name not in ("time", "frame")]
+    if kind == TRANSFORM:
+        return kinds[kind]([_transform(kinds, time, *one) for one in fields["transforms"]])
     if kind == POSE:
         place, turn = rest
         parts = kinds["geometry_msgs/msg/Point"](*place), kinds["geometry_msgs/msg/Quaternion"](*turn)
@@ -80,6 +93,32 @@ def _made(store: Any, kind: str, fields: Fields) -> Any:
     if kind == INFO:
         rest.append(kinds["sensor_msgs/msg/RegionOfInterest"](*rest.pop(), False))
     return kinds[kind](header, *rest)
+
+
+def _transform(kinds: Any, time: Any, parent: str, child: str, motion: np.ndarray) -> Any:
+    """motion: [4, 4], coordinates of `child` -> `parent`."""
+    place = kinds["geometry_msgs/msg/Vector3"](*motion[:3, 3])
+    turn = kinds["geometry_msgs/msg/Quaternion"](*Rotation.from_matrix(motion[:3, :3]).as_quat())
+    header = kinds["std_msgs/msg/Header"](0, time, parent)
+    transform = kinds["geometry_msgs/msg/Transform"](place, turn)
+    return kinds["geometry_msgs/msg/TransformStamped"](header, child, transform)
+
+
+def transforms(*steps: tuple[str, str, np.ndarray], moving: bool = False) -> Topic:
+    """tf: parent, child, and child -> parent, [4, 4]. moving: each message has the child 1 cm further."""
+
+    def fields(number: int) -> Fields:
+        along = np.eye(4)
+        along[0, 3] = 0.01 * number * moving
+        return {"time": stamp(number), "transforms": [(one, other, along @ motion) for one, other, motion in steps]}
+
+    return TRANSFORM, fields
+
+
+def of_frame(topic: Topic, frame: str) -> Topic:
+    """The same topic, whose messages state this frame."""
+    kind, fields = topic
+    return kind, lambda number: {**fields(number), "frame": frame}  # type: ignore[dict-item]
 
 
 def image(pixels: Callable[[int], np.ndarray] = tiny.image, encoding: str = "rgb8", **other: Any) -> Topic:
@@ -112,6 +151,7 @@ def info(
     lens: str = "plumb_bob",
     binning: int = 0,
     region: tuple[int, int, int, int] = (0, 0, 0, 0),
+    projection: tuple[float, ...] = (0.0,) * 12,
 ) -> Topic:
     """The camera. region: x, y, height, width."""
     fields = lambda number: {
@@ -122,7 +162,7 @@ def info(
         "d": np.array(distortion, float),
         "k": np.array(matrix(number), float),
         "r": np.eye(3).ravel(),
-        "p": np.zeros(12),
+        "p": np.array(projection, float),
         "binning_x": binning,
         "binning_y": binning,
         "region": region,

@@ -19,6 +19,8 @@ COUNT = 3
 POSES = tuple(pose(number) for number in range(COUNT))
 YAW = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
 
 def _matrix(values: np.ndarray) -> str:
     return "\n".join(" ".join(f"{value:.9f}" for value in row) for row in values) + "\n"
@@ -327,6 +329,53 @@ def stray(folder: Path) -> Path:
     (folder / "odometry.csv").write_text("".join(rows))
     (folder / "camera_matrix.csv").write_text("1400.0, 0.0, 959.5\n0.0, 1400.0, 719.5\n0.0, 0.0, 1.0\n")
     return folder
+
+
+def scanner3d(folder: Path, by_columns: bool = False) -> Path:
+    """An export of 3D Scanner App: every second frame has an image, depth of half the pixels, its first row without
+    trust, a thumbnail. by_columns: matrices as ARKit itself has them.
+    """
+    fx, fy, cx, cy = INTRINSICS
+    for number in range(2 * COUNT):
+        intrinsics, place = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), pose(number / 2) @ OPENGL
+        stated = {"intrinsics": intrinsics, "cameraPoseARFrame": place}
+        content = {key: (value.T if by_columns else value).ravel().tolist() for key, value in stated.items()}
+        if number % 2 == 0:
+            write_image(folder / f"frame_{number:05d}.jpg", image(number // 2))
+        _small_depth(folder / f"depth_{number:05d}.png", folder / f"conf_{number:05d}.png", number // 2, 2)
+        (folder / f"frame_{number:05d}.json").write_text(json.dumps(content | {"time": 100 + 0.05 * number}))
+    write_image(folder / "thumb_00.jpg", image(0, 8, 6))
+    (folder / "info.json").write_text("{}")
+    return folder
+
+
+def polycam(folder: Path, corrected: bool = False) -> Path:
+    """Raw data of Polycam, named by times. corrected: the app made second poses, 1 m aside; those state no times."""
+    fx, fy, cx, cy = INTRINSICS
+    for number in range(COUNT):
+        name = f"{6234500000 + 100000 * number}"
+        for kind, aside in (("", 0.0), ("corrected_", 1.0))[: 1 + corrected]:
+            place = pose(number) @ OPENGL
+            place[0, 3] += aside
+            camera = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": WIDTH, "height": HEIGHT}
+            camera |= {f"t_{row}{column}": place[row, column] for row in range(3) for column in range(4)}
+            camera |= {} if kind else {"timestamp": int(name)}
+            file = folder / f"keyframes/{kind}cameras/{name}.json"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(camera))
+            write_image(folder / f"keyframes/{kind}images/{name}.jpg", image(number))
+        parts = (folder / f"keyframes/{what}/{name}.png" for what in ("depth", "confidence"))
+        _small_depth(*parts, number, 255)
+    write_image(folder / "thumbnail.jpg", image(0, 8, 6))
+    (folder / "mesh_info.json").write_text("{}")
+    return folder
+
+
+def _small_depth(depth: Path, confidence: Path, number: int, high: int) -> None:
+    write_image(depth, depth_codes(number, WIDTH // 2, HEIGHT // 2))
+    trust = np.full((HEIGHT // 2, WIDTH // 2), high, np.uint8)
+    trust[0] = 0
+    write_image(confidence, trust)
 
 
 def bonn(folder: Path) -> Path:

@@ -95,7 +95,8 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
     scratch: a folder of this user alone, where a walk that is rendered is kept for the next run on it.
     """
     if not spec["simulate"]:
-        recorded = open_sequence(spec["path"], spec["kind"])
+        with_depth = spec["exact_depth"] or not spec["rgb_only"]
+        recorded = open_sequence(spec["path"], spec["kind"], depth=with_depth)
         sequence = _without(recorded, spec)
         exact = RecordedFrames.of(recorded) if spec["exact_depth"] else None
         scan = recorded if isinstance(recorded, TanksAndTemples) else None

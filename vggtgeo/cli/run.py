@@ -240,7 +240,7 @@ def open_input(
             warnings.simplefilter("ignore", GuessedCameraWarning)
         if depth_scale is not None:  # then the unit is not that of the layout
             warnings.simplefilter("ignore", UnusableDepthWarning)
-        sequence = open_sequence(path, kind, fps)
+        sequence = open_sequence(path, kind, fps, depth=not rgb_only)
     if depth_scale is not None:
         sequence = with_depth_scale(sequence, depth_scale)
     if intrinsics is not None:

@@ -5,6 +5,7 @@ of a part of the sensor, and those whose pixels were put together, have the matr
 (`image_geometry`, `PinholeCameraModel`): shifted by the region's corner, then divided by the pixels that make one.
 """
 
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.datasets.bag_transforms import frame_name
 from vggtgeo.datasets.intrinsics import is_fisheye, pinhole_of, warn_of_other_size
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.io.errors import InputError, InputWarning
@@ -22,19 +24,32 @@ _LENSES, _FISHEYE = (0, 4, 5, 8), 4
 _STEADY = 0.02
 """Relative change of the focal length up to which it is one camera; autofocus changes it by less."""
 
+_RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)", re.IGNORECASE)
+"""Topics of images whose lens was undone (package image_proc): their matrix is `P`."""
 
-def camera_of(path: Path, infos: Mapping[str, Sequence[Any]], colour: str, size: tuple[int, int]) -> Camera | None:
+
+def is_beside(info: str, images: str) -> bool:
+    """Whether a topic of `CameraInfo` lies in the folder of a topic of images."""
+    return images.startswith(info.rpartition("/")[0] + "/")
+
+
+def camera_of(
+    path: Path, infos: Mapping[str, Sequence[Any]], colour: str, size: tuple[int, int], frame: str = ""
+) -> Camera | None:
     """Of the topic whose name shares most with that of the images, `colour`, if it is of their size; None where there
-    is none. infos: messages by topic. InputWarnings for those beside the images that are not used, for a camera of
+    is none. infos: messages by topic. frame: that the images state, "" for none: a camera of another folder of topics
+    and of another frame is not theirs. InputWarnings for those beside the images that are not used, for a camera of
     another folder of topics, and for one that changes; InputError for numbers that are no camera.
     """
     shared = lambda name: next((n for n, (a, b) in enumerate(zip(name, colour, strict=False)) if a != b), len(name))
     for name in sorted(infos, key=shared, reverse=True):
         where, messages = f"`{path}`: `{name}`", infos[name]
-        beside = colour.startswith(name.rpartition("/")[0] + "/")
+        beside = is_beside(name, colour)
         if not messages:
             continue
         first = messages[0]
+        if not beside and frame and frame_name(first.header.frame_id) not in ("", frame):
+            continue
         sizes = {(first.width, first.height), _size(first)}
         if size not in sizes:
             if beside:
@@ -53,7 +68,7 @@ def camera_of(path: Path, infos: Mapping[str, Sequence[Any]], colour: str, size:
                 f"{where} tells of a part of the sensor, or of pixels that were put together, and the images are as "
                 "large as its whole: used as it is for the whole"
             )
-        camera = _camera(where, first, _matrix(first) if whole else _of_images(first), size)
+        camera = _camera(where, first, size, whole, bool(_RECTIFIED.search(colour)))
         warn_of_other_size(where, camera)
         focal = np.array([_matrix(message)[0, 0] for message in messages])
         if np.abs(focal - focal[0]).max() > _STEADY * abs(focal[0]):
@@ -84,17 +99,26 @@ def _size(message: Any) -> tuple[int, int]:
     return width, height
 
 
-def _of_images(message: Any) -> np.ndarray:
+def _projection(message: Any) -> np.ndarray:
+    """The matrix of images whose lens was undone; zeros where the message does not tell."""
+    return np.reshape(message.P if hasattr(message, "P") else message.p, (3, 4))[:, :3]
+
+
+def _of_images(message: Any, matrix: np.ndarray) -> np.ndarray:
     """The matrix of the images, of that of the whole sensor."""
-    matrix = np.array(_matrix(message), float)
+    matrix = np.array(matrix, float)
     matrix[:2, 2] -= _shift(message)
     matrix[:2] /= _binning(message)[:, None]
     return matrix
 
 
-def _camera(where: str, message: Any, matrix: np.ndarray, size: tuple[int, int]) -> Camera:
+def _camera(where: str, message: Any, size: tuple[int, int], whole: bool, rectified: bool) -> Camera:
+    """whole: the images show all of the sensor. rectified: their lens was undone."""
     lens = np.asarray(message.D if hasattr(message, "D") else message.d, float).tolist()
-    fisheye = is_fisheye(f"{where}: `distortion_model`", message.distortion_model)
+    rectified = rectified and bool(_projection(message)[0, 0])
+    matrix, lens = (_projection(message), []) if rectified else (_matrix(message), lens)
+    matrix = matrix if whole else _of_images(message, matrix)
+    fisheye = not rectified and is_fisheye(f"{where}: `distortion_model`", message.distortion_model)
     lens = _without_zeros(lens, (_FISHEYE,) if fisheye else _LENSES)
     try:
         return Camera(pinhole_of(matrix), *size, check_distortion(lens), fisheye=fisheye)

@@ -11,7 +11,7 @@ from vggtgeo.io.errors import InputError
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 POSES = ("geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped")
 _TRUTH = ("truth", "gt", "vicon", "mocap")
-_REGISTERED = re.compile(r"registered|aligned|to_(rgb|colou?r)", re.IGNORECASE)
+_REGISTERED = re.compile(r"registered|aligned(?!_depth_to_)|to_(rgb|colou?r)", re.IGNORECASE)
 """Depth that belongs to the colour camera pixel by pixel, by the names of RealSense's, OpenNI's and Azure's drivers."""
 _INFRARED = re.compile(r"(^|[/_])(ir|infra\d?|infrared)([/_\d]|$)", re.IGNORECASE)
 
@@ -50,6 +50,11 @@ def truth_topic(topics: Mapping[str, str]) -> str:
     return next(named, "")
 
 
+def is_registered(topic: str) -> bool:
+    """Whether the name of a topic of depth says that it belongs to the colour camera pixel by pixel."""
+    return bool(_REGISTERED.search(topic))
+
+
 def _best(ranks: Mapping[str, tuple[int, ...]]) -> str:
     return min(sorted(ranks), key=lambda name: ranks[name], default="")
 
@@ -65,7 +70,7 @@ def _is_depth(name: str, message: Any) -> bool:
 
 
 def _rank_of_depth(name: str) -> tuple[int]:
-    return (0 if _REGISTERED.search(name) else 1,)
+    return (0 if is_registered(name) else 1,)
 
 
 def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:

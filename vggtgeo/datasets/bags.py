@@ -2,13 +2,14 @@
 
 Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage`; colour before grey and infrared),
 depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
-any other), the camera's `CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
+any other; depth with a camera of its own is registered by what the bag states of it, `bag_depth.py`), the camera's
+`CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
 name contains `truth`, `gt`, `vicon` or `mocap`. What is chosen of several is told.
 """
 
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -16,12 +17,15 @@ from typing import Any, Self
 import numpy as np
 
 from vggtgeo.datasets.bag_cameras import CAMERA_INFO, camera_of
+from vggtgeo.datasets.bag_depth import DepthCamera, depth_camera_of
 from vggtgeo.datasets.bag_images import Unread, image_of, metres_of
-from vggtgeo.datasets.bag_topics import IMAGES, chosen_topics, told, truth_topic
+from vggtgeo.datasets.bag_topics import IMAGES, Chosen, chosen_topics, told, truth_topic
+from vggtgeo.datasets.bag_transforms import TRANSFORMS, frame_name
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_orientation import not_turned
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
+from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
@@ -66,7 +70,9 @@ def no_whole_bag(folder: Path) -> str | None:
 
 @dataclass(frozen=True)
 class RosBag:
-    """A recording. Fields: path; name; camera; colour, depth, poses: topics, "" for none; times of the images."""
+    """A recording. Fields: path; name; camera; colour, depth, poses: topics, "" for none; times of the images;
+    depth_camera, where the depth is of another camera: it is registered to `camera`.
+    """
 
     path: Path
     name: str
@@ -76,10 +82,17 @@ class RosBag:
     poses: str
     times: tuple[float, ...]
     has_depth: bool
+    depth_camera: DepthCamera | None = None
 
     @classmethod
-    def open(cls, path: Path) -> Self:
-        """Looks through the topics; InputError where there are no colour images, or rosbags is not installed."""
+    def open(cls, path: Path, depth: bool = True) -> Self:
+        """Looks through the topics. depth: False to leave it alone.
+
+        Raises:
+            InputError: there are no colour images, the depth is of another camera and the bag does not tell how to
+                register it, or rosbags is not installed.
+
+        """
         with _reader(path) as reader:
             topics = {name: str(info.msgtype) for name, info in reader.topics.items()}
             first = {name: _first(reader, name) for name in topics if topics[name] in IMAGES}
@@ -92,10 +105,16 @@ class RosBag:
             if text := told(chosen, poses):
                 _warn(f"`{path}`: {text}", NoteWarning)
             times, (width, height) = _times_and_size(reader, path, chosen.colour)
-            camera = _camera(reader, path, topics, chosen.colour, (width, height))
-            camera = camera or guess_with_warning(str(path), width, height)
-            has_depth = bool(chosen.depth) and _depth_is_usable(reader, path, chosen.depth, times, (width, height))
-        return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, times, has_depth)
+            infos = _infos(reader, topics)
+            frame = frame_name(first[chosen.colour].header.frame_id)
+            known = camera_of(path, infos, chosen.colour, (width, height), frame)
+            camera = known or guess_with_warning(str(path), width, height)
+            other = _depth_camera(reader, path, chosen, first, infos, known) if depth and chosen.depth else None
+            size = (other.camera.width, other.camera.height) if other else (width, height)
+            has_depth = depth and bool(chosen.depth) and _depth_is_usable(reader, path, chosen.depth, times, size)
+            if has_depth and other:
+                _warn(f"`{path}`: {_told_registered(chosen, other)}", NoteWarning)
+        return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, times, has_depth, other)
 
     def __len__(self) -> int:
         return len(self.times)
@@ -125,6 +144,8 @@ class RosBag:
     def _read(self, chosen: range) -> Iterator[Frame]:
         with _reader(self.path) as reader:
             depths = _messages(reader, self.depth) if self.has_depth else iter(())
+            other = self.depth_camera
+            register = DepthRegistration.of(other.camera, self.camera, other.motion) if other else None
             waiting: list[tuple[float, Any]] = []
             bits, turned = 8, False
             for index, (time, message) in enumerate(_messages(reader, self.colour)):
@@ -150,10 +171,12 @@ class RosBag:
                 depth = None
                 if self.has_depth:
                     waiting = _around(time, waiting, depths)
-                    depth = self._depth(time, waiting, place)
+                    depth = self._depth(time, waiting, place, register)
                 yield Frame(index, time, read.image, depth, f"{self.name}, {index}")
 
-    def _depth(self, time: float, waiting: list[tuple[float, Any]], place: Path) -> np.ndarray:
+    def _depth(
+        self, time: float, waiting: list[tuple[float, Any]], place: Path, register: DepthRegistration | None
+    ) -> np.ndarray:
         nothing = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
         near = [entry for entry in waiting if abs(entry[0] - time) <= _DELAY]
         if not near:
@@ -163,10 +186,10 @@ class RosBag:
         except InputError as error:
             _warn(f"{error}; used without depth")
             return nothing
-        if depth.shape != nothing.shape:
+        if depth.shape != (register.rays.shape[:2] if register else nothing.shape):
             _warn(f"`{place}`: its depth is {depth.shape[1]} x {depth.shape[0]} pixels; used without depth")
             return nothing
-        return depth
+        return register(depth) if register else depth
 
 
 def _tell_of_parts(path: Path) -> None:
@@ -245,12 +268,61 @@ def _depth_is_usable(reader: Any, path: Path, topic: str, images: tuple[float, .
     return alone < len(images)
 
 
-def _camera(reader: Any, path: Path, topics: Mapping[str, str], colour: str, size: tuple[int, int]) -> Camera | None:
-    """What the topics of `CameraInfo` say of the camera of the images."""
+def _infos(reader: Any, topics: Mapping[str, str]) -> dict[str, list[Any]]:
+    """The whole messages of the topics of `CameraInfo`."""
     kinds = [name for name, kind in topics.items() if kind == CAMERA_INFO]
     messages = {name: [message for _, message in _messages(reader, name)] for name in kinds}
-    whole = {name: [one for one in found if not isinstance(one, Unread)] for name, found in messages.items()}
-    return camera_of(path, whole, colour, size)
+    return {name: [one for one in found if not isinstance(one, Unread)] for name, found in messages.items()}
+
+
+def _depth_camera(
+    reader: Any,
+    path: Path,
+    chosen: Chosen,
+    first: Mapping[str, Any],
+    infos: Mapping[str, Sequence[Any]],
+    camera: Camera | None,
+) -> DepthCamera | None:
+    """See `depth_camera_of`; None, too, where no depth image can be read, which is told elsewhere."""
+    for number, (_, message) in enumerate(_messages(reader, chosen.depth)):
+        try:
+            height, width = metres_of(message, _place(path, chosen.depth, number)).shape
+        except InputError:
+            continue
+        transforms = lambda: _transforms(reader)
+        cameras = camera, (width, height)
+        return depth_camera_of(path, chosen, first, infos, cameras, transforms, _extrinsics(reader))
+    return None
+
+
+def _transforms(reader: Any) -> Iterator[Any]:
+    """The messages of tf that are whole."""
+    return _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
+
+
+def _extrinsics(reader: Any) -> np.ndarray | None:
+    """Depth -> colour as RealSense's driver publishes it, the rotation by columns; None where it does not."""
+    named = [one for one in reader.connections if one.topic.endswith("depth_to_color")]
+    message = next(_whole(reader, [one for one in named if one.msgtype.endswith("/Extrinsics")]), None)
+    if message is None:
+        return None
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = np.reshape(message.rotation, (3, 3)).T, message.translation
+    return motion
+
+
+def _whole(reader: Any, connections: list[Any]) -> Iterator[Any]:
+    for connection, _, raw in reader.messages(connections=connections) if connections else ():
+        with suppress(Exception):  # whatever a damaged message makes the package raise
+            yield reader.deserialize(raw, connection.msgtype)
+
+
+def _told_registered(chosen: Chosen, other: DepthCamera) -> str:
+    distance = 1e3 * float(np.linalg.norm(other.motion[:3, 3]))
+    return (
+        f"the depth of `{chosen.depth}` is of a camera of its own (f = {other.camera.intrinsics[0]:.1f}, "
+        f"{distance:.0f} mm from that of the images): it is registered to the images of `{chosen.colour}`"
+    )
 
 
 def _others(topics: Mapping[str, str]) -> str:

@@ -135,7 +135,7 @@ def _of_numbers(sequence: Sequence) -> list[str]:
         return []
     sizes, counts = np.unique(steps, return_counts=True)
     usual = sizes[np.argmax(counts)]
-    holes = np.flatnonzero(steps > usual)
+    holes = np.flatnonzero(steps >= 2 * usual)
     if usual < 1 or len(holes) == 0 or counts.max() < _USUAL * len(steps):
         return []
     first, lost = int(holes[0]), int(np.sum(steps[holes] // usual - 1))

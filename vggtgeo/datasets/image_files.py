@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import simplejpeg
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 
 from vggtgeo.datasets.exr_files import exr_depth
 from vggtgeo.datasets.image_defects import decoding_defect, defect
@@ -123,6 +123,11 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
             f"`{path}`: found {codes.dtype} of shape {codes.shape}; depth must have one channel, of uint16 or of "
             "floats in metres"
         )
+    return metres_of_codes(codes, coding)
+
+
+def metres_of_codes(codes: UInt16[np.ndarray, "h w"], coding: DepthFormat) -> Float[np.ndarray, "h w"]:
+    """Depth that is stored in 16 bits, float32 metres, NaN for none."""
     depth = np.divide(codes, np.float32(coding.units_per_metre), dtype=np.float32)
     for code in coding.invalid:
         depth[codes == code] = np.nan

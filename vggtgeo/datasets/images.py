@@ -28,6 +28,7 @@ _DIGITS = re.compile(r"[0-9]+")
 _SMALL = (64, 64)
 _ALIKE = 0.95
 """Correlation of two files of one picture; a colour image and its depth or mask have less."""
+_NO_IMAGES = re.compile(r"depth|conf", re.IGNORECASE)
 _NUMBERS = re.compile(r"((?:^-)?\d+)")
 _CAMERAS = re.compile(r"(.*(?:cam|camera|view|sensor|lens|eye)[ ._-]*\d+)(?!\d)(.*)", re.IGNORECASE)
 """Names that say which camera a picture is of, `cam0_17`."""
@@ -170,14 +171,22 @@ def _tell_of_series(folder: Path, images: list[Path]) -> None:
 
 def _tell_of_more(folder: Path, count: int) -> None:
     """The recording may be in a folder below, and what lies here a few pictures of it."""
-    below = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
-    more = {path.name: len(image_files(path)) for path in below}
+    below = _folders_in(folder)
+    below += [inner for place in below for inner in _folders_in(place)]
+    more = {path.relative_to(folder).as_posix(): len(image_files(path)) for path in below}
     larger = [name for name, number in more.items() if number > count]
     if larger:
-        # Of colour and depth the first is meant.
-        name = next((name for name in larger if "depth" not in name.lower()), larger[0])
+        # Of colour, depth and confidence the first is meant.
+        name = next((name for name in larger if not _NO_IMAGES.search(name)), larger[0])
         text = f"reading its {count} images; `{name}` in it has {more[name]}: give that folder to read those"
         warnings.warn(f"`{folder}`: {text}", InputWarning, stacklevel=4)
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+    except OSError:  # one that may not be looked into
+        return []
 
 
 def files_like(folder: Path, pattern: str) -> list[Path]:

@@ -24,6 +24,7 @@ from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.not_read import reason_not_read
+from vggtgeo.datasets.phone_exports import Polycam, Scanner3d
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
 from vggtgeo.datasets.replica import Replica
@@ -64,6 +65,8 @@ FOLDER_KINDS: dict[str, FolderReader] = {
     "7scenes": SevenScenes,
     "tum": TumRgbd,
     "nerfstudio": Nerfstudio,
+    "3dscanner": Scanner3d,
+    "polycam": Polycam,
     "rgbd": RgbdFolders,
     "images": ImageFolder,
 }
@@ -71,13 +74,16 @@ FOLDER_KINDS: dict[str, FolderReader] = {
 KINDS = (*FOLDER_KINDS, "video", "bag", "camera")
 
 
-def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: float | None = None) -> Sequence:
+def open_sequence(
+    path: str | os.PathLike[str], kind: str | None = None, rate: float | None = None, depth: bool = True
+) -> Sequence:
     """Opens a folder of a benchmark or of images, a video file, a ROS bag, a webcam (`webcam:0`) or a stream (`rtsp://`).
 
     Args:
         path: the folder or file, or the name of a camera.
         kind: one of `KINDS` to name the reader; None to find it by looking.
         rate: frames a second of a plain folder of images, whose files have no times (by default 30), or of a video.
+        depth: False to leave the depth of a bag or a video alone, which may not be that of its images' camera.
 
     The camera comes from `calibration.txt` or `camera-intrinsics.txt` in the folder, else from published
     values where the name tells the camera, else it is a guess (`camera.known` is False), with an
@@ -96,7 +102,7 @@ def open_sequence(path: str | os.PathLike[str], kind: str | None = None, rate: f
     place = path_of("path", path)
     if kind == "camera" or (kind is None and is_live(os.fspath(path))):
         return LiveCamera.open(os.fspath(path))
-    sequence = _open_place(place, kind)
+    sequence = _open_place(place, kind, depth)
     if sequence.camera.known:
         check_plausible(f"the camera of `{os.fspath(path)}`", sequence.camera)
     if isinstance(sequence, FolderSequence):
@@ -138,14 +144,14 @@ def _check_place(place: Path) -> None:
         )
 
 
-def _open_place(place: Path, kind: str | None) -> Sequence:
+def _open_place(place: Path, kind: str | None, depth: bool) -> Sequence:
     _check_place(place)
     if kind == "bag" or (kind is None and is_bag(place)):
-        return RosBag.open(place)
+        return RosBag.open(place, depth)
     if place.is_file() and (kind == "record3d" or (kind is None and Record3d.matches(place))):
         return Record3d.open(place)
     if kind == "video" or (kind is None and not place.is_dir()):
-        return _open_video(place)
+        return _open_video(place, depth)
     if not place.is_dir():
         raise InputError(f"`{place}` is a file; the reader {kind!r} needs a folder")
     return _open_folder(place, kind)
@@ -190,7 +196,7 @@ def _dead_links(folder: Path) -> str:
     )
 
 
-def _open_video(file: Path) -> Sequence:
+def _open_video(file: Path, depth: bool) -> Sequence:
     if file.is_dir():
         raise InputError(f"`{file}` is a folder; the reader 'video' needs a file")
     if not file.is_file():
@@ -208,7 +214,7 @@ def _open_video(file: Path) -> Sequence:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
     if reason := reason_not_read(file):
         raise InputError(reason)
-    return VideoFile.open(file)
+    return VideoFile.open(file, depth)
 
 
 _PNG = b"\x89PNG\r\n\x1a\n"

@@ -36,7 +36,7 @@ from vggtgeo.io.text_files import whole_text
 LARGEST = 960
 """Pixels of the longer side: the depth has 256, and 1920 pixels of image cost four times as much."""
 _LEAST_CONFIDENCE = 1
-"""Of 0 (low), 1 and 2."""
+"""Of 0 (low), 1 and 2; Polycam writes 0, 127 and 255."""
 _CONFIDENCE = "confidence"
 _LISTS = "odometry.csv", "camera_matrix.csv"
 """What Stray Scanner writes beside the video."""
@@ -70,7 +70,7 @@ class StrayScanner:
             )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)  # the video alone has no intrinsics; the folder has
-            video = VideoFile.open(folder / "rgb.mp4")
+            video = VideoFile.open(folder / "rgb.mp4", depth=False)
         width, height = video.camera.width, video.camera.height
         reduction = -(-max(width, height) // LARGEST)
         file = folder / "camera_matrix.csv"
@@ -122,22 +122,23 @@ class StrayScanner:
         try:
             depth = read_depth(file, MILLIMETRES)
             if (self.folder / _CONFIDENCE).is_dir():
-                self._leave_out_doubtful(depth, self.folder / _CONFIDENCE / file.name)
+                leave_out_doubtful(depth, self.folder / _CONFIDENCE / file.name)
             return enlarged(depth, (self.camera.width, self.camera.height), file)
         except InputError as error:
             warnings.warn(f"{error}; the frame is used without depth", InputWarning, stacklevel=3)
             return np.full(shape, np.nan, np.float32)
 
-    def _leave_out_doubtful(self, depth: np.ndarray, file: Path) -> None:
-        """Makes NaN of what the phone does not trust; where that is not known all stays, with an InputWarning."""
-        try:
-            trust = read_codes(file)
-            if trust.shape != depth.shape:
-                raise InputError(f"`{file}`: found the shape {trust.shape}; its depth has {depth.shape}")
-        except InputError as error:
-            warnings.warn(f"{error}; all depth of the frame is used", InputWarning, stacklevel=4)
-        else:
-            depth[trust < _LEAST_CONFIDENCE] = np.nan
+
+def leave_out_doubtful(depth: np.ndarray, file: Path) -> None:
+    """Makes NaN of depth that the phone does not trust; where that is not known all stays, with an InputWarning."""
+    try:
+        trust = read_codes(file)
+        if trust.shape != depth.shape:
+            raise InputError(f"`{file}`: found the shape {trust.shape}; its depth has {depth.shape}")
+    except InputError as error:
+        warnings.warn(f"{error}; all depth of the frame is used", InputWarning, stacklevel=4)
+    else:
+        depth[trust < _LEAST_CONFIDENCE] = np.nan
 
 
 @dataclass(frozen=True)

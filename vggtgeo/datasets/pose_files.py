@@ -58,7 +58,7 @@ def trajectory_of(
     times = np.asarray(times, np.float64)[: len(poses)]
     known = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     near = known & (np.abs(poses[:, :3, 3]) <= FARTHEST).all(axis=1) & (np.abs(times) <= LATEST)
-    turned = near & _have_rotations(np.nan_to_num(poses, nan=0.0, posinf=0.0, neginf=0.0))
+    turned = near & have_rotations(np.nan_to_num(poses, nan=0.0, posinf=0.0, neginf=0.0))
     for lost, why, kind in (
         (~known, "a NaN or an infinity", NoteWarning),
         (known & ~near, "a number that is no time or place", InputWarning),
@@ -178,7 +178,7 @@ def _whole(digits: str) -> float:
     return int(digits) if len(digits) <= _MOST_DIGITS else float(digits)
 
 
-def _have_rotations(poses: np.ndarray) -> np.ndarray:
+def have_rotations(poses: np.ndarray) -> np.ndarray:
     """Whether the axes of each pose have nearly unit length and are no mirror image, above a last row 0 0 0 1."""
     last = (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) < _MOST_STRETCH).all(axis=1)
     with np.errstate(over="ignore", invalid="ignore"):  # what is no rotation may be of any size

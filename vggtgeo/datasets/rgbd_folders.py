@@ -26,6 +26,8 @@ COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
 DEPTH = ("depth", "depths")
 INVERSE = {"inv", "inverse", "disp", "disparity", "disparities"}
 """In a name: that what it holds is no depth, though it may be called `inverse_depth`."""
+CONFIDENCE = {"conf", "confidence"}
+"""In a name: that what it holds is trust in depth, neither an image nor depth."""
 _SAYS_NOTHING = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
 """Endings of the names of folders: `rgb_png`, `depth_images`."""
 MOST_LOOSE, MOST_LOOSE_BESIDE_DEPTH = 0.1, 0.5
@@ -124,14 +126,18 @@ def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
 def _told_apart(folder: Path) -> tuple[list[Path], list[Path]] | None:
     """Images and depths of one folder, by the words of their names; None where hardly any name says depth."""
     inverse = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_inverse(path)]
-    depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _words(path) & set(DEPTH) and path not in inverse]
-    others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *INVERSE}]
+    depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_depth(path) and path not in inverse]
+    others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *INVERSE, *CONFIDENCE}]
     images = [path for path in others if _words(path) & set(COLOUR)] or others
     return (images, depths) if images and len(depths) >= LEAST_WITH_DEPTH * len(images) else None
 
 
 def _words(path: Path) -> set[str]:
     return set(re.findall(r"[a-z]+", path.stem.lower()))
+
+
+def _is_depth(path: Path) -> bool:
+    return bool(_words(path) & set(DEPTH)) and not _words(path) & CONFIDENCE
 
 
 def _is_inverse(path: Path) -> bool:
@@ -156,7 +162,7 @@ def _there(folder: Path, names: Sequence[str]) -> Path | None:
     there |= {path.name.lower(): path for path in folders}
     for path in folders:
         for word in set(re.findall(r"[a-z]+", path.name.lower())) & set(DEPTH):
-            if not _is_inverse(path):
+            if not _is_inverse(path) and _is_depth(path):
                 there.setdefault(word, path)
     return next((there[name] for name in names if name in there), None)
 

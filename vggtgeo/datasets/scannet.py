@@ -6,14 +6,17 @@
 | `depth/0.png` | `frame-000000.depth.pgm` or `.png` | millimetres |
 | `pose/0.txt` | `frame-000000.pose.txt` | camera -> world |
 | `intrinsic/intrinsic_color.txt`, `..._depth.txt` | `_info.txt` or `info.txt` | of both cameras |
+| `intrinsic/extrinsic_color.txt`, `..._depth.txt` | the same | where stated, the rig -> the camera |
 
-The colour images are larger than the depth and of another camera; each is brought to the depth camera, whose pixels are
-fewer, so that no depth is made up. The two cameras are taken to be at one place, as the published extrinsics say.
+The colour images are larger than the depth and of another camera; each is brought to the intrinsics of the depth, whose
+pixels are fewer, so that no depth is made up. Where the extrinsics say that the cameras are at two places, depth and
+poses are moved to the colour camera.
 Source: A. Dai et al., "ScanNet", CVPR 2017.
 """
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
@@ -24,7 +27,8 @@ from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, tell
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_of_other_size
-from vggtgeo.datasets.pose_files import numbers_of, read_matrix, read_text, trajectory_of
+from vggtgeo.datasets.pose_files import have_rotations, numbers_of, read_matrix, read_text, trajectory_of
+from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -38,6 +42,8 @@ class ScanNet(FolderSequence):
 
     colour: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
     """Intrinsics of the colour images as they lie on the disk."""
+    motion: np.ndarray = field(default_factory=lambda: np.eye(4), compare=False, repr=False)
+    """float64 [4, 4], depth camera -> colour camera, metres."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -66,7 +72,8 @@ class ScanNet(FolderSequence):
         warn_of_other_size(f"`{folder}`: the colour camera", taken)
         has_depth = any(file.depth is not None for file in files)
         camera = Camera(depth, width, height)
-        return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour)
+        motion = _extrinsics(folder, "color") @ np.linalg.inv(_extrinsics(folder, "depth"))
+        return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour, motion)
 
     def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
         """The image as the depth camera would see it: an affine change of pixels, reduced with an average."""
@@ -83,6 +90,21 @@ class ScanNet(FolderSequence):
         seen = cv2.warpAffine(image, change, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         return replace(read, image=np.asarray(seen, np.uint8))
 
+    def load_depth(self, path: Path) -> np.ndarray:
+        """The depth where the colour camera is, with the intrinsics of the depth camera."""
+        depth = super().load_depth(path)
+        if depth.shape != (self.camera.height, self.camera.width) or self._at_one_place:
+            return depth
+        return self._registration(depth)
+
+    @property
+    def _at_one_place(self) -> bool:
+        return bool((self.motion == np.eye(4)).all())
+
+    @cached_property
+    def _registration(self) -> DepthRegistration:
+        return DepthRegistration.of(self.camera, self.camera, self.motion)
+
     def ground_truth(self) -> Trajectory | None:
         """The true poses."""
         there = [(one.timestamp, _beside(self.folder, one.image, "pose", ".txt")) for one in self.files]
@@ -90,6 +112,9 @@ class ScanNet(FolderSequence):
         if not there:
             return None
         poses = np.array([read_matrix(file, (4, 4)) for _, file in there])
+        if not self._at_one_place:
+            with np.errstate(invalid="ignore"):  # of lost frames, which hold infinities
+                poses = poses @ np.linalg.inv(self.motion)
         return trajectory_of([time for time, _ in there], poses, self.folder / "pose")
 
 
@@ -119,17 +144,31 @@ def _info(folder: Path) -> Path | None:
 
 def _intrinsics(folder: Path, camera: str) -> tuple[float, float, float, float]:
     """Of `color` or `depth`."""
-    file = folder / "intrinsic" / f"intrinsic_{camera}.txt"
-    if (info := _info(folder)) is not None and not file.is_file():
-        file, key = info, f"m_calibration{camera.capitalize()}Intrinsic"
-        found = re.search(rf"^{key}\s*=(.*)$", read_text(file), re.MULTILINE)
-        values = numbers_of(found.group(1).split() if found else [], f"`{file}`: `{key}`")
-        if len(values) != 16:
-            raise InputError(f"`{file}`: `{key}` has {len(values)} numbers; expected 16")
-        matrix = np.array(values).reshape(4, 4)
-    else:
-        matrix = read_matrix(file, (4, 4))
+    file, matrix = _calibration(folder, "intrinsic", camera)
     return intrinsics_of(file, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+
+
+def _extrinsics(folder: Path, camera: str) -> np.ndarray:
+    """The rig -> the camera; the identity where nothing is stated."""
+    file, matrix = _calibration(folder, "extrinsic", camera, np.eye(4))
+    if not have_rotations(matrix[None])[0] or not np.isfinite(matrix).all():
+        raise InputError(f"`{file}`: the extrinsics of the {camera} camera are {matrix.tolist()}; expected a motion")
+    return matrix
+
+
+def _calibration(folder: Path, what: str, camera: str, unstated: np.ndarray | None = None) -> tuple[Path, np.ndarray]:
+    """A matrix [4, 4] of either layout, and the file where it stands. unstated: for one that is not there."""
+    file, info = folder / "intrinsic" / f"{what}_{camera}.txt", _info(folder)
+    if file.is_file() or info is None:
+        return file, unstated if unstated is not None and not file.is_file() else read_matrix(file, (4, 4))
+    key = f"m_calibration{camera.capitalize()}{what.capitalize()}"
+    found = re.search(rf"^{key}\s*=(.*)$", read_text(info), re.MULTILINE)
+    if found is None and unstated is not None:
+        return info, unstated
+    values = numbers_of(found.group(1).split() if found else [], f"`{info}`: `{key}`")
+    if len(values) != 16:
+        raise InputError(f"`{info}`: `{key}` has {len(values)} numbers; expected 16")
+    return info, np.array(values).reshape(4, 4)
 
 
 def _size(folder: Path, files: tuple[FrameFile, ...]) -> tuple[int, int]:

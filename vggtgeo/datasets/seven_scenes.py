@@ -12,6 +12,7 @@ objects stay some pixels off.
 import re
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
@@ -21,7 +22,7 @@ from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, dept
 from vggtgeo.datasets.image_files import MILLIMETRES
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.pose_files import trajectory_of
-from vggtgeo.datasets.registration import registered_depth
+from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
@@ -79,10 +80,12 @@ class SevenScenes(FolderSequence):
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth in the colour camera."""
         depth = super().load_depth(path)
-        if not self.as_published:
-            return depth
-        size = (self.camera.width, self.camera.height)
-        return registered_depth(depth, _KINECT_DEPTH, self.camera.intrinsics, _TO_COLOUR, size)
+        return self._registration(depth) if self.as_published else depth
+
+    @cached_property
+    def _registration(self) -> DepthRegistration:
+        source = Camera(_KINECT_DEPTH, self.camera.width, self.camera.height)
+        return DepthRegistration.of(source, self.camera, _TO_COLOUR)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses; pose files with NaN or infinity (tracking was lost) are left out with an InputWarning."""

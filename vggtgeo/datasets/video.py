@@ -1,4 +1,4 @@
-"""A video file, decoded frame by frame by OpenCV."""
+"""A video file, decoded frame by frame by OpenCV; one with several tracks by the package av, `video_tracks.py`."""
 
 import math
 import os
@@ -6,7 +6,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,11 +14,22 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.image_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.intrinsics import MOST_ASPECT, camera_from_folder, guess_with_warning
 from vggtgeo.datasets.picture_sizes import PictureSizes
+from vggtgeo.datasets.video_tracks import (
+    ChosenTracks,
+    DepthTrack,
+    Track,
+    TrackCapture,
+    choose_tracks,
+    open_depth,
+    read_tracks,
+    said_without_package,
+)
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
 
 _FALLBACK_RATE = 30.0
 _LOOKED_AT = 4096
@@ -43,10 +54,10 @@ _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 
 @dataclass(frozen=True)
 class VideoFile:
-    """A video, without depth and without truth. Intrinsics come from a file in the video's folder.
+    """A video without truth; with depth where a track of it says so. Intrinsics come from a file in the video's folder.
 
     Fields: path; name; camera; rate, frames/s; count, the container's number of frames (an estimate);
-    given_rate, frames/s in place of the container's times.
+    given_rate, frames/s in place of the container's times; tracks, those that are read of several.
     """
 
     path: Path
@@ -56,11 +67,18 @@ class VideoFile:
     count: int
     has_depth: bool = False
     given_rate: float | None = None
+    tracks: ChosenTracks | None = None
 
     @classmethod
-    def open(cls, path: Path) -> Self:
-        """Reads the header and the first frame; InputError where OpenCV can decode no video."""
-        with _capture(path) as capture:
+    def open(cls, path: Path, depth: bool = True) -> Self:
+        """Reads the header and the first frame. depth: False to leave a track of depth alone.
+
+        Raises:
+            InputError: no video can be decoded, or its depth is of another size than its images.
+
+        """
+        tracks = _tracks(path, depth)
+        with _capture(path, tracks) as capture:
             readable, image = _decoded(capture.read)
             if not readable or image is None or not image.size:  # a damaged stream may be decoded to nothing
                 raise InputError(
@@ -72,13 +90,17 @@ class VideoFile:
             count = int(stated) if math.isfinite(stated) else 1
             aspect = _pixel_aspect(capture)
         height, width = image.shape[:2]
+        if tracks is not None and tracks.depth is not None:
+            _check_depth(path, tracks, tracks.depth, (width, height))
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
         known_rate = math.isfinite(rate) and 0 < rate < FASTEST
         if not stated > 0 and (what := _without_container(path)):  # a browser's recording states no count, but times
             _warn(InputWarning(f"`{path}` {what}; {rate:g} frames a second are taken: give `--fps` if it has others"))
         if math.isfinite(rate) and rate > FASTEST:
             _warn(InputWarning(f"`{path}` states {rate:g} frames a second: give `--fps` if that is not its rate"))
-        return cls(path, path.name, camera, rate if known_rate else _FALLBACK_RATE, max(count, 1))
+        has_depth = tracks is not None and tracks.depth is not None
+        rate = rate if known_rate else _FALLBACK_RATE
+        return cls(path, path.name, camera, rate, max(count, 1), has_depth, None, tracks)
 
     def __len__(self) -> int:
         return self.count
@@ -98,7 +120,11 @@ class VideoFile:
         time, index, jumped = -math.inf, 0, False
         damaged: int | None = None  # the first frame of those that cannot be decoded, while they last
         still = _Still(self.name)
-        with _capture(self.path) as capture, self._sizes(capture) as sizes:
+        with (
+            _capture(self.path, self.tracks) as capture,
+            self._sizes(capture) as sizes,
+            open_depth(_ffmpeg_name(self.path), self._depth_track, getattr(capture, "start", 0.0)) as depths,
+        ):
             while end is None or index < end:
                 missed = self._missed(capture, self.count - index - 1)
                 if missed is None:
@@ -120,7 +146,8 @@ class VideoFile:
                     else:
                         colour = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
                         still.see(index, colour)
-                        yield Frame(index, time, colour, None, f"{self.name}, frame {index}")
+                        depth = None if depths is None else self._depth(depths, capture)
+                        yield Frame(index, time, colour, depth, f"{self.name}, frame {index}")
                 index += 1
         if damaged is not None:
             self._tell_damaged(damaged, index, _chosen(start, end, stride, damaged, index))
@@ -130,10 +157,21 @@ class VideoFile:
             text = f"`{self.name}` {counts}: is the file cut off, or damaged, or was it trimmed?"
             _warn(InputWarning(text))  # not as left out: where the rate varies, the header of an MKV only guesses
 
+    @property
+    def _depth_track(self) -> Track | None:
+        return self.tracks.depth if self.tracks is not None and self.has_depth else None
+
+    def _depth(self, depths: DepthTrack, capture: Any) -> np.ndarray:
+        """Depth of the frame in hand, metres, NaN for none."""
+        shape = self.camera.height, self.camera.width
+        codes = depths.at(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3)
+        return np.full(shape, np.nan, np.float32) if codes is None else metres_of_codes(codes, MILLIMETRES)
+
     @contextmanager
     def _sizes(self, capture: Any) -> Iterator[PictureSizes]:
         """The sizes of the pictures before OpenCV scaled them; tells of those that are others than the first's."""
-        sizes = PictureSizes(_ffmpeg_name(self.path), _letters(capture))
+        letters = _letters(capture) if self.tracks is None else b""  # those of the first track are others' there
+        sizes = PictureSizes(_ffmpeg_name(self.path), letters)
         try:
             yield sizes
         finally:
@@ -283,12 +321,56 @@ def _is_text(path: Path) -> bool:
     return bool(start) and not _NO_TEXT.search(start)
 
 
-@contextmanager
-def _capture(path: Path) -> Iterator[Any]:
+def _tracks(path: Path, depth: bool) -> ChosenTracks | None:
+    """Those that are read, told; None of a video whose first track is all that there is to be read of it."""
+    _check_content(path)
+    tracks = read_tracks(_ffmpeg_name(path))
+    if sentence := said_without_package(path):
+        _warn(InputWarning(sentence))
+    if len(tracks) < 2:
+        return None
+    chosen = choose_tracks(tracks)
+    chosen = chosen if depth else replace(chosen, depth=None)
+    beside = f", depth in millimetres of {chosen.depth}" if chosen.depth else ""
+    left = ", ".join(map(str, chosen.others))
+    _warn(NoteWarning(f"`{path}`: images of {chosen.images}{beside}" + (f"; not read: {left}" if left else "")))
+    if depth and (maybe := chosen.maybe_depth):
+        _warn(
+            InputWarning(
+                f"`{path}`: {', '.join(map(str, maybe))} may be depth, by 16 bits of grey, and no title says so: not "
+                f"used; `ffmpeg -i FILE -map 0 -c copy -metadata:s:v:{maybe[0].number} title=DEPTH NEW.mkv` says that "
+                "it is depth in millimetres"
+            )
+        )
+    first = next((track for track in tracks if not track.cover), tracks[0])
+    return None if chosen.images is first is tracks[0] and chosen.depth is None else chosen
+
+
+def _check_depth(path: Path, chosen: ChosenTracks, depth: Track, size: tuple[int, int]) -> None:
+    if (depth.width, depth.height) != size:
+        raise InputError(
+            f"`{path}`: the depth of {depth} is that of another camera than the images of {chosen.images}, and cannot "
+            "be registered to them: the file does not tell how the two lie in a way that is read; register it first "
+            "(Azure Kinect: `k4a_transformation_depth_image_to_color_camera`), or leave it out with --rgb-only"
+        )
+
+
+def _check_content(path: Path) -> None:
     if _is_text(path):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
     if path.is_file() and path.stat().st_size == 0:
         raise InputError(f"`{path}` is empty; copy or record it again")
+
+
+@contextmanager
+def _capture(path: Path, tracks: ChosenTracks | None = None) -> Iterator[Any]:
+    if tracks is not None:
+        track = TrackCapture(_ffmpeg_name(path), tracks.images.index)
+        try:
+            yield track
+        finally:
+            track.release()
+        return
     try:
         capture = cv2.VideoCapture(_ffmpeg_name(path))
     except cv2.error as error:

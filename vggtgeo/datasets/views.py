@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from vggtgeo.datasets.bags import RosBag
 from vggtgeo.datasets.folder import FolderSequence, depth_is_usable
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.images import ImageFolder
@@ -57,7 +58,8 @@ def with_intrinsics(
     """The sequence with the given, known intrinsics (pixels) in place of whatever its folder says."""
     camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height, distortion)
     check_plausible("`intrinsics`", camera)
-    return SequenceView(sequence, camera, sequence.has_depth)
+    source = replace(sequence, camera=camera) if isinstance(sequence, RosBag) else sequence  # depth is registered to it
+    return SequenceView(source, camera, sequence.has_depth)
 
 
 def with_rate(sequence: Sequence, rate: float) -> Sequence:
@@ -106,5 +108,6 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
 
 def without_depth(sequence: Sequence) -> Sequence:
     """The colour images alone; depth files are not even decoded."""
-    source = replace(sequence, has_depth=False) if isinstance(sequence, FolderSequence) else sequence
+    known = isinstance(sequence, FolderSequence | RosBag | VideoFile)
+    source = replace(sequence, has_depth=False) if known else sequence  # type: ignore[type-var]
     return SequenceView(source, sequence.camera, has_depth=False)

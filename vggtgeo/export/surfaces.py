@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.export.colours import FULL_SCALE, linear_16_bits, srgb_16_bits
 from vggtgeo.export.contents import cloud_of, mesh_of
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
@@ -18,6 +19,8 @@ UPRIGHT = np.array([1.0, -1.0, -1.0])
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """From the same to z up, y forward, as surveying has it."""
 LAS_UNIT = 1e-3
+_OWN = "_color"
+"""Name of an attribute that is the program's own, by its first letter."""
 _LAS_COUNTS = 2**31 - 1
 
 
@@ -40,11 +43,18 @@ def write_glb(source: Path, target: Path) -> dict[str, float]:
     matte = trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
     shape = trimesh.Trimesh(mesh.vertices * UPRIGHT, mesh.faces, vertex_normals=mesh.normals * UPRIGHT, process=False)
     shape.visual = trimesh.visual.TextureVisuals(material=matte)
-    opaque = np.full(len(mesh.colours), 255, np.uint8)
-    shape.visual.vertex_attributes["color"] = np.column_stack([mesh.colours, opaque])
+    opaque = np.full(len(mesh.colours), FULL_SCALE, np.uint16)
+    shape.vertex_attributes[_OWN] = np.column_stack([linear_16_bits(mesh.colours), opaque])
     with atomic_path(target / "map.glb") as temporary:
-        temporary.write_bytes(trimesh.Scene(shape).export(file_type="glb"))
+        temporary.write_bytes(trimesh.Scene(shape).export(file_type="glb", tree_postprocessor=_as_colours))
     return {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+
+
+def _as_colours(tree: dict[str, Any]) -> None:
+    """Names the attribute of 16 bits as glTF does: trimesh itself writes colours of 8 bits only."""
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["COLOR_0"] = attributes.pop(_OWN)
+    tree["accessors"][attributes["COLOR_0"]]["normalized"] = True
 
 
 def write_las(source: Path, target: Path) -> dict[str, float]:
@@ -63,7 +73,7 @@ def write_las(source: Path, target: Path) -> dict[str, float]:
     header.offsets = np.floor(points.min(axis=0))
     record = laspy.LasData(header)
     record.x, record.y, record.z = points.T
-    record.red, record.green, record.blue = (cloud.colours.astype(np.uint16) * 257).T
+    record.red, record.green, record.blue = srgb_16_bits(cloud.colours).T
     with atomic_path(target / "map.las") as temporary:
         record.write(str(temporary))
     return {"points": len(cloud)}

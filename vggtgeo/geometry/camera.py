@@ -117,6 +117,20 @@ class Camera:
         found = undistort(flat, matrix, coefficients, P=matrix, criteria=_CONVERGED)
         return np.asarray(found, np.float64).reshape(np.shape(pixels))
 
+    def distorted(self, pixels: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
+        """Where pixels of `pinhole`'s images are in those of this camera, float64: the inverse of `undistorted`."""
+        flat = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
+        if not self.distorts or not len(flat):
+            return flat.reshape(np.shape(pixels))
+        fx, fy, cx, cy = self.intrinsics
+        rays, coefficients = (flat - [cx, cy]) / [fx, fy], np.array(self.distortion)
+        if self.fisheye:
+            found = cv2.fisheye.distortPoints(rays, self.matrix, coefficients)
+        else:
+            points, still = cv2.convertPointsToHomogeneous(rays), np.zeros(3)
+            found, _ = cv2.projectPoints(points, still, still, self.matrix, coefficients)
+        return np.asarray(found, np.float64).reshape(np.shape(pixels))
+
     def undistorter(self) -> "Undistorter":
         """Prepares the maps from this camera's images to those of `pinhole`: make it once (40 ms for 640 x 480)."""
         return Undistorter.of(self)
