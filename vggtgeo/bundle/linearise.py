@@ -1,9 +1,11 @@
 """Normal equations, gradient and exact Hessian of any sum of terms, in the arrow's shape.
 
-One pass over the edges, sorted by host: every edge term gives columns `[6 + q + 2, m p]` (see `terms/edge.py`); their
+One pass over the edges, sorted by host: every edge term gives columns `[6 + c + 2, m p]` (see `terms/edge.py`); their
 Gram matrix is kept in relative coordinates, and their products with the depth column are added into the host's cross
-terms in place. Slot terms lie on the diagonal of the landmarks, terms on poses and pairs become blocks, the camera's
-and the dense ones one small matrix (layout chosen by measurement on CPU, see `benchmarks/solver.py`).
+terms in place: relative pose and target's camera in rows of the edge's own, the host's camera (or the one that all
+share) in rows that all edges of the host add to. Slot terms lie on the diagonal of the landmarks, terms on poses and
+pairs become blocks, the cameras' and the dense ones one small matrix (layout chosen by measurement on CPU, see
+`benchmarks/solver.py`).
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, times_depth_column
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors, add_shared
 from vggtgeo.solvers.segments import join_segments
 
 
@@ -35,8 +37,10 @@ def linearise(
     kernels' curvature, see `terms/term.py`.
     """
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
-    degree, size = problem.edges.of_host.shape[1], lie.TANGENT + problem.num_parameters
+    degree, size = problem.edges.of_host.shape[1], lie.TANGENT + cameras.seen
+    apart = cameras.seen - cameras.size  # of the target's camera, where it may be another than the host's
     wide = lie.TANGENT * degree
+    common = wide + apart * degree
 
     def body(cross: Array, edge: Any) -> tuple[Array, Array]:
         ends, index, motion, data = edge
@@ -45,11 +49,14 @@ def linearise(
         gram, coupled = (_exact if exact else _reweighted)(seen, correction, state.inverse_depth.shape[1])
         zero = jnp.zeros_like(host)
         cross = jax.lax.dynamic_update_slice(cross, coupled[None, : lie.TANGENT], (host, lie.TANGENT * index, zero))
-        tail = coupled[None, lie.TANGENT :]
-        shared = jax.lax.dynamic_slice(cross, (host, zero + wide, zero), (1, *tail.shape[1:]))
-        return jax.lax.dynamic_update_slice(cross, shared + tail, (host, zero + wide, zero)), gram
+        if apart:
+            by_target = coupled[None, lie.TANGENT : lie.TANGENT + apart]
+            cross = jax.lax.dynamic_update_slice(cross, by_target, (host, wide + apart * index, zero))
+        tail = coupled[None, lie.TANGENT + apart :]
+        shared = jax.lax.dynamic_slice(cross, (host, zero + common, zero), (1, *tail.shape[1:]))
+        return jax.lax.dynamic_update_slice(cross, shared + tail, (host, zero + common, zero)), gram
 
-    cross = _slot_terms(problem, state, wide, correction, exact)
+    cross = _slot_terms(problem, state, common + cameras.size, correction, exact)
     if problem.edge_terms:
         edges = (problem.edges.ends, problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         cross, gram = jax.lax.scan(body, cross, edges)
@@ -59,7 +66,7 @@ def linearise(
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     held = _held(problem, state, cross[:, -2])
     system = ArrowSystem(
-        graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
+        graph=_graph(problem),
         source_adjoint=lie.adjoint(relative),
         gram=gram,
         cross=cross,
@@ -94,7 +101,7 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
         return ArrowVector(dense, landmarks)
 
     def edge(ends: tuple[Array, Array], motion: Any, data: Any) -> tuple[Array, Array]:
-        local, slots = jnp.zeros(lie.TANGENT + problem.num_parameters, landmarks.dtype), jnp.zeros_like(landmarks[0])
+        local, slots = jnp.zeros(lie.TANGENT + cameras.seen, landmarks.dtype), jnp.zeros_like(landmarks[0])
         for term, seen in of_edge(problem, view_of(cameras, hosts, ends, motion), data):
             by_shared, by_depth = term.gradient(seen)
             local += by_shared
@@ -105,8 +112,16 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     eta = local[:, : lie.TANGENT]
     nodes = jnp.zeros((problem.num_keyframes, lie.TANGENT), local.dtype).at[problem.edges.target].add(eta)
     nodes = nodes.at[problem.edges.source].add(-jnp.einsum("eba,eb->ea", lie.adjoint(relative), eta))
-    dense += jnp.concatenate([nodes.reshape(-1), local[:, lie.TANGENT :].sum(0)])
+    graph = _graph(problem)
+    seen = graph.seen(graph.ends(), cameras.size)
+    shared = add_shared(local[:, lie.TANGENT :], seen, problem.num_parameters)
+    dense += jnp.concatenate([nodes.reshape(-1), shared])
     return ArrowVector(dense, landmarks.at[problem.edges.source].add(by_depth))
+
+
+def _graph(problem: Problem) -> EdgeGraph:
+    """The covisibility graph, with the camera of each keyframe where there are several."""
+    return EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host, problem.camera_of)
 
 
 def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
@@ -178,11 +193,11 @@ def _placed(seen: Seen, parts: list[Float[Array, "r _"]], slots: int) -> Float[A
 
 
 def _slot_terms(
-    problem: Problem, state: State, wide: int, correction: Float[Array, ""] | None, exact: bool
+    problem: Problem, state: State, rows: int, correction: Float[Array, ""] | None, exact: bool
 ) -> Float[Array, "n r s"]:
     """Cross terms before any edge: gradient and curvature of the terms on landmarks in the last two rows."""
     keyframes, slots = state.inverse_depth.shape
-    cross = jnp.zeros((keyframes, wide + problem.num_parameters + 2, slots), state.inverse_depth.dtype)
+    cross = jnp.zeros((keyframes, rows + 2, slots), state.inverse_depth.dtype)
     for term in problem.slot_terms:
         gradient, curvature = term.derivatives(state.inverse_depth, correction, exact)
         cross = cross.at[:, -2].add(gradient).at[:, -1].add(curvature)
@@ -200,9 +215,10 @@ def _held(problem: Problem, state: State, gradient: Float[Array, "n s"]) -> Bool
 def _node_factors(
     problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
 ) -> NodeFactors | None:
-    """All terms on poses and pairs as blocks over `(first, second, camera)`."""
+    """All terms on poses and pairs as blocks over `(first, second, camera of the first)`."""
     found = []
-    cameras, block, tail = cameras_of(problem, state), lie.TANGENT, problem.num_parameters
+    cameras, block = cameras_of(problem, state), lie.TANGENT
+    tail = cameras.size
     for term in problem.node_terms:
         hessian, gradient = node_models(term, state.poses.wxyz_xyz, cameras, correction, exact)
         touched = term.touched()
@@ -228,7 +244,9 @@ def _to_nodes(problem: Problem, factors: NodeFactors) -> Float[Array, " c"]:
     nodes = jnp.zeros((problem.num_keyframes + 1, block), factors.gradient.dtype)
     nodes = nodes.at[factors.first].add(factors.gradient[:, :block])
     nodes = nodes.at[factors.second].add(factors.gradient[:, block : 2 * block])
-    return jnp.concatenate([nodes[:-1].reshape(-1), factors.gradient[:, 2 * block :].sum(0)])
+    parameters = factors.gradient[:, 2 * block :]
+    seen = _graph(problem).seen(factors.first[:, None], parameters.shape[1])
+    return jnp.concatenate([nodes[:-1].reshape(-1), add_shared(parameters, seen, problem.num_parameters)])
 
 
 def _dense_terms(

@@ -1,8 +1,14 @@
 """Terms on a landmark seen along an edge: what makes the arrow's cross terms.
 
-Local coordinates of one edge: the left tangent `eta` of the relative pose (6), the parameters of all cameras (q), and
-the inverse depth of each landmark. Slots come last in every array, so that each quantity is contiguous: columns are
-`[6 + q + 2, m p]`, in the order eta, camera, residual, inverse depth, for `m` residual rows after one another.
+Local coordinates of one edge `(i, j)`: the left tangent `eta` of the relative pose (6), the parameters of the cameras
+that it sees (`c`), and the inverse depth of each landmark. One camera took all keyframes: `c = k`, its parameters.
+Several did: `c = 2 k`, those of the target's camera and those of the host's,
+
+    r(eta, p_j, p_i, d) = f_{p_j}(exp(eta) M (ray_{p_i}(pixel), d)),
+
+however many others there are; of one camera at both ends the derivative is the sum of both. Slots come last in every
+array, so that each quantity is contiguous: columns are `[6 + c + 2, m p]`, in the order eta, cameras, residual, inverse
+depth, for `m` residual rows after one another.
 """
 
 from __future__ import annotations
@@ -48,8 +54,8 @@ class EdgeView(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Coordinates that all slots of the edge share: relative pose and the parameters of all cameras."""
-        return lie.TANGENT + self.cameras.size
+        """Coordinates that all slots of the edge share: relative pose and the parameters of its cameras."""
+        return lie.TANGENT + self.cameras.seen
 
     def tied(self, rows: list[Array]) -> list[Array]:
         """Derivatives by relative pose and the pinhole's four parameters as those by the camera's own: with one focal
@@ -69,7 +75,7 @@ class EdgeView(eqx.Module):
 
 
 class LocalModel(NamedTuple):
-    """Exact second-order model of one edge's energy; `d = 6 + q`."""
+    """Exact second-order model of one edge's energy; `d = 6 + c`."""
 
     gram: Float[Array, "d+1 d+1"]
     """Hessian by the shared coordinates, with the gradient as last row and column (the corner is unused)."""
@@ -128,7 +134,7 @@ class EdgeTerm(AbstractTerm):
         return jnp.concatenate([rows[:-1], pull[None], rows[-1:]]).reshape(len(rows) + 1, -1)
 
     def gradient(self, view: EdgeView) -> tuple[Float[Array, " d"], Float[Array, " p"]]:
-        """Gradient of one edge's energy by relative pose and camera, and by each inverse depth."""
+        """Gradient of one edge's energy by relative pose and cameras, and by each inverse depth."""
         zero = jnp.zeros(view.size, view.inverse_depth.dtype)
         return jax.grad(self._energy_at, (1, 2))(view, zero, view.inverse_depth)
 
@@ -148,8 +154,7 @@ class EdgeTerm(AbstractTerm):
     def _moved(self, view: EdgeView, shared: Float[Array, " d"], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
         """Residuals after a step of the shared coordinates, at the given depths."""
         relative = lie.move(view.relative, shared[: lie.TANGENT])
-        cameras = view.cameras.moved(shared[lie.TANGENT :])
-        host, camera = (cameras.of(keyframe) for keyframe in view.ends)
+        host, camera = view.cameras.along(view.ends, shared[lie.TANGENT :])
 
         def one(data: dict, pixel: Array, inverse_depth: Array) -> Array:
             return check_residual(self, self.holding(data).residual(View(relative, camera, pixel, inverse_depth, host)))

@@ -53,11 +53,11 @@ class PoseTerm(AbstractTerm):
         """Of one observation; `pose` is world -> camera, `camera` the one that took the keyframe."""
 
     def local(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Local:
-        """The residual of one observation as a function of `(xi, parameters of all cameras)`."""
+        """The residual of one observation as a function of `(xi, parameters of the keyframe's camera)`."""
 
         def function(step: Array) -> Array:
             pose = lie.move(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
-            camera = cameras.moved(step[lie.TANGENT :]).of(touched[0])
+            camera = cameras.of(touched[0], step[lie.TANGENT :])
             return check_residual(self, self.holding(data).residual(pose, camera))
 
         return function
