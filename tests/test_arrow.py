@@ -19,8 +19,14 @@ from vggtgeo.solvers.arrow import (
     multiply,
     reduce,
 )
+from vggtgeo.solvers.band_cholesky import BandCholesky
+from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
+from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
+from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 from vggtgeo.solvers.exact_model import exact_model
 from vggtgeo.solvers.reduced import DenseCholesky
+
+from vggtgeo.bundle.analysis.weakest import sparse_matrix
 
 NODES, BLOCK, SHARED, SLOTS = 3, 2, 2, 4
 EDGES = np.array([[0, 1], [0, 2], [1, 0], [2, 1]])  # host 0 has two edges, the others one: one rank stays empty
@@ -262,3 +268,59 @@ def test_a_flat_gauge_is_held() -> None:
     error = np.abs(np.asarray(step.dense)[free] - expected).max() / np.abs(expected).max()
     assert error < 1e-9
     assert abs(float(direction @ step.dense)) < 1e-9
+
+
+SOLVERS = {
+    "dense": DenseCholesky(),
+    "band": BandCholesky(2),
+    "conjugate gradients by a band": ConjugateGradients(BandPreconditioner(1), rtol=1e-12),
+    "conjugate gradients by blocks": ConjugateGradients(BlockJacobi(), rtol=1e-12),
+}
+
+
+@pytest.fixture(scope="module")
+def grouped() -> tuple[ArrowSystem, Dense]:
+    """A system in groups whose prior is on the shared coordinates alone, and its matrix."""
+    system = random_system(grouped=True)
+    system = eqx.tree_at(lambda s: s.prior_hessian, system, system.prior_hessian[-system.shared :, -system.shared :])
+    whole = np.zeros((len(system.free),) * 2)
+    whole[-system.shared :, -system.shared :] = system.prior_hessian
+    return system, assemble(eqx.tree_at(lambda s: s.prior_hessian, system, jnp.asarray(whole)))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_groups_are_solved_and_inverted_by_every_solver(name: str, grouped: tuple[ArrowSystem, Dense]) -> None:
+    # Proves a damped step, the covariances of nodes, shared coordinates and landmarks, in every storage of the blocks.
+    # Oracle: numpy's solve and inverse of the dense matrix.
+    (system, dense), solver, damping = grouped, SOLVERS[name], 0.1
+    free, size = free_part(system), len(system.free)
+    matrix = dense.matrix[np.ix_(free, free)]
+    expected, inverse = np.zeros(len(dense.gradient)), np.zeros_like(dense.matrix)
+    expected[free] = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), -dense.gradient[free])
+    inverse[np.ix_(free, free)] = np.linalg.inv(matrix)
+
+    @jax.jit
+    def both(system: ArrowSystem) -> tuple[ArrowVector, ArrowCovariance]:
+        step = solver.step(system, solver.prepare(system), jnp.asarray(damping))[0]
+        return step, covariance(system, solver)
+
+    step, known = both(system)
+    np.testing.assert_allclose(flat(step), expected, atol=1e-9 * np.abs(expected).max())
+    nodes = NODES * BLOCK
+    np.testing.assert_allclose(known.shared, inverse[nodes:size, nodes:size], atol=1e-9 * np.abs(inverse).max())
+    for node in range(NODES):
+        own = slice(node * BLOCK, (node + 1) * BLOCK)
+        np.testing.assert_allclose(known.nodes[node], inverse[own, own], atol=1e-9 * np.abs(inverse).max())
+    variances = np.ravel(known.landmarks)
+    seen = np.isfinite(variances)
+    assert seen.sum() == NODES * SLOTS - 1
+    np.testing.assert_allclose(variances[seen], np.diag(inverse)[size:][seen], rtol=1e-8)
+
+
+def test_groups_as_sparse_blocks(grouped: tuple[ArrowSystem, Dense]) -> None:
+    # Proves the blocks of the weakest directions. Oracle: the dense Schur complement.
+    system, _ = grouped
+    found = sparse_matrix(reduced_blocks(system, sparse_layout(system)), sparse_layout(system)).toarray()
+    reduced = jax.jit(reduce)(system)
+    expected = np.asarray(reduced.hessian - reduced.schur)
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
