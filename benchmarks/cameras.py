@@ -82,10 +82,10 @@ def timed_solve(window: vg.SimulatedWindow, count: int) -> Callable[[], float]:
     jax.block_until_ready(solve(problem, initial).state)
 
     def once() -> float:
-        began = time.perf_counter()
+        began = time.process_time()
         solution = solve(problem, initial)
         jax.block_until_ready(solution.state)
-        return (time.perf_counter() - began) / max(int(solution.iterations), 1)
+        return (time.process_time() - began) / max(int(solution.iterations), 1)
 
     return once
 

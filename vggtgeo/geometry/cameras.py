@@ -248,13 +248,13 @@ class Cameras(eqx.Module):
         return self.kind(own if step is None else own + step)
 
     def along(
-        self, ends: tuple[Int[Array, ""], Int[Array, ""]], step: Float[Array, " seen"]
+        self, ends: tuple[Int[Array, ""], Int[Array, ""]], steps: list[Array]
     ) -> tuple[AbstractCamera, AbstractCamera]:
-        """Host's and target's camera of an edge `(i, j)`, after a step of what it sees: the target's parameters, then
-        the host's, or those of the camera that all share.
+        """Host's and target's camera of an edge `(i, j)`, after steps of the parameters that it sees: the target's,
+        then the host's, or those of the camera that all share.
         """
-        camera = self.of(ends[1], step[: self.size])
-        return (camera if self.group is None else self.of(ends[0], step[self.size :])), camera
+        camera = self.of(ends[1], steps[0])
+        return (camera if self.group is None else self.of(ends[0], steps[1])), camera
 
 
 def _flat(point: Float[Array, "3"]) -> Float[Array, "2"]:

@@ -57,6 +57,11 @@ class EdgeView(eqx.Module):
         """Coordinates that all slots of the edge share: relative pose and the parameters of its cameras."""
         return lie.TANGENT + self.cameras.seen
 
+    def parts(self, shared: Float[Array, " d"]) -> list[Array]:
+        """Those coordinates apart: relative pose, then the parameters of each camera that the edge sees."""
+        size = self.cameras.size
+        return [shared[: lie.TANGENT], *(shared[at : at + size] for at in range(lie.TANGENT, self.size, size))]
+
     def tied(self, rows: list[Array]) -> list[Array]:
         """Derivatives by relative pose and the pinhole's four parameters as those by the camera's own: with one focal
         length, those by both are added.
@@ -124,12 +129,18 @@ class EdgeTerm(AbstractTerm):
 
     def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "c mp"]:
         """Weighted derivatives, residual and depth derivative of one edge: their products are its normal equations."""
-        zero = jnp.zeros(view.size, view.inverse_depth.dtype)
-        by_shared = lambda tangent: jax.jvp(lambda x: self._moved(view, x, view.inverse_depth), (zero,), (tangent,))[1]
-        shared = jax.vmap(by_shared)(jnp.eye(view.size, dtype=zero.dtype))
+        zeros = view.parts(jnp.zeros(view.size, view.inverse_depth.dtype))
+
+        def by_part(at: int) -> Array:
+            moved = lambda x: self._after(view, [*zeros[:at], x, *zeros[at + 1 :]], view.inverse_depth)
+            along = lambda tangent: jax.jvp(moved, (zeros[at],), (tangent,))[1]
+            return jax.vmap(along)(jnp.eye(len(zeros[at]), dtype=zeros[at].dtype))
+
+        # Part by part, so that what one part leaves as it is, a host's viewing rays above all, is not carried along.
+        shared = [by_part(at) for at in range(len(zeros))]
         ones = jnp.ones_like(view.inverse_depth)
-        residual, depth = jax.jvp(lambda d: self._moved(view, zero, d), (view.inverse_depth,), (ones,))
-        jacobian = jnp.concatenate([shared, depth[None]])
+        residual, depth = jax.jvp(lambda d: self._after(view, zeros, d), (view.inverse_depth,), (ones,))
+        jacobian = jnp.concatenate([*shared, depth[None]])
         rows, pull = reweighted_rows(self.kernel, self.weights, residual, jacobian, correction)
         return jnp.concatenate([rows[:-1], pull[None], rows[-1:]]).reshape(len(rows) + 1, -1)
 
@@ -153,8 +164,11 @@ class EdgeTerm(AbstractTerm):
 
     def _moved(self, view: EdgeView, shared: Float[Array, " d"], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
         """Residuals after a step of the shared coordinates, at the given depths."""
-        relative = lie.move(view.relative, shared[: lie.TANGENT])
-        host, camera = view.cameras.along(view.ends, shared[lie.TANGENT :])
+        return self._after(view, view.parts(shared), depth)
+
+    def _after(self, view: EdgeView, parts: list[Array], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
+        relative = lie.move(view.relative, parts[0])
+        host, camera = view.cameras.along(view.ends, parts[1:])
 
         def one(data: dict, pixel: Array, inverse_depth: Array) -> Array:
             return check_residual(self, self.holding(data).residual(View(relative, camera, pixel, inverse_depth, host)))
