@@ -31,8 +31,8 @@ def changing(problem: Problem, term: AbstractTerm, state: State) -> AbstractTerm
         slopes = node_jacobians(term, state.poses.wxyz_xyz, cameras_of(problem, state))
         parts = [jnp.repeat(~problem.fixed_pose[index][:, None], lie.TANGENT, 1) for index in term.touched()]
         if isinstance(term, PoseTerm):
-            several = problem.camera_of is not None
-            own = free_parameters[problem.camera_of[term.keyframe]] if several else free_parameters
+            cameras = problem.camera_of
+            own = free_parameters if cameras is None else free_parameters[cameras[term.keyframe]]
             parts.append(jnp.broadcast_to(own, (len(slopes), free_parameters.shape[-1])))
         free = jnp.concatenate(parts, 1)
     else:
