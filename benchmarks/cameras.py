@@ -1,34 +1,98 @@
-"""What a lens costs in the adjustment: one simulated window, solved with each model of the camera.
+"""What a lens costs in the adjustment, and what many cameras cost: simulated keyframes, solved with each.
 
     python benchmarks/cameras.py [--keyframes 8] [--points 400]
+    python benchmarks/cameras.py --groups 0 16 49 [--keyframes 49] [--points 147] [--reach 8] [--rounds 5]
 
-A row a model: seconds of the first call, compilation counted in, seconds of the second, iterations, the last energy.
-The window has no distortion, so a fisheye, which always bends, explains it a little worse.
+Without `--groups`, a row a model of the lens: seconds of the first call, compilation counted in, seconds of the second,
+iterations, the last energy. The window has no distortion, so a fisheye, which always bends, explains it a little worse.
+
+With `--groups`, a row a number of cameras (0: one that all keyframes share), each with f, k1, k2 free, on a loop whose
+keyframes see `reach` others before and after them: milliseconds of an iteration, and their ratio to the first row. The
+rows run in turns, so that what else the machine does hits all of them; times are the least over the rounds.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 
 import jax
 import numpy as np
 
 import vggtgeo as vg
+from vggtgeo.simulation.loop import simulate_loop
 
 MODELS = (vg.SquarePinhole, vg.SquareRadialTangential, vg.SquareKannalaBrandt)
 SIGMA = 0.05
 """Of each coefficient of a lens."""
+FREE = np.isin(vg.SquareRadialTangential.names, ("f", "k1", "k2"))
+"""Of the parameters of each of many cameras."""
+ITERATIONS = 10
+"""Of a timed solve."""
 
 
 def main() -> None:
-    """Solve with each model and print the table."""
+    """Print the table of the models, or of many cameras."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--keyframes", type=int, default=8)
-    parser.add_argument("--points", type=int, default=400)
+    parser.add_argument("--keyframes", type=int)
+    parser.add_argument("--points", type=int)
+    parser.add_argument("--groups", type=int, nargs="+")
+    parser.add_argument("--reach", type=int, default=8)
+    parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    window = vg.simulate_window(keyframes=options.keyframes, points=options.points, lines=40)
+    if options.groups is None:
+        each_model(options.keyframes or 8, options.points or 400)
+    else:
+        many_cameras(options.groups, options.keyframes or 49, options.points or 147, options.reach, options.rounds)
+
+
+def many_cameras(groups: list[int], keyframes: int, points: int, reach: int, rounds: int) -> None:
+    """Time an iteration with each number of cameras, and print the table."""
+    window, _ = simulate_loop(keyframes, points, reach)
+    print(
+        f"{keyframes} keyframes, {len(window.observations.edges)} edges, {len(window.observations.point_edge)} matches"
+    )
+    solves = {count: timed_solve(window, count) for count in groups}
+    times = [[solve() for solve in solves.values()] for _ in range(rounds)]
+    least = np.min(times, axis=0)
+    print("| cameras | parameters | ms an iteration | of the first row |\n" + "|---" * 4 + "|")
+    for count, seconds in zip(groups, least, strict=True):
+        name = f"{count}" if count else "1, shared"
+        print(f"| {name} | {max(count, 1) * int(FREE.sum())} | {1e3 * seconds:.0f} | {seconds / least[0]:.2f} |")
+
+
+def timed_solve(window: vg.SimulatedWindow, count: int) -> Callable[[], float]:
+    """Seconds an iteration of a compiled solve with so many cameras, which took the keyframes in turns."""
+    focal, _, x, y = window.intrinsics
+    guess = np.tile([1.01 * focal, x, y, 0.0, 0.0, 0.0, 0.0], (max(count, 1), 1))
+    options = {"fixed_intrinsics": np.tile(~FREE, (max(count, 1), 1))}
+    options["intrinsics_sigma"] = np.broadcast_to([10.0, 5.0, 5.0, SIGMA, SIGMA, SIGMA, SIGMA], guess.shape)
+    if count:
+        options["camera_of"] = np.arange(len(window.start)) % count
+    else:
+        guess, options = guess[0], {name: value[0] for name, value in options.items()}
+    seen = window.observations
+    problem, initial, _ = vg.pack(
+        seen, window.start, guess, seen.depth_mean, camera=vg.SquareRadialTangential, **options
+    )
+    solver = vg.SchurLevenbergMarquardt(rtol=0.0, max_iterations=ITERATIONS)
+    solve = jax.jit(lambda problem, initial: vg.solve(problem, initial, solver=solver))
+    jax.block_until_ready(solve(problem, initial).state)
+
+    def once() -> float:
+        began = time.process_time()
+        solution = solve(problem, initial)
+        jax.block_until_ready(solution.state)
+        return (time.process_time() - began) / max(int(solution.iterations), 1)
+
+    return once
+
+
+def each_model(keyframes: int, points: int) -> None:
+    """Solve with each model and print the table."""
+    window = vg.simulate_window(keyframes=keyframes, points=points, lines=40)
     focal, _, x, y = np.asarray(window.intrinsics)
     print("| model | first call, s | second, s | iterations | energy |\n" + "|---" * 5 + "|")
     for model in MODELS:

@@ -11,6 +11,14 @@ where `G_e` (Gram matrix) and `C_e` (cross terms with the host's landmarks) are 
 them costs `b + q` columns a residual instead of `2 b + q`, and the Schur complement `W V^-1 W'` is one symmetric
 product of `[b k + q + 2, s]` a host, carried to node coordinates as a small matrix afterwards.
 
+The shared coordinates `y` may come in groups of `v`, of which a node sees one, `u_i = E_i y`, and an edge those of its
+two ends. Its local coordinates are then `(eta, u_j, u_i)`, `b + 2 v` of them however many groups there are, and
+
+    P_e = [-A_e  I  .; . . E_j; . . E_i],
+
+so that ends of one group add up. A host's cross terms have the rows `(eta of each edge, u of each edge's target, u of
+the host)`. In what follows, `p` rows of a host are about shared coordinates: `q`, or `v (k + 1)` in groups.
+
 Levenberg-Marquardt damping multiplies the diagonal: `V (1 + l)`, `H + l diag(H)`. Hence the Schur complement at damping
 `l` is the undamped one divided by `1 + l`: a rejected step costs a factorisation and a back-substitution only.
 """
@@ -36,11 +44,31 @@ class EdgeGraph(eqx.Module):
     source: Int[Array, " e"]
     target: Int[Array, " e"]
     of_host: Int[Array, "n k"]
+    group: Int[Array, " n"] | None = None
+    """Group of shared coordinates that each node sees; None: every node sees all of them."""
 
     def neighbours(self) -> Int[Array, "n k"]:
         """Target node of each edge of each host; `n` where there is no edge."""
         padded = jnp.append(self.target, self.of_host.shape[0])
         return padded[self.of_host]
+
+    def ends(self) -> Int[Array, "e 2"]:
+        """Nodes of each edge in the order of its local coordinates: target, host."""
+        return jnp.stack([self.target, self.source], 1)
+
+    def around(self) -> Int[Array, "n m"]:
+        """Neighbours of each host, as `neighbours`, then itself."""
+        return jnp.concatenate([self.neighbours(), jnp.arange(self.of_host.shape[0])[:, None]], 1)
+
+    def seen(self, nodes: Int[Array, "*t m"], size: int) -> Int[Array, "*t p"] | None:
+        """Which shared coordinates nodes see, in groups of `size`, one node after the other; None: all of them, once.
+
+        A node index equal to the number of nodes, which means no node, gives some group: what is added there is zero.
+        """
+        if self.group is None:
+            return None
+        group = self.group[jnp.minimum(nodes, len(self.group) - 1)]
+        return (group[..., None] * size + jnp.arange(size)).reshape(*nodes.shape[:-1], -1)
 
 
 class ArrowVector(eqx.Module):
@@ -89,7 +117,7 @@ class LandmarkBasis(NamedTuple):
 class NodeFactors(eqx.Module):
     """Second-order models of what touches one node or two, and the shared coordinates, but no landmark.
 
-    Local coordinates: `(x of first, x of second, shared)`, `2 b + q` of them.
+    Local coordinates: `(x of first, x of second, what first sees of the shared)`, `2 b + q` or `2 b + v` of them.
     """
 
     first: Int[Array, " m"]
@@ -106,10 +134,12 @@ class ArrowSystem(eqx.Module):
     source_adjoint: Float[Array, "e b b"]
     """`A` in `eta = x_j - A x_i`."""
     gram: Float[Array, "e m m"]
-    """`m = b + q + 1`: second derivatives in `(eta, shared)`; the last row and column hold the gradient."""
+    """`m = b + q + 1`: second derivatives in `(eta, shared)`; the last row and column hold the gradient. In groups
+    `m = b + 2 v + 1`, in `(eta, u of target, u of host)`."""
     cross: Float[Array, "n r s"]
-    """`r = b k + q + 2`: second derivatives of `(eta of edge 0 ... k-1, shared)` with each landmark, then the
-    landmark's gradient and its own second derivative. One array, because slicing it would copy it."""
+    """`r = b k + p + 2`: second derivatives of `(eta of edge 0 ... k-1, shared)` with each landmark, then the
+    landmark's gradient and its own second derivative. In groups the shared ones are `(u of the targets of edge
+    0 ... k-1, u of the host)`. One array, because slicing it would copy it."""
     lie_curvature: Float[Array, "e b b"]
     """Curvature of `eta` itself, `x_j' lie_curvature (-A x_i)`; zero in a Gauss-Newton model."""
     prior_hessian: Float[Array, "p p"]
@@ -137,6 +167,17 @@ class ArrowSystem(eqx.Module):
     def basis(self) -> LandmarkBasis:
         """Coordinates of the landmarks."""
         return LandmarkBasis(self.segments, self.triples)
+
+    @property
+    def shared(self) -> int:
+        """Number of shared coordinates, `q`."""
+        return len(self.free) - self.graph.of_host.shape[0] * self.source_adjoint.shape[-1]
+
+    @property
+    def seen(self) -> int:
+        """Number of shared coordinates that a node sees: `q`, or `v` in groups."""
+        local = self.gram.shape[-1] - self.source_adjoint.shape[-1] - 1
+        return local if self.graph.group is None else local // 2
 
     @property
     def landmark_gradient(self) -> Float[Array, "n s"]:
@@ -187,7 +228,7 @@ def reduce(system: ArrowSystem) -> Reduced:
 
 
 def host_products(system: ArrowSystem) -> Float[Array, "n t t"]:
-    """`C V^-1 C'` of each host in relative coordinates; `t = b k + q + 1`, the gradient comes last."""
+    """`C V^-1 C'` of each host in relative coordinates; `t = b k + p + 1`, the gradient comes last."""
     # A loop over hosts: twice as fast on a CPU as one batched product (the scaled rows stay in the cache).
     product = lambda host: (host[0] * host[1]) @ host[0].T
     return jax.lax.map(product, (system.cross, inverse_landmark_hessian(system)))[:, :-1, :-1]
@@ -200,7 +241,22 @@ def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, 
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
     eta = nodes[system.graph.target] - jnp.einsum("eab,eb->ea", system.source_adjoint, nodes[system.graph.source])
     eta = jnp.concatenate([eta, jnp.zeros_like(eta[:1])])[system.graph.of_host]
-    return jnp.concatenate([eta.reshape(hosts, degree * block), jnp.broadcast_to(shared, (hosts, len(shared)))], 1)
+    own = _seen_of(shared, hosts, seen_by_hosts(system))
+    return jnp.concatenate([eta.reshape(hosts, degree * block), own], 1)
+
+
+def seen_by_hosts(system: ArrowSystem) -> Int[Array, "n p"] | None:
+    """Which shared coordinates each host's cross terms see; None: all."""
+    return system.graph.seen(system.graph.around(), system.seen)
+
+
+def _seen_of(shared: Float[Array, " q"], count: int, seen: Int[Array, "t p"] | None) -> Float[Array, "t p"]:
+    return jnp.broadcast_to(shared, (count, len(shared))) if seen is None else shared[seen]
+
+
+def add_shared(values: Float[Array, "t p"], seen: Int[Array, "t p"] | None, count: int) -> Float[Array, " q"]:
+    """Values of what is seen added up at the `count` shared coordinates."""
+    return values.sum(0) if seen is None else jnp.zeros(count, values.dtype).at[seen].add(values)
 
 
 def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> Float[Array, "n s"]:
@@ -229,8 +285,8 @@ def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
     at_target = nodes[system.graph.target]
     at_source = jnp.einsum("eab,eb->ea", system.source_adjoint, nodes[system.graph.source])
-    spread = jnp.broadcast_to(shared, (len(at_target), len(shared)))
-    local = jnp.concatenate([at_target - at_source, spread], 1)
+    seen = system.graph.seen(system.graph.ends(), system.seen)
+    local = jnp.concatenate([at_target - at_source, _seen_of(shared, len(at_target), seen)], 1)
     pulled = jnp.einsum("eab,eb->ea", system.gram[:, :-1, :-1], local)
     bent = jnp.einsum("eba,eb->ea", system.lie_curvature, at_target)
     nodes = _gather_at_nodes(
@@ -238,7 +294,7 @@ def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array
         pulled[:, :block] - jnp.einsum("eab,eb->ea", system.lie_curvature, at_source),
         pulled[:, :block] + bent,
     )
-    whole = jnp.concatenate([nodes.reshape(-1), pulled[:, block:].sum(0)])
+    whole = jnp.concatenate([nodes.reshape(-1), add_shared(pulled[:, block:], seen, len(shared))])
     prior = len(system.prior_hessian)
     whole = whole.at[-prior:].add(system.prior_hessian @ dense[-prior:])
     return whole if system.factors is None else whole + _factors_times(system, system.factors, dense)
@@ -248,7 +304,7 @@ def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array
     hosts, block = system.graph.of_host.shape[0], system.source_adjoint.shape[-1]
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
     nodes = jnp.concatenate([nodes, jnp.zeros_like(nodes[:1])])
-    spread = jnp.broadcast_to(shared, (len(factors.first), len(shared)))
+    spread = _seen_of(shared, len(factors.first), _seen_by_factors(system, factors))
     local = jnp.concatenate([nodes[factors.first], nodes[factors.second], spread], 1)
     return _factors_gathered(system, factors, jnp.einsum("mab,mb->ma", factors.hessian, local))
 
@@ -258,7 +314,12 @@ def _factors_gathered(system: ArrowSystem, factors: NodeFactors, local: Float[Ar
     hosts, block = system.graph.of_host.shape[0], system.source_adjoint.shape[-1]
     nodes = jnp.zeros((hosts + 1, block), local.dtype)
     nodes = nodes.at[factors.first].add(local[:, :block]).at[factors.second].add(local[:, block : 2 * block])
-    return jnp.concatenate([nodes[:-1].reshape(-1), local[:, 2 * block :].sum(0)])
+    shared = add_shared(local[:, 2 * block :], _seen_by_factors(system, factors), system.shared)
+    return jnp.concatenate([nodes[:-1].reshape(-1), shared])
+
+
+def _seen_by_factors(system: ArrowSystem, factors: NodeFactors) -> Int[Array, "m v"] | None:
+    return system.graph.seen(factors.first[:, None], system.seen)
 
 
 def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "n s"]) -> Float[Array, " c"]:
@@ -274,7 +335,8 @@ def from_relative(system: ArrowSystem, relative: Float[Array, "n relative"]) -> 
     eta = jnp.where(system.graph.of_host[..., None] < len(system.graph.source), eta, 0.0)
     to_host = -jnp.einsum("nkab,nka->nb", padded_transports(system), eta)
     nodes = jnp.zeros((hosts + 1, block), eta.dtype).at[system.graph.neighbours()].add(eta)[:-1]
-    return jnp.concatenate([(nodes + to_host).reshape(-1), relative[:, degree * block :].sum(0)])
+    shared = add_shared(relative[:, degree * block :], seen_by_hosts(system), system.shared)
+    return jnp.concatenate([(nodes + to_host).reshape(-1), shared])
 
 
 def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
@@ -286,7 +348,7 @@ def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array
     at_source = jnp.einsum("eba,ebc,eca->ea", system.source_adjoint, eta, system.source_adjoint)
     nodes = jnp.zeros_like(gradients).at[system.graph.target].add(at_target)
     nodes = nodes.at[system.graph.source].add(at_source)
-    shared = system.gram[:, block:, block:].sum(0)
+    shared = _corner(system, system.gram[:, block:, block:], system.graph.seen(system.graph.ends(), system.seen))
     gradient = jnp.concatenate([gradients.reshape(-1), shared[:-1, -1]]) + system.prior_gradient
     diagonal = jnp.concatenate([nodes.reshape(-1), jnp.diagonal(shared)[:-1]])
     diagonal = diagonal.at[-len(system.prior_hessian) :].add(jnp.diagonal(system.prior_hessian))
@@ -351,7 +413,7 @@ def padded_transports(system: ArrowSystem) -> Float[Array, "n k b b"]:
 
 
 def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout: AbstractLayout) -> Blocks:
-    """Carry each host's matrix from relative to node coordinates and add them all up."""
+    """Carry each host's matrix from relative to node and shared coordinates and add them all up."""
     hosts, degree = system.graph.of_host.shape
     block = system.source_adjoint.shape[-1]
     wide = degree * block
@@ -363,18 +425,43 @@ def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout:
     top = jnp.concatenate([products[:, :wide, :wide], own[:, :wide]], 2)
     bottom = jnp.concatenate([to_neighbour, corner], 2)
     local = jnp.concatenate([top, bottom], 1).reshape(hosts, degree + 1, block, degree + 1, block)
-    index = jnp.concatenate([system.graph.neighbours(), jnp.arange(hosts)[:, None]], 1)
+    index = system.graph.around()
     rows, columns = jnp.broadcast_arrays(index[:, :, None], index[:, None, :])
     blocks = layout.empty(hosts, block, products.dtype)
     blocks = layout.add(blocks, rows, columns, local.transpose(0, 1, 3, 2, 4))
     border = jnp.concatenate([products[:, wide:, :wide], own[:, wide:]], 2)
     border = border.reshape(hosts, -1, degree + 1, block).transpose(0, 2, 3, 1)
-    borders = jnp.zeros((hosts + 1, block, border.shape[-1]), products.dtype).at[index].add(border)[:-1]
-    return Blocks(blocks, borders, products[:, wide:, wide:].sum(0))
+    seen = seen_by_hosts(system)
+    borders = _add_border(jnp.zeros((hosts + 1, block, system.shared + 1), products.dtype), index, border, seen)[:-1]
+    return Blocks(blocks, borders, _corner(system, products[:, wide:, wide:], seen))
+
+
+def _add_border(
+    stored: Float[Array, "m b o"],
+    node: Int[Array, "t *d"],
+    value: Float[Array, "t *d b l"],
+    seen: Int[Array, "t p"] | None,
+) -> Float[Array, "m b o"]:
+    """Rows of nodes over what is seen and the gradient (`l = p + 1`), added up over all shared coordinates."""
+    if seen is None:
+        return stored.at[node].add(value)
+    block, shared = stored.shape[1], stored.shape[2] - 1
+    columns = jnp.pad(seen, ((0, 0), (0, 1)), constant_values=shared)
+    columns = columns.reshape(len(columns), *(1,) * node.ndim, -1)
+    return stored.at[node[..., None, None], jnp.arange(block)[:, None], columns].add(value)
+
+
+def _corner(system: ArrowSystem, value: Float[Array, "t l l"], seen: Int[Array, "t p"] | None) -> Float[Array, "o o"]:
+    """Matrices over what is seen and the gradient, added up over all shared coordinates (`o = q + 1`)."""
+    if seen is None:
+        return value.sum(0)
+    columns = jnp.pad(seen, ((0, 0), (0, 1)), constant_values=system.shared)
+    corner = jnp.zeros((system.shared + 1, system.shared + 1), value.dtype)
+    return corner.at[columns[:, :, None], columns[:, None, :]].add(value)
 
 
 def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
-    """Hessian and gradient of all edges in node coordinates."""
+    """Hessian and gradient of all edges in node and shared coordinates."""
     hosts = system.graph.of_host.shape[0]
     block = system.source_adjoint.shape[-1]
     source, target = system.graph.source, system.graph.target
@@ -385,13 +472,15 @@ def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     blocks = layout.add(layout.add(blocks, target, target, eta), source, source, own)
     blocks = layout.add(blocks, target, source, mixed)
     blocks = layout.add(blocks, source, target, jnp.swapaxes(mixed, 1, 2))
-    borders = jnp.zeros((hosts, block, border.shape[-1]), eta.dtype).at[target].add(border)
-    borders = borders.at[source].add(-jnp.einsum("eba,ebc->eac", system.source_adjoint, border))
-    whole = Blocks(blocks, borders, system.gram[:, block:, block:].sum(0))
-    return whole if system.factors is None else _add_factors(whole, system.factors, layout)
+    seen = system.graph.seen(system.graph.ends(), system.seen)
+    borders = _add_border(jnp.zeros((hosts, block, system.shared + 1), eta.dtype), target, border, seen)
+    at_source = -jnp.einsum("eba,ebc->eac", system.source_adjoint, border)
+    borders = _add_border(borders, source, at_source, seen)
+    whole = Blocks(blocks, borders, _corner(system, system.gram[:, block:, block:], seen))
+    return whole if system.factors is None else _add_factors(system, whole, system.factors, layout)
 
 
-def _add_factors(whole: Blocks, factors: NodeFactors, layout: AbstractLayout) -> Blocks:
+def _add_factors(system: ArrowSystem, whole: Blocks, factors: NodeFactors, layout: AbstractLayout) -> Blocks:
     hosts, block = whole.border.shape[:2]
     first, second = factors.first, factors.second
     cut = lambda a, b: factors.hessian[:, a * block : (a + 1) * block, b * block : (b + 1) * block]
@@ -405,8 +494,11 @@ def _add_factors(whole: Blocks, factors: NodeFactors, layout: AbstractLayout) ->
         nodes = layout.add(nodes, jnp.where(absent, hosts, row), jnp.where(absent, hosts, column), value)
     tail = jnp.concatenate([factors.hessian[:, :, 2 * block :], factors.gradient[..., None]], 2)
     borders = jnp.concatenate([whole.border, jnp.zeros_like(whole.border[:1])])
-    borders = borders.at[first].add(tail[:, :block]).at[second].add(tail[:, block : 2 * block])[:-1]
-    own = tail[:, 2 * block :].sum(0)
+    seen = _seen_by_factors(system, factors)
+    borders = _add_border(borders, first, tail[:, :block], seen)
+    borders = _add_border(borders, second, tail[:, block : 2 * block], seen)[:-1]
+    own = jnp.pad(tail[:, 2 * block :], ((0, 0), (0, 1), (0, 0)))
+    own = _corner(system, own, seen)[:-1]
     corner = whole.corner.at[:-1].add(own).at[-1, :-1].add(own[:, -1])
     return Blocks(nodes, borders, corner)
 

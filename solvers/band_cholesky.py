@@ -33,7 +33,7 @@ class BandCholesky(AbstractReducedSolver[Bands]):
             raise ValueError(f"`reach` is {self.reach}; it must be at least 1, the largest |i - j| over the edges")
 
     def prepare(self, system: ArrowSystem) -> Bands:
-        if len(system.prior_hessian) > system.gram.shape[-1] - system.source_adjoint.shape[-1] - 1:
+        if len(system.prior_hessian) > system.shared:
             raise ValueError(
                 "`system.prior_hessian` couples all nodes (a marginalisation prior), so the reduced system has no "
                 "band; use `DenseCholesky` or `ConjugateGradients`"

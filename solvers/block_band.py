@@ -233,8 +233,9 @@ def _band(blocks: Blocks, layout: BandLayout) -> BandMatrix:
 
 def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "n t t"]:
     """Which entries of the hosts' products couple no far edge with anything else."""
-    block, tail = system.source_adjoint.shape[-1], system.gram.shape[-1] - system.source_adjoint.shape[-1]
     hosts, degree = system.graph.of_host.shape
+    block = system.source_adjoint.shape[-1]
+    tail = system.cross.shape[1] - 1 - degree * block
     far = jnp.append(~near, False)[system.graph.of_host]
     # A far edge is a class of its own (1 + its index); near edges, shared coordinates and the gradient are class 0.
     classes = jnp.repeat(jnp.where(far, 1 + jnp.arange(degree), 0), block, axis=1)

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from vggtgeo.solvers.arrow import ArrowSystem, padded_transports
+from vggtgeo.solvers.arrow import ArrowSystem, padded_transports, seen_by_hosts
 
 
 class LocalInverse(eqx.Module):
@@ -44,15 +44,18 @@ def local_coordinates(system: ArrowSystem, hosts: Int[Array, " h"]) -> Int[Array
 
 
 def to_relative(system: ArrowSystem, hosts: Int[Array, " h"], local: Float[Array, "h l l"]) -> Float[Array, "h r r"]:
-    """`J C J'`: a covariance of the local coordinates carried to `(eta of each rank, shared)`."""
+    """`J C J'`: a covariance of the local coordinates carried to the rows of a host's cross terms, `(eta, shared)`."""
     degree, block = system.graph.of_host.shape[1], system.source_adjoint.shape[-1]
-    wide, shared = degree * block, local.shape[-1] - (degree + 1) * block
+    wide, shared = degree * block, system.shared
+    seen = seen_by_hosts(system)
+    selected = jnp.eye(shared, dtype=local.dtype)
+    selected = selected if seen is None else selected[seen[hosts]]
     present = system.graph.of_host[hosts] < len(system.graph.source)
-    carry = jnp.zeros((len(hosts), wide + shared, wide + block + shared), local.dtype)
+    carry = jnp.zeros((len(hosts), system.cross.shape[1] - 2, wide + block + shared), local.dtype)
     carry = carry.at[:, jnp.arange(wide), jnp.arange(wide)].set(jnp.repeat(present, block, 1).astype(local.dtype))
     transports = padded_transports(system)[hosts].reshape(len(hosts), wide, block)
     carry = carry.at[:, :wide, wide : wide + block].set(-transports)
-    carry = carry.at[:, wide:, wide + block :].set(jnp.eye(shared, dtype=local.dtype))
+    carry = carry.at[:, wide:, wide + block :].set(selected)
     return jnp.einsum("nra,nab,ntb->nrt", carry, local, carry)
 
 

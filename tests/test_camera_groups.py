@@ -215,6 +215,53 @@ def test_second_derivatives_with_several_cameras() -> None:
     assert error < 1e-10, error
 
 
+def test_an_edge_sees_two_cameras_however_many_there_are() -> None:
+    # Proves that no array an edge or a host has grows with the number of cameras. Oracle: 6 of the relative pose and 4
+    # of each end's camera, beside the gradient, the landmark's own two rows, and three edges a host.
+    made = rig(tuple(map(tuple, PINHOLES)), noise=0.5)
+    for count in (2, 4, 400):
+        intrinsics = np.tile(PINHOLES[0], (count, 1))
+        problem, state, _ = vg.pack(
+            made.seen, made.poses, intrinsics, made.inverse_depth, camera_of=np.arange(4) % count
+        )
+        system = jax.eval_shape(lambda p, s: BundleAdjustment(p).linearise(s), problem, state)
+        assert system.gram.shape == (12, 6 + 4 + 4 + 1, 6 + 4 + 4 + 1)
+        assert system.cross.shape[1] == 3 * 6 + 3 * 4 + 4 + 2
+        assert len(system.free) == 4 * 6 + 4 * count
+
+
+class Ratio(vg.CameraTerm):
+    """Of the first focal lengths of two cameras."""
+
+    ratio: jax.Array
+
+    def residual(self, parameters):
+        return jnp.stack([parameters[0] / parameters[4] - self.ratio, (parameters[1] - parameters[5]) / 100])
+
+
+def test_a_term_on_all_cameras() -> None:
+    # Proves the model of a term that two cameras are part of, under a robust kernel. Oracle: the energy written out,
+    # differentiated, and `sum w rho' J'J`.
+    term = Ratio(ratio=jnp.array([1.0, 1.3]), weight=jnp.array([4.0, 25.0]), kernel=vg.Huber(0.7))
+    at = jnp.asarray(PINHOLES.reshape(-1))
+    one = lambda p, ratio: jnp.stack([p[0] / p[4] - ratio, (p[1] - p[5]) / 100])
+
+    def energy(p):
+        squared = term.weight * jnp.stack([jnp.sum(one(p, ratio) ** 2) for ratio in term.ratio])
+        return jnp.sum(jnp.where(squared <= 0.49, squared, 1.4 * jnp.sqrt(squared) - 0.49)) / 2
+
+    hessian, gradient = term.model(at, None, True)
+    np.testing.assert_allclose(hessian, jax.hessian(energy)(at), atol=1e-14)
+    np.testing.assert_allclose(gradient, jax.grad(energy)(at), atol=1e-14)
+    expected = np.zeros((8, 8))
+    for weight, ratio in zip(term.weight, term.ratio, strict=True):
+        jacobian, size = jax.jacfwd(one)(at, ratio), jnp.sqrt(weight * jnp.sum(one(at, ratio) ** 2))
+        expected += weight * min(1.0, 0.7 / size) * jacobian.T @ jacobian
+    reweighted, force = term.model(at, None, False)
+    np.testing.assert_allclose(reweighted, expected, atol=1e-14)
+    np.testing.assert_allclose(force, gradient, atol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("model", "truth"),
     [

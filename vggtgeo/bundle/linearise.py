@@ -1,9 +1,11 @@
 """Normal equations, gradient and exact Hessian of any sum of terms, in the arrow's shape.
 
-One pass over the edges, sorted by host: every edge term gives columns `[6 + q + 2, m p]` (see `terms/edge.py`); their
+One pass over the edges, sorted by host: every edge term gives columns `[6 + c + 2, m p]` (see `terms/edge.py`); their
 Gram matrix is kept in relative coordinates, and their products with the depth column are added into the host's cross
-terms in place. Slot terms lie on the diagonal of the landmarks, terms on poses and pairs become blocks, the camera's
-and the dense ones one small matrix (layout chosen by measurement on CPU, see `benchmarks/solver.py`).
+terms in place: relative pose and target's camera in rows of the edge's own, the host's camera (or the one that all
+share) in rows that all edges of the host add to. Slot terms lie on the diagonal of the landmarks, terms on poses and
+pairs become blocks, the cameras' and the dense ones one small matrix (layout chosen by measurement on CPU, see
+`benchmarks/solver.py`).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors, add_shared
 from vggtgeo.solvers.segments import join_segments
 from vggtgeo.solvers.triples import depth_gradient, join_triples
 
@@ -42,8 +44,10 @@ def linearise(
     free pixels) are not in the basis that makes them scalars, so that systems may be added.
     """
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
-    degree, size = problem.edges.of_host.shape[1], lie.TANGENT + problem.num_parameters
+    degree, size = problem.edges.of_host.shape[1], lie.TANGENT + cameras.seen
+    apart = cameras.seen - cameras.size  # of the target's camera, where it may be another than the host's
     wide = lie.TANGENT * degree
+    common = wide + apart * degree
 
     sizes = num_offsets(state) // 2, state.inverse_depth.shape[1]
 
@@ -54,13 +58,17 @@ def linearise(
         gram, coupled, own = (_exact if exact else _reweighted)(seen, correction, sizes)
         zero = jnp.zeros_like(host)
         for first, part in coupled:
-            place, tail = (host, lie.TANGENT * index, zero + first), (host, zero + wide, zero + first)
-            cross = jax.lax.dynamic_update_slice(cross, part[None, : lie.TANGENT], place)
-            shared = jax.lax.dynamic_slice(cross, tail, (1, len(part) - lie.TANGENT, part.shape[1]))
-            cross = jax.lax.dynamic_update_slice(cross, shared + part[None, lie.TANGENT :], tail)
+            column = zero + first
+            cross = jax.lax.dynamic_update_slice(cross, part[None, : lie.TANGENT], (host, lie.TANGENT * index, column))
+            if apart:
+                by_target = part[None, lie.TANGENT : lie.TANGENT + apart]
+                cross = jax.lax.dynamic_update_slice(cross, by_target, (host, wide + apart * index, column))
+            tail, place = part[None, lie.TANGENT + apart :], (host, zero + common, column)
+            shared = jax.lax.dynamic_slice(cross, place, (1, *tail.shape[1:]))
+            cross = jax.lax.dynamic_update_slice(cross, shared + tail, place)
         return (cross, blocks if blocks is None or own is None else blocks.at[host].add(own)), gram
 
-    cross, blocks = _landmark_terms(problem, state, wide, correction, exact)
+    cross, blocks = _landmark_terms(problem, state, common + cameras.size, correction, exact)
     if problem.edge_terms:
         edges = (problem.edges.ends, problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
@@ -69,7 +77,7 @@ def linearise(
     force = gram[:, : lie.TANGENT, size]
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     system = ArrowSystem(
-        graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
+        graph=_graph(problem),
         source_adjoint=lie.adjoint(relative),
         gram=gram,
         cross=cross,
@@ -114,7 +122,7 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     sizes = first // 2, state.inverse_depth.shape[1]
 
     def edge(ends: tuple[Array, Array], motion: Any, data: Any) -> tuple[Array, Array]:
-        local, own = jnp.zeros(lie.TANGENT + problem.num_parameters, landmarks.dtype), jnp.zeros_like(landmarks[0])
+        local, own = jnp.zeros(lie.TANGENT + cameras.seen, landmarks.dtype), jnp.zeros_like(landmarks[0])
         for term, seen in of_edge(problem, view_of(cameras, hosts, ends, motion), data):
             found = term.gradient(seen)
             local += found.shared
@@ -127,8 +135,16 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     eta = local[:, : lie.TANGENT]
     nodes = jnp.zeros((problem.num_keyframes, lie.TANGENT), local.dtype).at[problem.edges.target].add(eta)
     nodes = nodes.at[problem.edges.source].add(-jnp.einsum("eba,eb->ea", lie.adjoint(relative), eta))
-    dense += jnp.concatenate([nodes.reshape(-1), local[:, lie.TANGENT :].sum(0)])
+    graph = _graph(problem)
+    seen = graph.seen(graph.ends(), cameras.size)
+    shared = add_shared(local[:, lie.TANGENT :], seen, problem.num_parameters)
+    dense += jnp.concatenate([nodes.reshape(-1), shared])
     return ArrowVector(dense, landmarks.at[problem.edges.source].add(by_depth))
+
+
+def _graph(problem: Problem) -> EdgeGraph:
+    """The covisibility graph, with the camera of each keyframe where there are several."""
+    return EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host, problem.camera_of)
 
 
 def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
@@ -255,13 +271,13 @@ def _joined(parts: Columns, size: int) -> Columns:
 
 
 def _landmark_terms(
-    problem: Problem, state: State, wide: int, correction: Float[Array, ""] | None, exact: bool
+    problem: Problem, state: State, rows: int, correction: Float[Array, ""] | None, exact: bool
 ) -> tuple[Float[Array, "n r s"], Float[Array, "n 3 p"] | None]:
     """Cross terms before any edge: gradient and curvature of the terms on landmarks in the last two rows; and the
     blocks of landmarks with free pixels.
     """
     (keyframes, slots), first = state.inverse_depth.shape, num_offsets(state)
-    cross = jnp.zeros((keyframes, wide + problem.num_parameters + 2, first + slots), state.inverse_depth.dtype)
+    cross = jnp.zeros((keyframes, rows + 2, first + slots), state.inverse_depth.dtype)
     for term in problem.slot_terms:
         gradient, curvature = term.derivatives(state.inverse_depth, correction, exact)
         cross = cross.at[:, -2, first:].add(gradient).at[:, -1, first:].add(curvature)
@@ -287,9 +303,10 @@ def _held(problem: Problem, state: State, gradient: Float[Array, "n s"]) -> Bool
 def _node_factors(
     problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
 ) -> NodeFactors | None:
-    """All terms on poses and pairs as blocks over `(first, second, camera)`."""
+    """All terms on poses and pairs as blocks over `(first, second, camera of the first)`."""
     found = []
-    cameras, block, tail = cameras_of(problem, state), lie.TANGENT, problem.num_parameters
+    cameras, block = cameras_of(problem, state), lie.TANGENT
+    tail = cameras.size
     for term in problem.node_terms:
         hessian, gradient = node_models(term, state.poses.wxyz_xyz, cameras, correction, exact)
         touched = term.touched()
@@ -315,7 +332,9 @@ def _to_nodes(problem: Problem, factors: NodeFactors) -> Float[Array, " c"]:
     nodes = jnp.zeros((problem.num_keyframes + 1, block), factors.gradient.dtype)
     nodes = nodes.at[factors.first].add(factors.gradient[:, :block])
     nodes = nodes.at[factors.second].add(factors.gradient[:, block : 2 * block])
-    return jnp.concatenate([nodes[:-1].reshape(-1), factors.gradient[:, 2 * block :].sum(0)])
+    parameters = factors.gradient[:, 2 * block :]
+    seen = _graph(problem).seen(factors.first[:, None], parameters.shape[1])
+    return jnp.concatenate([nodes[:-1].reshape(-1), add_shared(parameters, seen, problem.num_parameters)])
 
 
 def _dense_terms(

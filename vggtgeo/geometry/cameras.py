@@ -232,16 +232,29 @@ class Cameras(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Number of parameters, of all cameras together."""
-        return self.parameters.size
+        """Number of parameters of one camera, `k`."""
+        return self.parameters.shape[-1]
 
-    def of(self, keyframe: Int[Array, ""] | int) -> AbstractCamera:
-        """The camera that took a keyframe."""
-        return self.kind(self.parameters if self.group is None else self.parameters[self.group[keyframe]])
+    @property
+    def seen(self) -> int:
+        """Number of parameters that an edge sees: those of the target's camera and of the host's, once if all keyframes
+        share one.
+        """
+        return self.size if self.group is None else 2 * self.size
 
-    def moved(self, step: Float[Array, " q"]) -> Cameras:
-        """After a step of all parameters, camera after camera."""
-        return Cameras(self.parameters + step.reshape(self.parameters.shape), self.kind, self.group)
+    def of(self, keyframe: Int[Array, ""] | int, step: Float[Array, " k"] | None = None) -> AbstractCamera:
+        """The camera that took a keyframe, after a step of its parameters."""
+        own = self.parameters if self.group is None else self.parameters[self.group[keyframe]]
+        return self.kind(own if step is None else own + step)
+
+    def along(
+        self, ends: tuple[Int[Array, ""], Int[Array, ""]], steps: list[Array]
+    ) -> tuple[AbstractCamera, AbstractCamera]:
+        """Host's and target's camera of an edge `(i, j)`, after steps of the parameters that it sees: the target's,
+        then the host's, or those of the camera that all share.
+        """
+        camera = self.of(ends[1], steps[0])
+        return (camera if self.group is None else self.of(ends[0], steps[1])), camera
 
 
 def _flat(point: Float[Array, "3"]) -> Float[Array, "2"]:

@@ -22,16 +22,18 @@ def changing(problem: Problem, term: AbstractTerm, state: State) -> AbstractTerm
 
     Landmarks always move, so terms on them stay as they are; a dense term couples everything.
     """
-    free_camera = ~problem.fixed_intrinsics.reshape(-1)
+    free_parameters = ~problem.fixed_intrinsics
     free: Bool[Array, "m d"]
     if isinstance(term, CameraTerm):
         slopes = jnp.moveaxis(jax.jacfwd(term.residuals)(state.parameters), 1, 0)
-        free = jnp.broadcast_to(free_camera, (len(slopes), len(free_camera)))
+        free = jnp.broadcast_to(free_parameters.reshape(-1), (len(slopes), problem.num_parameters))
     elif isinstance(term, PoseTerm | PairTerm):
         slopes = node_jacobians(term, state.poses.wxyz_xyz, cameras_of(problem, state))
         parts = [jnp.repeat(~problem.fixed_pose[index][:, None], lie.TANGENT, 1) for index in term.touched()]
         if isinstance(term, PoseTerm):
-            parts.append(jnp.broadcast_to(free_camera, (len(slopes), len(free_camera))))
+            cameras = problem.camera_of
+            own = free_parameters if cameras is None else free_parameters[cameras[term.keyframe]]
+            parts.append(jnp.broadcast_to(own, (len(slopes), free_parameters.shape[-1])))
         free = jnp.concatenate(parts, 1)
     else:
         return term

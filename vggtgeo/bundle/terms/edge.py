@@ -1,9 +1,15 @@
 """Terms on a landmark seen along an edge: what makes the arrow's cross terms.
 
-Local coordinates of one edge: the left tangent `eta` of the relative pose (6), the parameters of all cameras (q), and
-the inverse depth of each landmark. Slots come last in every array, so that each quantity is contiguous: columns are
-`[6 + q + 2, m p]`, in the order eta, camera, residual, inverse depth, for `m` residual rows after one another. Where
-the pixels of the slots in their host are unknowns, too (`terms/host_pixel.py`), two rows follow: by `u`, by `v`.
+Local coordinates of one edge `(i, j)`: the left tangent `eta` of the relative pose (6), the parameters of the cameras
+that it sees (`c`), and the inverse depth of each landmark. One camera took all keyframes: `c = k`, its parameters.
+Several did: `c = 2 k`, those of the target's camera and those of the host's,
+
+    r(eta, p_j, p_i, d) = f_{p_j}(exp(eta) M (ray_{p_i}(pixel), d)),
+
+however many others there are; of one camera at both ends the derivative is the sum of both. Slots come last in every
+array, so that each quantity is contiguous: columns are `[6 + c + 2, m p]`, in the order eta, cameras, residual, inverse
+depth, for `m` residual rows after one another. Where the pixels of the slots in their host are unknowns, too
+(`terms/host_pixel.py`), two rows follow: by `u`, by `v`.
 """
 
 from __future__ import annotations
@@ -51,8 +57,13 @@ class EdgeView(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Coordinates that all slots of the edge share: relative pose and the parameters of all cameras."""
-        return lie.TANGENT + self.cameras.size
+        """Coordinates that all slots of the edge share: relative pose and the parameters of its cameras."""
+        return lie.TANGENT + self.cameras.seen
+
+    def parts(self, shared: Float[Array, " d"]) -> list[Array]:
+        """Those coordinates apart: relative pose, then the parameters of each camera that the edge sees."""
+        size = self.cameras.size
+        return [shared[: lie.TANGENT], *(shared[at : at + size] for at in range(lie.TANGENT, self.size, size))]
 
     def tied(self, rows: list[Array]) -> list[Array]:
         """Derivatives by relative pose and the pinhole's four parameters as those by the camera's own: with one focal
@@ -84,7 +95,7 @@ class Gradient(NamedTuple):
 
 
 class LocalModel(NamedTuple):
-    """Second-order model of one edge's energy; `d = 6 + q`."""
+    """Second-order model of one edge's energy; `d = 6 + c`."""
 
     gram: Float[Array, "d+1 d+1"]
     """Hessian by the shared coordinates, with the gradient as last row and column (the corner is unused)."""
@@ -144,17 +155,23 @@ class EdgeTerm(AbstractTerm):
 
     def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "c mp"]:
         """Weighted derivatives, residual and depth derivative of one edge: their products are its normal equations."""
-        zero = jnp.zeros(view.size, view.inverse_depth.dtype)
-        by_shared = lambda tangent: jax.jvp(lambda x: self._moved(view, x, view.inverse_depth), (zero,), (tangent,))[1]
-        shared = jax.vmap(by_shared)(jnp.eye(view.size, dtype=zero.dtype))
+        zeros = view.parts(jnp.zeros(view.size, view.inverse_depth.dtype))
+
+        def by_part(at: int) -> Array:
+            moved = lambda x: self._after(view, [*zeros[:at], x, *zeros[at + 1 :]], view.inverse_depth)
+            along = lambda tangent: jax.jvp(moved, (zeros[at],), (tangent,))[1]
+            return jax.vmap(along)(jnp.eye(len(zeros[at]), dtype=zeros[at].dtype))
+
+        # Part by part, so that what one part leaves as it is, a host's viewing rays above all, is not carried along.
+        shared = [by_part(at) for at in range(len(zeros))]
         ones = jnp.ones_like(view.inverse_depth)
-        residual, depth = jax.jvp(lambda d: self._moved(view, zero, d), (view.inverse_depth,), (ones,))
-        jacobian = jnp.concatenate([shared, depth[None], *self._by_pixel(view, zero)])
+        residual, depth = jax.jvp(lambda d: self._after(view, zeros, d), (view.inverse_depth,), (ones,))
+        jacobian = jnp.concatenate([*shared, depth[None], *self._by_pixel(view, zeros)])
         rows, pull = reweighted_rows(self.kernel, self.weights, residual, jacobian, correction)
         return jnp.concatenate([rows[: view.size], pull[None], rows[view.size :]]).reshape(len(rows) + 1, -1)
 
     def gradient(self, view: EdgeView) -> Gradient:
-        """Gradient of one edge's energy by relative pose and camera, by each inverse depth, and by the pixels."""
+        """Gradient of one edge's energy by relative pose and cameras, by each inverse depth, and by the pixels."""
         zero = jnp.zeros(view.size, view.inverse_depth.dtype)
         by_shared, by_depth, by_pixel = jax.grad(self._energy_at, (1, 2, 3))(
             view, zero, view.inverse_depth, view.pixels
@@ -181,28 +198,31 @@ class EdgeTerm(AbstractTerm):
         by_pixels = jnp.concatenate([mixed_pixels, force[None], coupling[None]])
         return LocalModel(gram, coupled, PixelModel(by_pixels, jnp.stack([by_uu, by_vv, by_uv])))
 
-    def _by_pixel(self, view: EdgeView, shared: Float[Array, " d"]) -> list[Float[Array, "2 m p"]]:
+    def _by_pixel(self, view: EdgeView, parts: list[Array]) -> list[Float[Array, "2 m p"]]:
         """Derivatives of the residuals by `u` and `v` in the host, where those are unknowns."""
         if not view.free_pixels:
             return []
-        residuals = lambda pixels: self._moved(view, shared, view.inverse_depth, pixels)
+        residuals = lambda pixels: self._after(view, parts, view.inverse_depth, pixels)
         axes = [jnp.zeros_like(view.pixels).at[axis].set(1.0) for axis in range(2)]
         return [jnp.stack([jax.jvp(residuals, (view.pixels,), (axis,))[1] for axis in axes])]
 
     def _energy_at(self, view: EdgeView, shared: Array, depth: Array, pixels: Array) -> Float[Array, ""]:
-        return robust_energy(self.kernel, self.weights, self._moved(view, shared, depth, pixels))
+        return robust_energy(self.kernel, self.weights, self._after(view, view.parts(shared), depth, pixels))
 
-    def _moved(
+    def _moved(self, view: EdgeView, shared: Float[Array, " d"], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
+        """Residuals after a step of the shared coordinates, at the given depths."""
+        return self._after(view, view.parts(shared), depth)
+
+    def _after(
         self,
         view: EdgeView,
-        shared: Float[Array, " d"],
+        parts: list[Array],
         depth: Float[Array, " p"],
         pixels: Float[Array, "2 p"] | None = None,
     ) -> Float[Array, "m p"]:
-        """Residuals after a step of the shared coordinates, at the given depths and, if any, pixels in the host."""
-        relative = lie.move(view.relative, shared[: lie.TANGENT])
-        cameras = view.cameras.moved(shared[lie.TANGENT :])
-        host, camera = (cameras.of(keyframe) for keyframe in view.ends)
+        """Residuals after a step of each part, at the given depths and, if any, pixels in the host."""
+        relative = lie.move(view.relative, parts[0])
+        host, camera = view.cameras.along(view.ends, parts[1:])
 
         def one(data: dict, pixel: Array, inverse_depth: Array) -> Array:
             return check_residual(self, self.holding(data).residual(View(relative, camera, pixel, inverse_depth, host)))

@@ -12,7 +12,14 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.bundle.terms.term import AbstractTerm, Local, check_residual, local_model
+from vggtgeo.bundle.terms.term import (
+    AbstractTerm,
+    Local,
+    check_residual,
+    local_model,
+    reweighted_rows,
+    robust_energy,
+)
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import AbstractCamera, Cameras
 from vggtgeo.io.errors import InputError
@@ -53,11 +60,11 @@ class PoseTerm(AbstractTerm):
         """Of one observation; `pose` is world -> camera, `camera` the one that took the keyframe."""
 
     def local(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Local:
-        """The residual of one observation as a function of `(xi, parameters of all cameras)`."""
+        """The residual of one observation as a function of `(xi, parameters of the keyframe's camera)`."""
 
         def function(step: Array) -> Array:
             pose = lie.move(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
-            camera = cameras.moved(step[lie.TANGENT :]).of(touched[0])
+            camera = cameras.of(touched[0], step[lie.TANGENT :])
             return check_residual(self, self.holding(data).residual(pose, camera))
 
         return function
@@ -145,14 +152,14 @@ class CameraTerm(AbstractTerm):
     def model(
         self, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
     ) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
-        """Hessian and gradient of the energy."""
-
-        def one(data: dict, weight: Array) -> tuple[Array, Array]:
-            residual = lambda step: check_residual(self, self.holding(data).residual(parameters + step))
-            return local_model(self, weight, residual, len(parameters), correction, exact)
-
-        hessians, gradients = jax.vmap(one)(self.data(), self.weights)
-        return hessians.sum(0), gradients.sum(0)
+        """Hessian and gradient of the energy: of the sum, since each observation may see all parameters."""
+        if exact:
+            gradient = jax.grad(lambda at: robust_energy(self.kernel, self.weights, self.residuals(at)))
+            return jax.jacfwd(gradient)(parameters), gradient(parameters)
+        jacobian = jnp.moveaxis(jax.jacfwd(self.residuals)(parameters), -1, 0)
+        rows, pull = reweighted_rows(self.kernel, self.weights, self.residuals(parameters), jacobian, correction)
+        rows = rows.reshape(len(parameters), -1)
+        return rows @ rows.T, rows @ pull.reshape(-1)
 
 
 class DenseTerm(AbstractTerm):
