@@ -106,7 +106,7 @@ def simulate_window(
     outliers: float = 0.0,
     depth_error: float = 0.03,
     start_error: float = 0.03,
-    host_noise: bool = False,
+    host_noise: bool = True,
     seed: int = 0,
 ) -> SimulatedWindow:
     """A window of `keyframes` cameras, 0.15 m apart, that look at one place.
