@@ -1,5 +1,7 @@
 """Robust kernels `rho(s)` of a squared, weighted residual norm `s`; the energy of a residual is `rho(s) / 2`.
 
+`s = w |r|^2` is whitened where a weight is 1 / variance: then the width of a kernel counts in standard deviations.
+
 A kernel is normalised so that `rho(0) = 0` and `rho'(0) = 1`: near zero every kernel is the plain square. A kernel of
 your own needs `rho` alone; its derivatives are derived.
 References: Huber 1964; Black & Anandan 1996; Barron, "A General and Adaptive Robust Loss Function", CVPR 2019.
@@ -30,7 +32,10 @@ def _number(given: Any) -> Array:
 
 
 class AbstractKernel(eqx.Module):
-    """A robust kernel; `s` is the squared norm, any shape, `s >= 0`.
+    """A robust kernel; `s = w |r|^2` is the squared norm of the weighted residual, any shape, `s >= 0`.
+
+    The width `delta` of a kernel acts on `sqrt(w) |r|`. Where weights are `1 / sigma^2`, that is a number of standard
+    deviations: `Huber(1.5)` is quadratic up to 1.5 sigma. Only for weights of 1 is it in the residual's own unit.
 
     Example: a kernel of one's own, for small residuals the square.
         >>> class Welsch(vg.AbstractKernel):

@@ -17,6 +17,11 @@ from vggtgeo.bundle.terms.term import AbstractTerm
 class Observations:
     """What bundle adjustment sees, as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples.
 
+    A weight is 1 / variance: a match of standard deviation `s` pixels has weight `1 / s^2`, and weight 1 states a
+    standard deviation of 1 pixel. The width of the kernel counts in these standard deviations. A depth of weight 1
+    has the standard deviation `depth_sigma`; `alpha` scales the information of all depths, so that the energy and the
+    covariances take them as known to `depth_sigma / sqrt(alpha depth_weight)`.
+
     Example:
         >>> import numpy as np, vggtgeo as vg
         >>> vg.Observations(
@@ -45,19 +50,22 @@ class Observations:
     point_target: np.ndarray
     """`[A, 2]` pixels."""
     point_weight: np.ndarray
-    """`[A]`."""
+    """`[A]`: 1 / variance of both coordinates, 1/pixels^2; 0 = the match is not there."""
     line_edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     line_landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     line_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """`[B, 3]`: a, b, c with a^2 + b^2 = 1."""
     line_weight: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """`[B]`: 1 / variance of the distance from the line, 1/pixels^2; 0 = the sample is not there."""
     depth_mean: np.ndarray | None = None
     """`[D]`: prior inverse depth, 1/m; None = no depth prior at all."""
     depth_sigma: np.ndarray | None = None
-    """`[D]`: its standard deviation, 1/m."""
+    """`[D]`: its standard deviation, 1/m; None = 1."""
     depth_weight: np.ndarray | None = None
-    """`[D]`: its confidence; 0 = none."""
-    alpha: float = 2.0
+    """`[D]`: factor on the information `1 / depth_sigma^2`, 1 by default; 0 = no prior for this landmark."""
+    alpha: float = 1.0
+    """Factor on the information of all depths: with 2, the paper's value, a depth of `depth_sigma=0.1` counts as one of
+    0.0707."""
     segment: np.ndarray | None = None
     """int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples then lie on a
     straight line (two unknowns a segment); None: each sample has its own."""

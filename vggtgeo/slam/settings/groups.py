@@ -125,7 +125,7 @@ class DepthSettings(CheckedSettings):
 
     group: ClassVar[str] = "depth_terms"
     depth_weight: float = not_negative(2.0)
-    """The paper's alpha; 0 switches the depth prior off."""
+    """The paper's alpha, a factor on the information of all depths; 0 switches the depth prior off."""
     depth_trust: str = one_of("own", "saliency", "complement")
     """What scales the depth prior of a pixel. "own": the confidence of the depth itself; "saliency": the Omega that
     weights the matches, as in the paper's formula; "complement": 1 - Omega, as the paper's text describes it."""
