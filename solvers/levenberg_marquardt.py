@@ -174,7 +174,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Apply `max_correction` from the start, whatever the gain."""
     reduced_solver: AbstractReducedSolver = DenseCholesky()
     differentiable_loop: bool = False
-    """Make the inner loop reverse-differentiable (bounded, slower), for unrolled differentiation."""
+    """Make the inner loop reverse-differentiable (bounded, slower), for `optimistix.RecursiveCheckpointAdjoint`;
+    `vggtgeo.solve` sets it where that adjoint is given."""
     record_iterations: bool = False
     """Keep an `IterationRecord`, for pictures of the iteration; without it nothing of it is compiled."""
 
