@@ -111,7 +111,7 @@ def test_a_centre_that_nothing_determines_is_not_reported_as_exact() -> None:
     problem, in which keyframes 1 to 3 have no term.
     """
     problem, state = poses_alone()
-    nothing = problem.with_term(problem.epipolar.reweighted(problem.epipolar.weight * 0))
+    nothing = problem.with_term(problem.epipolar.reweighted(problem.epipolar.weight * 0), replace=True)
     line = repr(vg.covariances(nothing, state))
     assert "3 undetermined" in line
     assert "mm" not in line

@@ -13,8 +13,13 @@ import equinox as eqx
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.line import LineTerm
+from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
+from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
@@ -24,6 +29,10 @@ from vggtgeo.io.given import check_kind
 
 MIN_INVERSE_DEPTH = 1e-6
 """1/m: the bound of positive inverse depths (1000 km)."""
+
+
+_ONE_OF_EACH = (PointTerm, LineTerm, DepthPrior, IntrinsicsPrior, MarginalPrior)
+"""Kinds of terms that a problem has one of."""
 
 
 class State(eqx.Module):
@@ -130,23 +139,48 @@ class Problem(eqx.Module):
                 return term
         raise AttributeError(f"`Problem` has no attribute and no term `{name}`")
 
-    def with_term(self, term: AbstractTerm) -> Problem:
-        """The problem with `term` in place of the one of the same name, or added as the last.
+    def with_term(self, term: AbstractTerm, *, replace: bool = False) -> Problem:
+        """Add a term as the last, or put it in place of the one of its name.
+
+        What a problem has one of is replaced: points, lines, depth, the intrinsics' prior and the prior of a
+        marginalisation. Any other term of a name that is taken is refused, so that a second list of
+        measurements does not take the place of the first; `replace=True` says that it is to.
+
+        Args:
+            term: in the padded shape of this problem.
+            replace: put it in place of the term of its name, if there is one.
 
         Raises:
-            InputError: it is no term, or of another kind than the one of its name.
+            InputError: it is no term, its name is taken, or the term of its name is of another kind.
+
+        Example: two receivers, each with measurements of its own.
+            >>> import jax.numpy as jnp
+            >>> class PositionFix(vg.PoseTerm):
+            ...     position: jnp.ndarray
+            ...     def residual(self, pose, camera):
+            ...         return pose.inverse().translation() - self.position
+            >>> class SecondFix(PositionFix):
+            ...     name = "second_fix"
+            >>> first, second = (kind(keyframe=[1], position=jnp.zeros((1, 3))) for kind in (PositionFix, SecondFix))
+            >>> [term.name for term in problem.with_term(first).with_term(second).terms[-2:]]
+            ['position_fix', 'second_fix']
 
         """
         check_kind("term", term, AbstractTerm, "a term, such as `vggtgeo.PointTerm`")
-        names = [old.name for old in self.terms]
-        for old in self.terms:
-            if old.name == term.name and not (isinstance(term, type(old)) or isinstance(old, type(term))):
-                raise InputError(
-                    f"`{term.name}` is the name of a `{type(old).__name__}` of the problem, which a "
-                    f"`{type(term).__name__}` would replace; give its class another `name`"
-                )
-        terms = tuple(term if old.name == term.name else old for old in self.terms)
-        return self.with_terms(terms if term.name in names else (*terms, term))
+        old = next((old for old in self.terms if old.name == term.name), None)
+        if old is None:
+            return self.with_terms((*self.terms, term))
+        if not (isinstance(term, type(old)) or isinstance(old, type(term))):
+            raise InputError(
+                f"`{term.name}` is the name of a `{type(old).__name__}` of the problem, which a "
+                f"`{type(term).__name__}` would replace; give its class another `name`"
+            )
+        if not replace and not isinstance(old, _ONE_OF_EACH):
+            raise InputError(
+                f"`term` is a second `{term.name}`; the problem has one of that name. Give `replace=True` to put it in "
+                "its place; for both, join their observations in one term, or derive a class with a `name` of its own"
+            )
+        return self.with_terms(tuple(term if own is old else own for own in self.terms))
 
     def without_term(self, name: str) -> Problem:
         """The problem without the term of that name, if it has one."""

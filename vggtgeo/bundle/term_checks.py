@@ -34,7 +34,10 @@ def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int
         if not isinstance(term, AbstractTerm | FlatTerm):
             raise InputError(f"`terms` holds {term!r:.60}; expected terms, as `vggtgeo.RelativePose`, or `FlatTerm`")
         if term.name in names:
-            raise InputError(f"`terms` holds a second term `{term.name}`; give its class another `name`")
+            raise InputError(
+                f"`terms` holds a second term `{term.name}`; join their observations in one term, or derive a class "
+                "with a `name` of its own"
+            )
         names.append(term.name)
         if not isinstance(term.weight, jax.core.Tracer):
             check_weight(f"{term.name}.weight", term.weight)
