@@ -22,6 +22,27 @@ class Observations:
     has the standard deviation `depth_sigma`; `alpha` scales the information of all depths, so that the energy and the
     covariances take them as known to `depth_sigma / sqrt(alpha depth_weight)`.
 
+    Fields:
+        edges: int `[E, 2]`: (host keyframe, target keyframe).
+        host: int `[D]`: keyframe that hosts each landmark (one inverse depth each).
+        pixel: `[D, 2]`: its pixel in the host.
+        point_edge: int `[A]`: along which edge each match was seen.
+        point_landmark: int `[A]`: which landmark it is.
+        point_target: `[A, 2]` pixels.
+        point_weight: `[A]`: 1 / variance of both coordinates, 1/pixels^2; 0 = the match is not there.
+        line_edge: int `[B]`: along which edge each line sample was seen.
+        line_landmark: int `[B]`: which landmark it is.
+        line_coefficients: `[B, 3]`: a, b, c with a^2 + b^2 = 1.
+        line_weight: `[B]`: 1 / variance of the distance from the line, 1/pixels^2; 0 = the sample is not there.
+        depth_mean: `[D]`: prior inverse depth, 1/m; None = no depth prior at all.
+        depth_sigma: `[D]`: its standard deviation, 1/m; None = 1.
+        depth_weight: `[D]`: factor on the information `1 / depth_sigma^2`, 1 by default; 0 = no prior for this
+            landmark.
+        alpha: Factor on the information of all depths: with 2, the paper's value, a depth of `depth_sigma=0.1`
+            counts as one of 0.0707.
+        segment: int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples
+            then lie on a straight line (two unknowns a segment); None: each sample has its own.
+
     Example:
         >>> import numpy as np, vggtgeo as vg
         >>> vg.Observations(
@@ -38,37 +59,21 @@ class Observations:
     """
 
     edges: np.ndarray
-    """int `[E, 2]`: (host keyframe, target keyframe)."""
     host: np.ndarray
-    """int `[D]`: keyframe that hosts each landmark (one inverse depth each)."""
     pixel: np.ndarray
-    """`[D, 2]`: its pixel in the host."""
     point_edge: np.ndarray
-    """int `[A]`."""
     point_landmark: np.ndarray
-    """int `[A]`."""
     point_target: np.ndarray
-    """`[A, 2]` pixels."""
     point_weight: np.ndarray
-    """`[A]`: 1 / variance of both coordinates, 1/pixels^2; 0 = the match is not there."""
     line_edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     line_landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     line_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """`[B, 3]`: a, b, c with a^2 + b^2 = 1."""
     line_weight: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """`[B]`: 1 / variance of the distance from the line, 1/pixels^2; 0 = the sample is not there."""
     depth_mean: np.ndarray | None = None
-    """`[D]`: prior inverse depth, 1/m; None = no depth prior at all."""
     depth_sigma: np.ndarray | None = None
-    """`[D]`: its standard deviation, 1/m; None = 1."""
     depth_weight: np.ndarray | None = None
-    """`[D]`: factor on the information `1 / depth_sigma^2`, 1 by default; 0 = no prior for this landmark."""
     alpha: float = 1.0
-    """Factor on the information of all depths: with 2, the paper's value, a depth of `depth_sigma=0.1` counts as one of
-    0.0707."""
     segment: np.ndarray | None = None
-    """int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples then lie on a
-    straight line (two unknowns a segment); None: each sample has its own."""
 
     def __repr__(self) -> str:
         rows = {"landmark": self.host, "edge": self.edges, "point": self.point_edge, "line sample": self.line_edge}
@@ -81,6 +86,13 @@ class FlatTerm:
     """A term on landmarks before packing: one row an observation, in any order.
 
     `pack(..., terms=[...])` puts each row where its landmark is, and pads.
+
+    Fields:
+        kind: A class of terms on edges or on slots.
+        fields: What its constructor takes: data of the observations `[k, ...]`, `weight [k]` (1 without one),
+            `kernel`, and what all observations share.
+        landmark: int `[k]`, as `Observations.host` lists them.
+        edge: int `[k]`, as `Observations.edges` lists them: where the landmark was seen (terms on edges only).
 
     Example: each landmark that keyframe 0 hosts lies on a plane that is known in keyframe 1.
         >>> import numpy as np, vggtgeo as vg
@@ -98,14 +110,9 @@ class FlatTerm:
     """
 
     kind: type[AbstractTerm]
-    """A class of terms on edges or on slots."""
     fields: Mapping[str, Any]
-    """What its constructor takes: data of the observations `[k, ...]`, `weight [k]` (1 without one), `kernel`, and what
-    all observations share."""
     landmark: np.ndarray
-    """int `[k]`, as `Observations.host` lists them."""
     edge: np.ndarray | None = None
-    """int `[k]`, as `Observations.edges` lists them: where the landmark was seen (terms on edges only)."""
 
     @property
     def name(self) -> str:

@@ -29,6 +29,16 @@ GivenTerm = AbstractTerm | FlatTerm
 class PaddedSize:
     """Static shape of a problem: every problem packed to one size shares one compiled solver.
 
+    Fields:
+        keyframes: Number of keyframes.
+        points: Slots for points a keyframe.
+        lines: Slots for line samples a keyframe.
+        degree: Largest number of edges of one host.
+        edges: Number of edges stored; None = `keyframes * degree`, every host padded to `degree` edges.
+        samples: Samples of a segment, where observations have a `segment`; `lines` is a multiple of it.
+        terms: Names of terms on poses, pairs and the camera, and how many observations of each there is room for;
+            one that is not named here is not padded.
+
     Example:
         >>> import vggtgeo as vg
         >>> size = vg.PaddedSize(keyframes=10, points=320, lines=192, degree=9)
@@ -42,14 +52,9 @@ class PaddedSize:
     points: int
     lines: int
     degree: int
-    """Largest number of edges of one host."""
     edges: int | None = None
-    """Number of edges stored; None = `keyframes * degree`, every host padded to `degree` edges."""
     samples: int | None = None
-    """Samples of a segment, where observations have a `segment`; `lines` is a multiple of it."""
     terms: tuple[tuple[str, int], ...] = ()
-    """Names of terms on poses, pairs and the camera, and how many observations of each there is room for; one that is
-    not named here is not padded."""
 
     @staticmethod
     def of(observations: Observations, keyframes: int, terms: Sequence[GivenTerm] = ()) -> PaddedSize:

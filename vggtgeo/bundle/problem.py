@@ -38,6 +38,12 @@ _ONE_OF_EACH = (PointTerm, LineTerm, DepthPrior, IntrinsicsPrior, MarginalPrior)
 class State(eqx.Module):
     """What bundle adjustment estimates: `n` poses, the camera they share, `s` inverse depths a keyframe.
 
+    Fields:
+        poses: World -> camera of each keyframe, batch `[n]`.
+        intrinsics: Parameters of the camera, `fx, fy, cx, cy` in pixels, then those of its distortion: `[k]`, or
+            `[g, k]` of `g` cameras.
+        inverse_depth: 1/m, along the optical axis of the host keyframe, one a slot.
+
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
         >>> _, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
@@ -50,12 +56,8 @@ class State(eqx.Module):
     """
 
     poses: jaxlie.SE3
-    """World -> camera of each keyframe, batch `[n]`."""
     intrinsics: Float[Array, "*g k"]
-    """Parameters of the camera, `fx, fy, cx, cy` in pixels, then those of its distortion: `[k]`, or `[g, k]` of `g`
-    cameras."""
     inverse_depth: Float[Array, "n s"]
-    """1/m, along the optical axis of the host keyframe, one a slot."""
 
     @property
     def parameters(self) -> Float[Array, " q"]:
@@ -101,6 +103,20 @@ class Problem(eqx.Module):
     Pixels, 1/m for inverse depths, poses world -> camera. Weight 0 means that an observation is not there, so that a
     kind can be left out without another shape. A term is also an attribute by its name: `problem.points`.
 
+    Fields:
+        pixels: Where slot s of keyframe i looks: point slots first, then line samples.
+        edges: The covisibility graph.
+        terms: What is minimised: the sum of their energies.
+        fixed_pose: Keyframes whose pose is held (the gauge).
+        fixed_intrinsics: Parameters of the cameras that are held.
+        fraction: Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a
+            segment is an affine function of this position along it (0 and 1 at its ends). None: each sample has its
+            own inverse depth.
+        camera_of: Which camera took each keyframe, a row of the state's intrinsics; None: one took all.
+        camera: Model of the cameras whose parameters the state holds.
+        positive_depth: Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver
+            without bounds.
+
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
@@ -115,23 +131,14 @@ class Problem(eqx.Module):
     """
 
     pixels: Float[Array, "n s 2"]
-    """Where slot s of keyframe i looks: point slots first, then line samples."""
     edges: Edges
     terms: tuple[AbstractTerm, ...]
-    """What is minimised: the sum of their energies."""
     fixed_pose: Bool[Array, " n"]
-    """Keyframes whose pose is held (the gauge)."""
     fixed_intrinsics: Bool[Array, "*g k"]
-    """Parameters of the cameras that are held."""
     fraction: Float[Array, "n g m"] | None = None
-    """Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a segment is an
-    affine function of this position along it (0 and 1 at its ends). None: each sample has its own inverse depth."""
     camera_of: Int[Array, " n"] | None = None
-    """Which camera took each keyframe, a row of the state's intrinsics; None: one took all."""
     camera: type[AbstractCamera] = eqx.field(static=True, default=Pinhole)
-    """Model of the cameras whose parameters the state holds."""
     positive_depth: bool = eqx.field(static=True, default=True)
-    """Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver without bounds."""
 
     def __getattr__(self, name: str) -> Any:
         for term in vars(self).get("terms", ()):

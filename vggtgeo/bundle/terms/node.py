@@ -32,6 +32,11 @@ def _indices(given: Any) -> Array:
 class PoseTerm(AbstractTerm):
     """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`.
 
+    Fields:
+        keyframe: Which pose each observation is about.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+
     Example: a position fix.
         >>> class PositionFix(vg.PoseTerm):
         ...     position: jax.Array
@@ -44,7 +49,6 @@ class PoseTerm(AbstractTerm):
     """
 
     keyframe: _Index = eqx.field(converter=_indices, kw_only=True)
-    """Which pose each observation is about."""
 
     structure = frozenset({"weight", "kernel", "keyframe"})
 
@@ -74,6 +78,12 @@ class PoseTerm(AbstractTerm):
 class PairTerm(AbstractTerm):
     """Observations of two poses: `weight` and data have the axis `[m]`.
 
+    Fields:
+        first: Keyframe i of each observation.
+        second: Keyframe j.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+
     Example: what the wheels say of a motion.
         >>> class Wheels(vg.PairTerm):
         ...     step: jax.Array
@@ -86,9 +96,7 @@ class PairTerm(AbstractTerm):
     """
 
     first: _Index = eqx.field(converter=_indices, kw_only=True)
-    """Keyframe i of each observation."""
     second: _Index = eqx.field(converter=_indices, kw_only=True)
-    """Keyframe j."""
 
     structure = frozenset({"weight", "kernel", "first", "second"})
 
@@ -122,6 +130,10 @@ class CameraTerm(AbstractTerm):
     """Observations of the camera's parameters: `weight` and data have the axis `[m]`.
 
     Several cameras: their parameters one camera after the other, `q = g k` of them.
+
+    Fields:
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
 
     Example: pixels are square.
         >>> class SquarePixels(vg.CameraTerm):
@@ -157,6 +169,10 @@ class CameraTerm(AbstractTerm):
 
 class DenseTerm(AbstractTerm):
     """One observation of all poses and the camera together; it fills the matrix. `weight` is a scalar.
+
+    Fields:
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
 
     Example: the one of the package is the prior of marginalisation.
         >>> isinstance(vg.no_prior(3), vg.DenseTerm)

@@ -86,6 +86,12 @@ class AbstractTerm(eqx.Module):
     The fields that a subclass adds are data: every array in them has the axes of `weight` first. What all observations
     share is declared with `vggtgeo.shared_field()`.
 
+    Fields:
+        weight: 1 / variance of the residual of each observation. 0 means that it is not there, and what is not there
+            has no derivative: by a weight of exactly 0 the derivative of a solution is 0. To learn whether an
+            observation should count, give it a small positive weight.
+        kernel: robust kernel of each observation; the square by default.
+
     Example: a term of a problem, without its first edge.
         >>> term = problem.points
         >>> term.reweighted(term.weight.at[0].set(0.0)).present()[0].any().item()
@@ -94,7 +100,6 @@ class AbstractTerm(eqx.Module):
     """
 
     weight: Float[Array, "*observations"] = eqx.field(converter=_weights, kw_only=True, default=1.0)
-    """Of each observation, 1 / variance of its residual; 0 means that it is not there."""
     kernel: AbstractKernel = eqx.field(kw_only=True, default=Square())
 
     unit: ClassVar[str] = ""
