@@ -120,8 +120,9 @@ class FlatTerm:
 
     @property
     def weight(self) -> np.ndarray:
-        """`[k]`."""
-        return np.asarray(self.fields.get("weight", np.ones(len(self.landmark))))
+        """`[k]`; one number is that of each."""
+        given = np.asarray(self.fields.get("weight", 1.0))
+        return np.full(len(self.landmark), given) if given.ndim == 0 and given.dtype.kind in "iuf" else given
 
     def rows(self) -> dict[str, Any]:
         """The fields that have one row an observation, `weight` among them."""

@@ -119,7 +119,7 @@ def pack(
     check_positive("inverse_depth", inverse_depth, len(observations.host))
     warn_of_far(inverse_depth)
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
-    check_terms(terms, observations, len(poses))
+    terms = check_terms(terms, observations, len(poses))
     guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
     check_precision({**vars(observations), **guess, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
     size, graph, index = _layout(observations, len(poses), size)

@@ -61,7 +61,7 @@ class PaddedSize:
         """The smallest that fits, every host padded to the same number of edges."""
         slots = assign_slots(observations, keyframes)
         _, _, degree = sort_edges(observations.edges, keyframes)
-        counts = tuple((term.name, np.size(term.weight)) for term in terms if isinstance(term, COUNTED))
+        counts = tuple((term.name, np.size(term.broadcast().weight)) for term in terms if isinstance(term, COUNTED))
         return PaddedSize(keyframes, slots.points, slots.lines, degree, samples=slots.samples, terms=counts)
 
     @staticmethod

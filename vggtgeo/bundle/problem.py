@@ -21,7 +21,7 @@ from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
-from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
 from vggtgeo.io.errors import InputError
@@ -158,7 +158,8 @@ class Problem(eqx.Module):
             replace: put it in place of the term of its name, if there is one.
 
         Raises:
-            InputError: it is no term, its name is taken, or the term of its name is of another kind.
+            InputError: it is no term, its name is taken, the term of its name is of another kind, or it is on
+                landmarks and not in the shape of this problem.
 
         Example: two receivers, each with measurements of its own.
             >>> import jax.numpy as jnp
@@ -174,6 +175,10 @@ class Problem(eqx.Module):
 
         """
         check_kind("term", term, AbstractTerm, "a term, such as `vggtgeo.PointTerm`")
+        term = term.broadcast()
+        if isinstance(term, EdgeTerm | SlotTerm):
+            rows = self.edges.source.shape if isinstance(term, EdgeTerm) else self.pixels.shape[:-2]
+            check_padded(term, rows, self.pixels.shape[-2])
         old = next((old for old in self.terms if old.name == term.name), None)
         if old is None:
             return self.with_terms((*self.terms, term))

@@ -30,7 +30,8 @@ def _indices(given: Any) -> Array:
 
 
 class PoseTerm(AbstractTerm):
-    """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`.
+    """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`. One number as
+    weight counts for each.
 
     Fields:
         keyframe: Which pose each observation is about.
@@ -70,13 +71,17 @@ class PoseTerm(AbstractTerm):
         """Keyframes of each observation."""
         return (self.keyframe,)
 
+    def observation_shape(self) -> tuple[int, ...]:
+        return self.keyframe.shape
+
     def local_size(self, cameras: Cameras) -> int:
         """Number of local coordinates."""
         return lie.TANGENT + cameras.size
 
 
 class PairTerm(AbstractTerm):
-    """Observations of two poses: `weight` and data have the axis `[m]`.
+    """Observations of two poses: `weight` and data have the axis `[m]`. One number as weight counts for
+    each.
 
     Fields:
         first: Keyframe i of each observation.
@@ -118,6 +123,9 @@ class PairTerm(AbstractTerm):
         """Keyframes of each observation."""
         return self.first, self.second
 
+    def observation_shape(self) -> tuple[int, ...]:
+        return self.first.shape
+
     def local_size(self, cameras: Cameras) -> int:
         """Number of local coordinates."""
         return 2 * lie.TANGENT
@@ -127,7 +135,8 @@ NodeTerm = PoseTerm | PairTerm
 
 
 class CameraTerm(AbstractTerm):
-    """Observations of the camera's parameters: `weight` and data have the axis `[m]`.
+    """Observations of the camera's parameters: `weight` and data have the axis `[m]`. One number as weight counts for
+    each.
 
     Several cameras: their parameters one camera after the other, `q = g k` of them.
 
@@ -148,6 +157,10 @@ class CameraTerm(AbstractTerm):
     @abc.abstractmethod
     def residual(self, parameters: Float[Array, " q"]) -> Float[Array, "*m"]:
         """Of one observation."""
+
+    def observation_shape(self) -> tuple[int, ...]:
+        rows = [np.shape(leaf)[:1] for leaf in jax.tree.leaves(self.data())]
+        return next(iter(rows), (1,))
 
     def residuals(self, parameters: Float[Array, " q"]) -> Float[Array, "m k"]:
         """Of all of them, the residual's own axis first."""

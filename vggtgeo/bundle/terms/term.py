@@ -65,6 +65,23 @@ def check_residual(term: AbstractTerm, residual: Any) -> Array:
     return jnp.atleast_1d(residual)
 
 
+def check_padded(term: AbstractTerm, rows: tuple[int, ...], slots: int) -> None:
+    """InputError for a term on landmarks whose weights or data are not in the padded shape of a problem: `rows` (its
+    edges or keyframes), then at most `slots`; flat lists in particular.
+    """
+    shape = np.shape(term.weight)
+    found = [("weight", shape, (*rows, slots))] if shape[:-1] != rows or shape[-1] > slots else []
+    for name, value in term.data().items():
+        found += [
+            (name, np.shape(leaf), shape) for leaf in jax.tree.leaves(value) if np.shape(leaf)[: len(shape)] != shape
+        ]
+    for name, own, expected in found:
+        raise InputError(
+            f"`{term.name}.{name}` has shape {own}; it must begin with {expected}, the padded shape of the problem. "
+            "Give flat lists, one row an observation, as a `vggtgeo.FlatTerm` to `vggtgeo.pack(..., terms=[...])`"
+        )
+
+
 def shared_field(**options: Any) -> Any:
     """A field of a term that all its observations share (a scale, a calibration), not data with an axis of its own.
 
@@ -140,6 +157,17 @@ class AbstractTerm(eqx.Module):
                 f"`weight` has shape {given.shape}; expected {self.weight.shape}, that of `{self.name}.weight`"
             )
         return eqx.tree_at(lambda term: term.weight, self, given)
+
+    def observation_shape(self) -> tuple[int, ...] | None:
+        """Shape of the observations, where their number is known without weights; None where it is not."""
+        return None
+
+    def broadcast(self) -> Self:
+        """The same term with a weight for each observation, where one number is given for all."""
+        shape = self.observation_shape()
+        if shape is None or self.weight.ndim:
+            return self
+        return eqx.tree_at(lambda term: term.weight, self, jnp.broadcast_to(self.weight, shape))
 
     def present(self) -> Bool[Array, "*observations"]:
         """Which observations are there."""
