@@ -61,6 +61,14 @@ class ArrowAdjoint(optx.AbstractAdjoint):
     Where the Hessian at the optimum is singular beyond the gauge (nothing determines some coordinate), the derivative
     is that of the coordinates that are determined; where no finite answer exists it is zero.
 
+    Fields:
+        polish: Chord steps before differentiating, at most: they end when the gradient no longer shrinks.
+        not_stationary: What to do with a derivative at a point that the polish did not bring to rest: keep it
+            (`gradient_residual` of the solution says how far it is off), make it NaN, or raise an error. The same
+            is done where the derivative's own linear system was not solved: minimum residuals (of
+            `ConjugateGradients`) end after `exact_iterations`. To differentiate the iterations themselves take
+            `optimistix.RecursiveCheckpointAdjoint()` instead of this class.
+
     Example:
         >>> import jax, vggtgeo as vg
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
@@ -72,12 +80,7 @@ class ArrowAdjoint(optx.AbstractAdjoint):
     """
 
     polish: int = 6
-    """Chord steps before differentiating, at most: they end when the gradient no longer shrinks."""
     not_stationary: Literal["keep", "nan", "error"] = "keep"
-    """What to do with a derivative at a point that the polish did not bring to rest: keep it (`gradient_residual` of
-    the solution says how far it is off), make it NaN, or raise an error. The same is done where the derivative's own
-    linear system was not solved: minimum residuals (of `ConjugateGradients`) end after `exact_iterations`. To
-    differentiate the iterations themselves take `optimistix.RecursiveCheckpointAdjoint()` instead of this class."""
 
     def __check_init__(self) -> None:
         given: Any = self.polish

@@ -7,7 +7,15 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from vggtgeo.solvers.arrow import ArrowSystem, Reduced, couple, hessian_times, inverse_landmark_hessian
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    Reduced,
+    couple,
+    dense_gradient,
+    hessian_times,
+    inverse_landmark_hessian,
+)
+from vggtgeo.solvers.local_inverse import rank_tolerance
 
 MIN_DIAGONAL = 1e-6
 """Least curvature that damping and scaling assume of a coordinate, where the largest is 1 or more."""
@@ -27,32 +35,40 @@ def free_gauge(system: ArrowSystem) -> Float[Array, "c g"]:
 
 
 def gauge_stiffness(system: ArrowSystem, reduced: Reduced) -> Float[Array, " g"]:
-    """Stiffness to add along each gauge direction: zero where the energy curves along it, else the Hessian's own.
-
-    A direction counts as flat where the Schur complement takes all but `sqrt(eps)` of the Hessian's curvature away:
-    then nothing in the problem determines it, and it is held by this stiffness rather than left to the damping.
-    """
-    directions = jnp.where(system.free[:, None], system.gauge, 0.0)
+    """Stiffness to add along each gauge direction: zero where the energy curves along it, else as in `_where_flat`."""
+    directions = free_gauge(system)
     quadratic = lambda matrix: jnp.einsum("cg,cd,dg->g", directions, matrix, directions)
-    whole = quadratic(reduced.hessian)
-    left = quadratic(reduced.hessian - reduced.schur)
-    flat = left < jnp.sqrt(jnp.finfo(left.dtype).eps) * whole
-    return jnp.where(flat, whole, 0.0)
+    return _where_flat(
+        quadratic(reduced.hessian),
+        quadratic(reduced.hessian - reduced.schur),
+        jnp.abs(jnp.diagonal(reduced.hessian)) @ directions**2,
+    )
 
 
 def flat_stiffness(system: ArrowSystem) -> Float[Array, " g"]:
-    """The stiffness of `gauge_stiffness`, from one product of the system with each gauge direction.
-
-    `d' H d - d' W V^-1 W' d` against `d' H d`: flat where elimination takes all but `sqrt(eps)` of the curvature away.
+    """The stiffness of `gauge_stiffness`, from one product of the system with each gauge direction:
+    `d' H d - d' W V^-1 W' d` against `d' H d`.
     """
-    inverse = inverse_landmark_hessian(system)
+    inverse, directions = inverse_landmark_hessian(system), free_gauge(system)
 
     def curvatures(direction: Array) -> tuple[Array, Array]:
         whole = direction @ hessian_times(system, direction)
         return whole, whole - jnp.sum(inverse * couple(system, direction, 0.0) ** 2)
 
-    whole, left = jax.vmap(curvatures, in_axes=1)(free_gauge(system))
-    return jnp.where(left < jnp.sqrt(jnp.finfo(left.dtype).eps) * whole, whole, 0.0)
+    whole, left = jax.vmap(curvatures, in_axes=1)(directions)
+    return _where_flat(whole, left, jnp.abs(dense_gradient(system)[1]) @ directions**2)
+
+
+def _where_flat(whole: Float[Array, " g"], left: Float[Array, " g"], size: Float[Array, " g"]) -> Float[Array, " g"]:
+    """A direction is flat where elimination of the landmarks takes all but `sqrt(eps)` of its curvature away; then it
+    is held by the stiffness that was there, rather than left to the damping.
+
+    Without landmarks on it, the Hessian itself has no curvature along a free scale: all of `d' H d` is then rounding
+    error of the curvatures `size = d' diag(H) d` of its coordinates, which take its place.
+    """
+    curved = jnp.abs(whole) > rank_tolerance(1, whole.dtype) * size
+    reference = jnp.where(curved, whole, size)
+    return jnp.where(left < jnp.sqrt(jnp.finfo(left.dtype).eps) * reference, reference, 0.0)
 
 
 def pins(system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Array, " c"]) -> Float[Array, "c g"]:

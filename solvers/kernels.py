@@ -1,5 +1,7 @@
 """Robust kernels `rho(s)` of a squared, weighted residual norm `s`; the energy of a residual is `rho(s) / 2`.
 
+`s = w |r|^2` is whitened where a weight is 1 / variance: then the width of a kernel counts in standard deviations.
+
 A kernel is normalised so that `rho(0) = 0` and `rho'(0) = 1`: near zero every kernel is the plain square. A kernel of
 your own needs `rho` alone; its derivatives are derived.
 References: Huber 1964; Black & Anandan 1996; Barron, "A General and Adaptive Robust Loss Function", CVPR 2019.
@@ -30,7 +32,12 @@ def _number(given: Any) -> Array:
 
 
 class AbstractKernel(eqx.Module):
-    """A robust kernel; `s` is the squared norm, any shape, `s >= 0`.
+    """A robust kernel; `s = w |r|^2` is the squared norm of the weighted residual, any shape, `s >= 0`.
+
+    The width `delta` of a kernel acts on `sqrt(w) |r|`. Where weights are `1 / sigma^2`, that is a number of standard
+    deviations: `Huber(1.5)` is quadratic up to 1.5 sigma. Only for weights of 1 is it in the residual's own unit.
+
+    Fields:
 
     Example: a kernel of one's own, for small residuals the square.
         >>> class Welsch(vg.AbstractKernel):
@@ -66,6 +73,8 @@ class AbstractKernel(eqx.Module):
 class Square(AbstractKernel):
     """No robustness: `rho(s) = s`.
 
+    Fields:
+
     Example:
         >>> float(vg.Square().weight(jax.numpy.asarray(9.0)))
         1.0
@@ -84,6 +93,9 @@ class Square(AbstractKernel):
 
 class Huber(AbstractKernel):
     """`rho(s) = s` up to `delta^2`, then `2 delta sqrt(s) - delta^2`: outliers pull with a constant force.
+
+    Fields:
+        delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
 
     Example: a residual of four times the width counts a quarter.
         >>> float(vg.Huber(delta=1.5).weight(jax.numpy.asarray(6.0**2)))
@@ -114,6 +126,9 @@ class Huber(AbstractKernel):
 class Cauchy(AbstractKernel):
     """`rho(s) = delta^2 log(1 + s / delta^2)`: the pull of an outlier falls with its distance.
 
+    Fields:
+        delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
+
     Example: a residual of twice the width counts a fifth.
         >>> float(vg.Cauchy(delta=1.5).weight(jax.numpy.asarray(3.0**2)))
         0.2
@@ -134,6 +149,9 @@ class Cauchy(AbstractKernel):
 
 class GemanMcClure(AbstractKernel):
     """`rho(s) = s / (1 + s / delta^2)`: redescending, bounded by `delta^2`.
+
+    Fields:
+        delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
 
     Example: a residual as large as the width counts a quarter.
         >>> float(vg.GemanMcClure(delta=1.5).weight(jax.numpy.asarray(1.5**2)))
@@ -158,6 +176,10 @@ class Barron(AbstractKernel):
 
     `rho(s) = (2 b delta^2 / alpha) ((s / (delta^2 b) + 1)^(alpha / 2) - 1)` with `b = 2 - alpha`
     (Barron 2019, eq. 8, times 2, for `rho'(0) = 1`).
+
+    Fields:
+        delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
+        alpha: shape, below 2 and not 0.
 
     Example: a shape of -2 is Geman-McClure's kernel.
         >>> s = jax.numpy.asarray(4.0)

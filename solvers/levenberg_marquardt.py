@@ -148,6 +148,24 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     Use with `optimistix.least_squares(energy_of, solver, y0, args=problem)`: `args` is an `AbstractArrowProblem`, `y0`
     one of its points. Another function than its energy is refused. Failures are optimistix results, too.
 
+    Fields:
+        rtol: Relative decrease of the energy that ends the iteration.
+        atol: Gradient norm, in units of the scaled step, that ends the iteration; where all curvatures are below 1
+            it counts in the root of the largest, so that weights that are all tiny do not look like an optimum.
+        norm: Not used by the iteration itself; optimistix asks for one.
+        max_iterations: Tries in all, accepted or not.
+        initial_damping: Damping of the first try, relative to the diagonal of the Hessian.
+        max_damping: Damping above which the iteration ends: no step lowers the energy.
+        min_damping: Least damping.
+        max_correction: Largest part of the kernels' curvature to apply, below 1; 0 for plain reweighting.
+        fixed_correction: Apply `max_correction` from the start, whatever the gain.
+        reduced_solver: Linear algebra of the reduced system; `choose_reduced_solver` finds the one that suits a
+            graph.
+        differentiable_loop: Make the inner loop reverse-differentiable (bounded, slower), for
+            `optimistix.RecursiveCheckpointAdjoint`; `vggtgeo.solve` sets it where that adjoint is given.
+        record_iterations: Keep an `IterationRecord`, for pictures of the iteration; without it nothing of it is
+            compiled.
+
     Example:
         >>> import vggtgeo as vg
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
@@ -158,25 +176,17 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """
 
     rtol: float = 1e-9
-    """Relative decrease of the energy that ends the iteration."""
     atol: float = 1e-12
-    """Gradient norm, in units of the scaled step, that ends the iteration; where all curvatures are below 1 it counts
-    in the root of the largest, so that weights that are all tiny do not look like an optimum."""
     norm: Callable = optx.max_norm
     max_iterations: int = 50
-    """Tries in all, accepted or not."""
     initial_damping: float = 1e-4
     max_damping: float = 1e12
     min_damping: float = 1e-16
     max_correction: float = 0.95
-    """Largest part of the kernels' curvature to apply, below 1; 0 for plain reweighting."""
     fixed_correction: bool = False
-    """Apply `max_correction` from the start, whatever the gain."""
     reduced_solver: AbstractReducedSolver = DenseCholesky()
     differentiable_loop: bool = False
-    """Make the inner loop reverse-differentiable (bounded, slower), for unrolled differentiation."""
     record_iterations: bool = False
-    """Keep an `IterationRecord`, for pictures of the iteration; without it nothing of it is compiled."""
 
     def __check_init__(self) -> None:
         most: Any = self.max_iterations  # of a caller: annotations promise what nobody has checked

@@ -55,6 +55,7 @@ def scene_of(
         depth_mean=depths,
         depth_sigma=SIGMA * depths,
         depth_weight=np.ones(len(host)),
+        alpha=2.0,
         **seen,
     )
     start = scenes._guess(poses, depths, start_error, np.random.default_rng(1))

@@ -111,6 +111,7 @@ def make_scene(
         depth_mean=mean,
         depth_sigma=SIGMA * inverse_depth,
         depth_weight=rng.uniform(0.5, 1.0, len(host)),
+        alpha=2.0,
         **seen,
     )
     start = _guess(poses, inverse_depth, start_error, rng)

@@ -60,7 +60,7 @@ def test_one_file_is_all(added: ModuleType, tmp_path: Path) -> None:
     centres = truth.poses.inverse().translation()
     heights = added.CameraHeight(keyframe=[1, 2], height=centres[1:, 1], weight=jnp.full(2, 1e8))
     problem, start, index = SCENE.pack(terms=[heights, vg.no_prior(3)])
-    without = problem.with_term(heights.reweighted(jnp.zeros(2)))
+    without = problem.with_term(heights.reweighted(jnp.zeros(2)), replace=True)
 
     energy, size = eqx.filter_jit(vg.energy_terms)(problem, start), eqx.filter_jit(vg.residual_sizes)(problem, start)
     off = start.poses.inverse().translation()[1:, 1] - centres[1:, 1]

@@ -84,6 +84,7 @@ def rig(cameras: tuple, fisheye: bool = False, noise: float = 0.0, points: int =
         *(seen.edges, seen.host, seen.pixel, edge, landmark, np.zeros((len(edge), 2)), np.ones(len(edge))),
         depth_mean=scene.inverse_depth,
         depth_sigma=0.05 * scene.inverse_depth,
+        alpha=2.0,
     )
     group = GROUP if len(truth) > 1 else np.zeros(4, int)
     made = Rig(seen, scene.poses, scene.inverse_depth, truth, group, fisheye)

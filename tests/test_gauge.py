@@ -157,7 +157,7 @@ def test_windows_whose_first_keyframe_leaves_keep_their_gauge(seed: int) -> None
         problem = problem.with_term(depth.reweighted(depth.weight * staying[:, None]))
         ties = problem.relative_poses
         inside = staying[np.asarray(ties.first)] & staying[np.asarray(ties.second)]
-        problem = problem.with_term(ties.reweighted(ties.weight * inside))
+        problem = problem.with_term(ties.reweighted(ties.weight * inside), replace=True)
         order = tuple(number if staying[number] else -1 for number in range(KEYFRAMES))
         problem = problem.with_term(prior.aligned(order, KEYFRAMES))
         # Those that left are no part of the problem any more: they are held as padding is.

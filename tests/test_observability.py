@@ -16,18 +16,31 @@ from degenerate_scenes import (
     packed,
     parallel_lines,
     pure_rotation,
+    random_points,
+    random_segments,
+    scene_of,
     without,
     without_matches_of,
 )
 from scenes import Scene
+from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.arrow import ArrowVector
 
 from vggtgeo.bundle.analysis import observability as module
+from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.analysis.directions import MOTIONS, common_directions, direction_names
 from vggtgeo.bundle.analysis.observability import observability
-from vggtgeo.bundle.analysis.observability_report import WEAK, Observability, undetermined_landmarks, weak_directions
+from vggtgeo.bundle.analysis.observability_report import (
+    WEAK,
+    Observability,
+    least_known,
+    rotation_pairs,
+    undetermined_landmarks,
+    weak_directions,
+)
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.figures.plot import plot
 from vggtgeo.simulation.loop import simulate_loop
@@ -85,6 +98,78 @@ def test_no_parallax(observed: Observe) -> None:
     assert turning == (KEYFRAMES * POINTS, KEYFRAMES * POINTS)
     lost, used = undetermined_landmarks(observed(*packed(WELL, at_truth=True)))
     assert (lost, used) == (0, WELL.observations.host.size)
+
+
+def forward_motion(turn: float) -> Scene:
+    """Three cameras that drive straight ahead, turned by some `turn` radians each, points only."""
+    rotation = Rotation.from_rotvec(turn * np.random.default_rng(0).normal(size=(KEYFRAMES, 3)))
+    shift = -rotation.apply(np.outer(0.25 * np.arange(KEYFRAMES), [0.0, 0.0, 1.0]))
+    poses = np.concatenate([rotation.as_quat(scalar_first=True), shift], 1)
+    return without(scene_of(poses, *random_points(), random_segments()), "line", "depth")
+
+
+CENTRE_HELD = {"fixed_intrinsics": np.array([False, False, True, True])}
+
+
+def test_forward_motion_with_a_free_camera_by_name(observed: Observe) -> None:
+    """Driving straight ahead, turned by milliradians, the least known direction is named and not hidden by the level of
+    weak ones: the focal length, by more than its own value. Oracle: the construction; the dense inverse, which
+    `covariances` is tested against.
+    """
+    problem, state = packed(forward_motion(0.003), at_truth=True, **NO_PRIOR, **CENTRE_HELD)
+    found = observed(problem, state)
+    assert [direction.name for direction in weak_directions(found)] == ["scale"]
+    first = least_known(found)[0]
+    assert first.names[0] == "focal length"
+    assert first.parameters["fx"] > 300
+    assert first.parameters["fx"] == pytest.approx(float(covariances(problem, state).intrinsics[0, 0]) ** 0.5, rel=0.05)
+    assert f"least known: {first}" in str(found)
+    assert found.to_dict()["least_known"][0]["sigma"]["fx"] == first.parameters["fx"]
+
+
+def test_a_lens_that_nothing_determines_is_undetermined(observed: Observe) -> None:
+    """Without any turn the focal length has no part in a match: `u / (1 - d t)`. So it is undetermined, by name, and no
+    direction is said to have a standard deviation along it. Oracle: the construction.
+    """
+    found = observed(*packed(forward_motion(0.0), at_truth=True, **NO_PRIOR, **CENTRE_HELD))
+    weak = weak_directions(found)
+    assert {direction.name for direction in weak} == {"scale", "focal length", "aspect ratio"}
+    assert not any(direction.determined for direction in weak)
+    assert all(not direction.parameters for direction in least_known(found))
+
+
+def test_one_sigma_of_the_least_known_direction(observed: Observe) -> None:
+    """One standard deviation along it raises the energy by 1/2 when the depths follow, by as much as is said. Oracle:
+    the Hessian of the energy by all coordinates together.
+    """
+    problem, state = packed(WELL, at_truth=True, **NO_PRIOR)
+    found = observed(problem, state)
+    first, dense = least_known(found)[0], 6 * KEYFRAMES + 4
+    zero = jnp.zeros(dense + state.inverse_depth.size)
+    hessian = np.asarray(jax.jit(jax.hessian(lambda step: energy(problem, state.moved(step))))(zero))
+    step = np.where(found.free, found.whole.vectors[0, :, 0] / found.scale, 0.0) / np.sqrt(first.eigenvalue)
+    depths = -np.linalg.solve(hessian[dense:, dense:], hessian[dense:, :dense] @ step)
+    whole = np.concatenate([step, depths])
+    assert whole @ hessian @ whole / 2 == pytest.approx(0.5, rel=1e-6)
+    relative = depths / np.asarray(state.inverse_depth).ravel()
+    assert first.depth == pytest.approx(np.sqrt(np.mean(relative**2)), rel=1e-6)
+    assert first.parameters["fx"] == pytest.approx(abs(step[dense - 4]), rel=1e-9)
+
+
+def test_pure_rotation_by_name(observed: Observe) -> None:
+    """Keyframes between which the camera only turned are named, and no others. Oracle: the construction, with one of
+    three cameras set aside by 30 cm, and the well-posed scene.
+    """
+    turned = pure_rotation()
+    found = observed(*packed(turned, at_truth=True))
+    assert rotation_pairs(found) == [(0, 1), (0, 2), (1, 2)]
+    assert "pure rotation" in repr(found)
+    assert "pure rotation: no match between any two keyframes has parallax" in str(found)
+    poses = turned.poses.copy()
+    poses[2, 4:] = [0.3, 0.0, 0.0]
+    moved = without(scene_of(poses, *random_points(), random_segments()), "line", "depth")
+    assert rotation_pairs(observed(*packed(moved, at_truth=True))) == [(0, 1)]
+    assert observed(*packed(WELL, at_truth=True)).to_dict()["pure_rotation"] == []
 
 
 def test_what_each_kind_is_worth(observed: Observe) -> None:

@@ -130,12 +130,14 @@ def changed(name: str) -> Problem:
     """The loop as it is, without anything metric, or with one keyframe cut out of it."""
     none = lambda term: term.reweighted(jnp.zeros_like(term.weight))
     if name == "free scale":
-        return PROBLEM.with_term(none(PROBLEM.depth)).with_term(none(PROBLEM.surfaces))
+        return PROBLEM.with_term(none(PROBLEM.depth)).with_term(none(PROBLEM.surfaces), replace=True)
     if name == "cut":
         edges = (PROBLEM.edges.source == 7) | (PROBLEM.edges.target == 7)
         points = PROBLEM.points.reweighted(jnp.where(edges[:, None], 0.0, PROBLEM.points.weight))
         pairs = (SURFACES.first == 7) | (SURFACES.second == 7)
-        return PROBLEM.with_term(points).with_term(SURFACES.reweighted(jnp.where(pairs, 0.0, SURFACES.weight)))
+        return PROBLEM.with_term(points).with_term(
+            SURFACES.reweighted(jnp.where(pairs, 0.0, SURFACES.weight)), replace=True
+        )
     return PROBLEM
 
 

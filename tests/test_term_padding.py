@@ -52,6 +52,21 @@ def test_absent_weights_have_no_derivative(packed: Packed) -> None:
     assert float(weight.max()) > 0
 
 
+def test_a_small_weight_has_the_derivative_that_a_weight_of_0_lacks() -> None:
+    """By a weight of 0 the energy has derivative 0, though it rises when the weight does; by a small positive weight it
+    has that one-sided slope. Oracle: a one-sided difference.
+    """
+    window = vg.simulate_window(2, points=3, lines=0)
+    problem, initial, _ = window.pack(kernel=vg.Square())
+    energy = jax.jit(lambda weight: vg.energy(problem.with_term(problem.points.reweighted(weight)), initial))
+    absent = problem.points.weight.at[0, 0].set(0.0)
+    slope = float((energy(absent.at[0, 0].set(1e-3)) - energy(absent)) / 1e-3)
+    derivative = jax.jit(jax.grad(energy))
+    assert slope > 1e-3
+    assert float(derivative(absent)[0, 0]) == 0.0
+    assert float(derivative(absent.at[0, 0].set(1e-6))[0, 0]) == pytest.approx(slope, rel=1e-6)
+
+
 @pytest.mark.long
 def test_padding_changes_neither_energy_nor_gradient(packed) -> None:
     # Proves that room for more keyframes, edges, landmarks and observations says nothing, for terms on edges, poses
@@ -78,7 +93,7 @@ def test_padding_changes_neither_energy_nor_gradient(packed) -> None:
     np.testing.assert_allclose(same_camera, camera, atol=1e-12 * size)
     np.testing.assert_allclose(other.gather(more_landmarks), index.gather(landmarks), rtol=1e-9, atol=1e-12 * size)
     fix = roomy.position_fix
-    missing = roomy.with_term(fix.reweighted(fix.weight.at[1].set(0.0)))
+    missing = roomy.with_term(fix.reweighted(fix.weight.at[1].set(0.0)), replace=True)
     assert float(energy_terms(missing, larger)["position_fix"]) < float(energy_terms(roomy, larger)["position_fix"])
 
 

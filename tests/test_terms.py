@@ -288,6 +288,42 @@ def test_a_written_residual_is_solved() -> None:
     np.testing.assert_allclose(found.state.poses.wxyz_xyz, truth, atol=1e-6)
 
 
+class Fix(vg.PoseTerm):
+    """Position of a camera."""
+
+    position: jax.Array
+
+    def residual(self, pose: jaxlie.SE3, camera: vg.AbstractCamera) -> jax.Array:
+        return pose.inverse().translation() - self.position
+
+
+class SecondFix(Fix):
+    """The same of another receiver."""
+
+    name = "second_fix"
+
+
+def test_a_second_list_of_one_class_does_not_take_the_place_of_the_first() -> None:
+    """Adding a second term of a name is an error that names the remedies, in `with_term` as in `pack`, and each remedy
+    works: the energy of both lists is their sum. Oracle: the energies of each alone.
+    """
+    problem, initial, _ = SCENE.pack()
+    first, second = (Fix(keyframe=[1], position=jnp.full((1, 3), at), weight=jnp.ones(1)) for at in (1.0, 2.0))
+    one = problem.with_term(first)
+    with pytest.raises(vg.InputError, match=r"`term` is a second `fix`.*replace=True.*`name`"):
+        one.with_term(second)
+    with pytest.raises(vg.InputError, match=r"`terms` holds a second term `fix`.*`name`"):
+        SCENE.pack(terms=[first, second])
+    size = lambda problem, name: float(vg.energy_terms(problem, initial)[name])
+    replaced = one.with_term(second, replace=True)
+    assert len(replaced.terms) == len(one.terms)
+    assert size(replaced, "fix") != size(one, "fix")
+    both = one.with_term(SecondFix(**vars(second)))
+    assert size(both, "fix") + size(both, "second_fix") == pytest.approx(size(one, "fix") + size(replaced, "fix"))
+    joined = Fix(keyframe=[1, 1], position=jnp.concatenate([first.position, second.position]), weight=jnp.ones(2))
+    assert size(problem.with_term(joined), "fix") == pytest.approx(size(one, "fix") + size(replaced, "fix"))
+
+
 def test_names_and_replacement() -> None:
     # Proves how terms are found: by their class's name in snake case, replaced in place, added as the last, left out.
     problem, _, _ = SCENE.pack()

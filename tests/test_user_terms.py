@@ -100,7 +100,7 @@ def without(problem: vg.Problem, *names: str) -> vg.Problem:
     """The problem with the weights of these terms zero: of the same structure, so nothing is compiled again."""
     for name in names:
         term = getattr(problem, name)
-        problem = problem.with_term(term.reweighted(0 * term.weight))
+        problem = problem.with_term(term.reweighted(0 * term.weight), replace=True)
     return problem
 
 

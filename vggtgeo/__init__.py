@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from vggtgeo.bundle.observations import Observations as Observations
     from vggtgeo.bundle.packing import pack as pack
     from vggtgeo.bundle.padding import PaddedSize as PaddedSize
+    from vggtgeo.bundle.padding import SlotIndex as SlotIndex
     from vggtgeo.bundle.problem import Problem as Problem
     from vggtgeo.bundle.problem import State as State
     from vggtgeo.bundle.problem_file import load_problem as load_problem
@@ -146,7 +147,7 @@ _HOME = {
     "bundle.analysis.observability_report": ("Observability",),
     "bundle.observations": ("FlatTerm", "Observations"),
     "bundle.packing": ("pack",),
-    "bundle.padding": ("PaddedSize",),
+    "bundle.padding": ("PaddedSize", "SlotIndex"),
     "benchmark.runner": ("BenchReport", "bench"),
     "bundle.problem": ("Problem", "State"),
     "bundle.problem_file": ("load_problem", "save_problem"),

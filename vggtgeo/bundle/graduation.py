@@ -25,6 +25,10 @@ from vggtgeo.solvers.problem import energy_of
 class Graduation(eqx.Module):
     """A few iterations at each of these kernel widths before the solve proper.
 
+    Fields:
+        factors: Widths, in units of the kernel's own.
+        iterations: Tries at each width.
+
     Example: `vg.solve(problem, initial, graduation=vg.Graduation())`, from 16 times the kernel's width to twice.
         >>> vg.Graduation().factors
         (16.0, 8.0, 4.0, 2.0)
@@ -32,9 +36,7 @@ class Graduation(eqx.Module):
     """
 
     factors: tuple[float, ...] = eqx.field(static=True, default=(16.0, 8.0, 4.0, 2.0))
-    """Widths, in units of the kernel's own."""
     iterations: int = eqx.field(static=True, default=4)
-    """Tries at each width."""
 
     def __check_init__(self) -> None:
         """InputError for widths or a number of tries that are none."""

@@ -17,6 +17,35 @@ from vggtgeo.bundle.terms.term import AbstractTerm
 class Observations:
     """What bundle adjustment sees, as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples.
 
+    A weight is 1 / variance: a match of standard deviation `s` pixels has weight `1 / s^2`, and weight 1 states a
+    standard deviation of 1 pixel. The width of the kernel counts in these standard deviations. A depth of weight 1
+    has the standard deviation `depth_sigma`; `alpha` scales the information of all depths, so that the energy and the
+    covariances take them as known to `depth_sigma / sqrt(alpha depth_weight)`.
+
+    Fields:
+        edges: int `[E, 2]`: (host keyframe, target keyframe).
+        host: int `[D]`: keyframe that hosts each landmark (one inverse depth each).
+        pixel: `[D, 2]`: its pixel in the host.
+        point_edge: int `[A]`: along which edge each match was seen.
+        point_landmark: int `[A]`: which landmark it is.
+        point_target: `[A, 2]` pixels.
+        point_weight: `[A]`: 1 / variance of both coordinates, 1/pixels^2; 0 = the match is not there.
+        line_edge: int `[B]`: along which edge each line sample was seen.
+        line_landmark: int `[B]`: which landmark it is.
+        line_coefficients: `[B, 3]`: a, b, c with a^2 + b^2 = 1.
+        line_weight: `[B]`: 1 / variance of the distance from the line, 1/pixels^2; 0 = the sample is not there.
+        depth_mean: `[D]`: prior inverse depth, 1/m; None = no depth prior at all.
+        depth_sigma: `[D]`: its standard deviation, 1/m; None = 1.
+        depth_weight: `[D]`: factor on the information `1 / depth_sigma^2`, 1 by default; 0 = no prior for this
+            landmark.
+        alpha: Factor on the information of all depths: with 2, the paper's value, a depth of `depth_sigma=0.1`
+            counts as one of 0.0707.
+        pixel_sigma: `[D]` or one for all, pixels: standard deviation of `pixel`, where a point was observed in its
+            host, in the unit of the matches' `1 / sqrt(point_weight)`; None: the pixels are exact. Samples of lines
+            have none.
+        segment: int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples
+            then lie on a straight line (two unknowns a segment); None: each sample has its own.
+
     Example:
         >>> import numpy as np, vggtgeo as vg
         >>> vg.Observations(
@@ -33,37 +62,22 @@ class Observations:
     """
 
     edges: np.ndarray
-    """int `[E, 2]`: (host keyframe, target keyframe)."""
     host: np.ndarray
-    """int `[D]`: keyframe that hosts each landmark (one inverse depth each)."""
     pixel: np.ndarray
-    """`[D, 2]`: its pixel in the host."""
     point_edge: np.ndarray
-    """int `[A]`."""
     point_landmark: np.ndarray
-    """int `[A]`."""
     point_target: np.ndarray
-    """`[A, 2]` pixels."""
     point_weight: np.ndarray
-    """`[A]`."""
     line_edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     line_landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     line_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """`[B, 3]`: a, b, c with a^2 + b^2 = 1."""
     line_weight: np.ndarray = field(default_factory=lambda: np.zeros(0))
     depth_mean: np.ndarray | None = None
-    """`[D]`: prior inverse depth, 1/m; None = no depth prior at all."""
     depth_sigma: np.ndarray | None = None
-    """`[D]`: its standard deviation, 1/m."""
     depth_weight: np.ndarray | None = None
-    """`[D]`: its confidence; 0 = none."""
-    alpha: float = 2.0
+    alpha: float = 1.0
     pixel_sigma: np.ndarray | float | None = None
-    """`[D]` or one for all, pixels: standard deviation of `pixel`, where a point was observed in its host, in the unit
-    of the matches' `1 / sqrt(weight)`; None: exact. Samples of lines have none."""
     segment: np.ndarray | None = None
-    """int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples then lie on a
-    straight line (two unknowns a segment); None: each sample has its own."""
 
     def __repr__(self) -> str:
         rows = {"landmark": self.host, "edge": self.edges, "point": self.point_edge, "line sample": self.line_edge}
@@ -76,6 +90,13 @@ class FlatTerm:
     """A term on landmarks before packing: one row an observation, in any order.
 
     `pack(..., terms=[...])` puts each row where its landmark is, and pads.
+
+    Fields:
+        kind: A class of terms on edges or on slots.
+        fields: What its constructor takes: data of the observations `[k, ...]`, `weight [k]` (1 without one),
+            `kernel`, and what all observations share.
+        landmark: int `[k]`, as `Observations.host` lists them.
+        edge: int `[k]`, as `Observations.edges` lists them: where the landmark was seen (terms on edges only).
 
     Example: each landmark that keyframe 0 hosts lies on a plane that is known in keyframe 1.
         >>> import numpy as np, vggtgeo as vg
@@ -93,14 +114,9 @@ class FlatTerm:
     """
 
     kind: type[AbstractTerm]
-    """A class of terms on edges or on slots."""
     fields: Mapping[str, Any]
-    """What its constructor takes: data of the observations `[k, ...]`, `weight [k]` (1 without one), `kernel`, and what
-    all observations share."""
     landmark: np.ndarray
-    """int `[k]`, as `Observations.host` lists them."""
     edge: np.ndarray | None = None
-    """int `[k]`, as `Observations.edges` lists them: where the landmark was seen (terms on edges only)."""
 
     @property
     def name(self) -> str:
@@ -108,8 +124,9 @@ class FlatTerm:
 
     @property
     def weight(self) -> np.ndarray:
-        """`[k]`."""
-        return np.asarray(self.fields.get("weight", np.ones(len(self.landmark))))
+        """`[k]`; one number is that of each."""
+        given = np.asarray(self.fields.get("weight", 1.0))
+        return np.full(len(self.landmark), given) if given.ndim == 0 and given.dtype.kind in "iuf" else given
 
     def rows(self) -> dict[str, Any]:
         """The fields that have one row an observation, `weight` among them."""

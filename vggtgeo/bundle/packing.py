@@ -85,7 +85,9 @@ def pack(
         camera: its model: `Pinhole`, `RadialTangential`, `KannalaBrandt`, each of them with `fx = fy` tied
             (`SquarePinhole`, ...), or your own.
         camera_of: int `[n]`: which of several cameras, a row of `intrinsics`, took each keyframe; None: one took all.
-        kernel: robust kernel; None = Cauchy with delta 1.5 px, the best of `benchmarks/robustness.py`.
+        kernel: robust kernel of points, lines and depths; None = `Cauchy(1.5)`, the best of `benchmarks/robustness.py`.
+            Its width counts in standard deviations, of residuals times the root of their weight: 1.5 px for a match of
+            weight 1, 1.5 sigma for one of weight `1 / sigma^2`.
         terms: what else is known: terms on poses, pairs or the camera, the prior of a marginalisation, and, as
             `FlatTerm`, terms on landmarks. Each is padded by its kind.
         dtype: float type of all arrays; None = JAX's own, which is double where `jax_enable_x64` is on.
@@ -118,7 +120,7 @@ def pack(
     check_positive("inverse_depth", inverse_depth, len(observations.host))
     warn_of_far(inverse_depth)
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
-    check_terms(terms, observations, len(poses))
+    terms = check_terms(terms, observations, len(poses))
     guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
     check_precision({**vars(observations), **guess, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
     size, graph, index = _layout(observations, len(poses), size)

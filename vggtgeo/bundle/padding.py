@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
@@ -28,6 +29,16 @@ GivenTerm = AbstractTerm | FlatTerm
 class PaddedSize:
     """Static shape of a problem: every problem packed to one size shares one compiled solver.
 
+    Fields:
+        keyframes: Number of keyframes.
+        points: Slots for points a keyframe.
+        lines: Slots for line samples a keyframe.
+        degree: Largest number of edges of one host.
+        edges: Number of edges stored; None = `keyframes * degree`, every host padded to `degree` edges.
+        samples: Samples of a segment, where observations have a `segment`; `lines` is a multiple of it.
+        terms: Names of terms on poses, pairs and the camera, and how many observations of each there is room for;
+            one that is not named here is not padded.
+
     Example:
         >>> import vggtgeo as vg
         >>> size = vg.PaddedSize(keyframes=10, points=320, lines=192, degree=9)
@@ -41,21 +52,16 @@ class PaddedSize:
     points: int
     lines: int
     degree: int
-    """Largest number of edges of one host."""
     edges: int | None = None
-    """Number of edges stored; None = `keyframes * degree`, every host padded to `degree` edges."""
     samples: int | None = None
-    """Samples of a segment, where observations have a `segment`; `lines` is a multiple of it."""
     terms: tuple[tuple[str, int], ...] = ()
-    """Names of terms on poses, pairs and the camera, and how many observations of each there is room for; one that is
-    not named here is not padded."""
 
     @staticmethod
     def of(observations: Observations, keyframes: int, terms: Sequence[GivenTerm] = ()) -> PaddedSize:
         """The smallest that fits, every host padded to the same number of edges."""
         slots = assign_slots(observations, keyframes)
         _, _, degree = sort_edges(observations.edges, keyframes)
-        counts = tuple((term.name, np.size(term.weight)) for term in terms if isinstance(term, COUNTED))
+        counts = tuple((term.name, np.size(term.broadcast().weight)) for term in terms if isinstance(term, COUNTED))
         return PaddedSize(keyframes, slots.points, slots.lines, degree, samples=slots.samples, terms=counts)
 
     @staticmethod
@@ -79,13 +85,34 @@ COUNTED = (PoseTerm, PairTerm, CameraTerm)
 
 @dataclass(frozen=True)
 class SlotIndex:
-    """Where each landmark went: `inverse_depth[host[i], slot[i]]`; and each edge: row `edge[e]`."""
+    """Where `pack` put what was given as flat lists: landmark `i` at `[host[i], slot[i]]`, edge `e` in row `edge[e]`.
+
+    `gather` and `gather_points` read padded arrays in the order of `Observations`. `scatter`, `scatter_points` and
+    `scatter_lines` write values of that order into padded arrays; these are traceable and differentiable, so they take
+    what a network computes.
+
+    Fields:
+        host: int [D], keyframe of each landmark.
+        slot: int [D], its slot there.
+        edge: int [E], row of each edge in the arrays of the problem.
+        shape: keyframes, edges and slots of the problem.
+
+    Example: the energy of a problem by weights of a network, one a match.
+        >>> import jax, jax.numpy as jnp, vggtgeo as vg
+        >>> window = vg.simulate_window(3, points=10, lines=1)
+        >>> problem, initial, index = window.pack()
+        >>> def energy(weights):  # [A], as `window.observations` lists the matches
+        ...     padded = index.scatter_points(weights, window.observations, problem.points.weight)
+        ...     return vg.energy(problem.with_term(problem.points.reweighted(padded)), initial)
+        >>> jax.jit(jax.grad(energy))(jnp.ones(60)).shape
+        (60,)
+
+    """
 
     host: np.ndarray
     slot: np.ndarray
     edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     shape: tuple[int, int, int] = (0, 0, 0)
-    """Keyframes, edges and slots of the problem."""
 
     def __repr__(self) -> str:
         return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
@@ -113,6 +140,73 @@ class SlotIndex:
                 "point of each edge, such as `problem.points.weight`"
             )
         return found[self.edge[observations.point_edge], self.slot[observations.point_landmark]]
+
+    def scatter(self, values: ArrayLike, into: ArrayLike) -> Array:
+        """Write values of the landmarks to their places in `into`: the counterpart of `gather`.
+
+        Pure: works under `jit`, `vmap` and `grad`.
+
+        Args:
+            values: [D, ...], as `Observations.host` lists the landmarks.
+            into: [n, s, ...], `initial.inverse_depth` or `problem.depth.weight`, say. It gives shape and precision;
+                slots that hold no landmark keep its values.
+
+        Raises:
+            InputError: an array of another shape.
+
+        """
+        return _scattered(values, into, (self.host, self.slot), self.shape[0])
+
+    def scatter_points(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
+        """Write values of the point matches to their places in `into`: the counterpart of `gather_points`.
+
+        Pure: works under `jit`, `vmap` and `grad`.
+
+        Args:
+            values: [A, ...], as `observations` lists the matches.
+            observations: what was packed.
+            into: [e, p, ...], `problem.points.weight` or `problem.points.target`, say. It gives shape and precision;
+                places that hold no match keep its values, so that a weight of 0 stays one.
+
+        Raises:
+            InputError: an array of another shape.
+
+        """
+        where = (self.edge[observations.point_edge], self.slot[observations.point_landmark])
+        return _scattered(values, into, where, self.shape[1])
+
+    def scatter_lines(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
+        """Write values of the line samples to their places in `into`, as `scatter_points` does.
+
+        Args:
+            values: [B, ...], as `observations` lists the samples.
+            observations: what was packed.
+            into: [e, l, ...], `problem.lines.weight` or `problem.lines.coefficients`, say.
+
+        Raises:
+            InputError: an array of another shape.
+
+        """
+        first = self.shape[2] - (np.shape(into)[1] if np.ndim(into) > 1 else 0)  # the slots of lines come last
+        where = (self.edge[observations.line_edge], self.slot[observations.line_landmark] - first)
+        return _scattered(values, into, where, self.shape[1])
+
+
+def _scattered(values: ArrayLike, into: ArrayLike, where: tuple[np.ndarray, np.ndarray], rows: int) -> Array:
+    """`into` with each value at its row and column."""
+    given, whole, column = jnp.asarray(values), jnp.asarray(into), where[1]
+    room = whole.ndim > 1 and whole.shape[0] == rows
+    if not room or (column.size and not 0 <= column.min() <= column.max() < whole.shape[1]):
+        raise InputError(
+            f"`into` has shape {whole.shape}; it must be ({rows}, slots, ...), an array of the problem that was packed "
+            "with this index, such as the `weight` of the term"
+        )
+    if given.shape != (len(column), *whole.shape[2:]):
+        raise InputError(
+            f"`values` has shape {given.shape}; it must be {(len(column), *whole.shape[2:])}, one row an observation, "
+            "in the order in which they were given to `pack`"
+        )
+    return whole.at[where].set(given.astype(whole.dtype), unique_indices=True)
 
 
 class Slots(NamedTuple):

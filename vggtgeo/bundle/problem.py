@@ -13,11 +13,16 @@ import equinox as eqx
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.line import LineTerm
+from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
+from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
-from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
 from vggtgeo.io.errors import InputError
@@ -27,30 +32,36 @@ MIN_INVERSE_DEPTH = 1e-6
 """1/m: the bound of positive inverse depths (1000 km)."""
 
 
+_ONE_OF_EACH = (PointTerm, LineTerm, DepthPrior, HostPixel, IntrinsicsPrior, MarginalPrior)
+"""Kinds of terms that a problem has one of."""
+
+
 class State(eqx.Module):
     """What bundle adjustment estimates: `n` poses, the camera they share, `s` inverse depths a keyframe.
+
+    Fields:
+        poses: World -> camera of each keyframe, batch `[n]`.
+        intrinsics: Parameters of the camera, `fx, fy, cx, cy` in pixels, then those of its distortion: `[k]`, or
+            `[g, k]` of `g` cameras.
+        inverse_depth: 1/m, along the optical axis of the host keyframe, one a slot.
+        pixel_offset: Pixels from where a landmark was observed in its host to where it is, of the first `p` slots (the
+            points); None: the observed pixels are exact.
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
         >>> _, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
         >>> initial.inverse_depth.shape
         (3, 14)
-        >>> step = jnp.zeros(6 * 3 + 4 + 3 * 14).at[18].set(2.0)  # the first of the intrinsics
+        >>> step = jnp.zeros(initial.num_unknowns).at[18].set(2.0)  # the first of the intrinsics
         >>> float(initial.moved(step).intrinsics[0] - initial.intrinsics[0])
         2.0
 
     """
 
     poses: jaxlie.SE3
-    """World -> camera of each keyframe, batch `[n]`."""
     intrinsics: Float[Array, "*g k"]
-    """Parameters of the camera, `fx, fy, cx, cy` in pixels, then those of its distortion: `[k]`, or `[g, k]` of `g`
-    cameras."""
     inverse_depth: Float[Array, "n s"]
-    """1/m, along the optical axis of the host keyframe, one a slot."""
     pixel_offset: Float[Array, "n p 2"] | None = None
-    """Pixels from where a landmark was observed in its host to where it is, of the first `p` slots (the points); None:
-    the observed pixels are exact."""
 
     @property
     def parameters(self) -> Float[Array, " q"]:
@@ -106,6 +117,20 @@ class Problem(eqx.Module):
     Pixels, 1/m for inverse depths, poses world -> camera. Weight 0 means that an observation is not there, so that a
     kind can be left out without another shape. A term is also an attribute by its name: `problem.points`.
 
+    Fields:
+        pixels: Where slot s of keyframe i looks: point slots first, then line samples.
+        edges: The covisibility graph.
+        terms: What is minimised: the sum of their energies.
+        fixed_pose: Keyframes whose pose is held (the gauge).
+        fixed_intrinsics: Parameters of the cameras that are held.
+        fraction: Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a
+            segment is an affine function of this position along it (0 and 1 at its ends). None: each sample has its
+            own inverse depth.
+        camera_of: Which camera took each keyframe, a row of the state's intrinsics; None: one took all.
+        camera: Model of the cameras whose parameters the state holds.
+        positive_depth: Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver
+            without bounds.
+
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
@@ -120,23 +145,14 @@ class Problem(eqx.Module):
     """
 
     pixels: Float[Array, "n s 2"]
-    """Where slot s of keyframe i looks: point slots first, then line samples."""
     edges: Edges
     terms: tuple[AbstractTerm, ...]
-    """What is minimised: the sum of their energies."""
     fixed_pose: Bool[Array, " n"]
-    """Keyframes whose pose is held (the gauge)."""
     fixed_intrinsics: Bool[Array, "*g k"]
-    """Parameters of the cameras that are held."""
     fraction: Float[Array, "n g m"] | None = None
-    """Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a segment is an
-    affine function of this position along it (0 and 1 at its ends). None: each sample has its own inverse depth."""
     camera_of: Int[Array, " n"] | None = None
-    """Which camera took each keyframe, a row of the state's intrinsics; None: one took all."""
     camera: type[AbstractCamera] = eqx.field(static=True, default=Pinhole)
-    """Model of the cameras whose parameters the state holds."""
     positive_depth: bool = eqx.field(static=True, default=True)
-    """Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver without bounds."""
 
     def __getattr__(self, name: str) -> Any:
         for term in vars(self).get("terms", ()):
@@ -144,23 +160,53 @@ class Problem(eqx.Module):
                 return term
         raise AttributeError(f"`Problem` has no attribute and no term `{name}`")
 
-    def with_term(self, term: AbstractTerm) -> Problem:
-        """The problem with `term` in place of the one of the same name, or added as the last.
+    def with_term(self, term: AbstractTerm, *, replace: bool = False) -> Problem:
+        """Add a term as the last, or put it in place of the one of its name.
+
+        What a problem has one of is replaced: points, lines, depth, the intrinsics' prior and the prior of a
+        marginalisation. Any other term of a name that is taken is refused, so that a second list of
+        measurements does not take the place of the first; `replace=True` says that it is to.
+
+        Args:
+            term: in the padded shape of this problem.
+            replace: put it in place of the term of its name, if there is one.
 
         Raises:
-            InputError: it is no term, or of another kind than the one of its name.
+            InputError: it is no term, its name is taken, the term of its name is of another kind, or it is on
+                landmarks and not in the shape of this problem.
+
+        Example: two receivers, each with measurements of its own.
+            >>> import jax.numpy as jnp
+            >>> class PositionFix(vg.PoseTerm):
+            ...     position: jnp.ndarray
+            ...     def residual(self, pose, camera):
+            ...         return pose.inverse().translation() - self.position
+            >>> class SecondFix(PositionFix):
+            ...     name = "second_fix"
+            >>> first, second = (kind(keyframe=[1], position=jnp.zeros((1, 3))) for kind in (PositionFix, SecondFix))
+            >>> [term.name for term in problem.with_term(first).with_term(second).terms[-2:]]
+            ['position_fix', 'second_fix']
 
         """
         check_kind("term", term, AbstractTerm, "a term, such as `vggtgeo.PointTerm`")
-        names = [old.name for old in self.terms]
-        for old in self.terms:
-            if old.name == term.name and not (isinstance(term, type(old)) or isinstance(old, type(term))):
-                raise InputError(
-                    f"`{term.name}` is the name of a `{type(old).__name__}` of the problem, which a "
-                    f"`{type(term).__name__}` would replace; give its class another `name`"
-                )
-        terms = tuple(term if old.name == term.name else old for old in self.terms)
-        return self.with_terms(terms if term.name in names else (*terms, term))
+        term = term.broadcast()
+        if isinstance(term, EdgeTerm | SlotTerm):
+            rows = self.edges.source.shape if isinstance(term, EdgeTerm) else self.pixels.shape[:-2]
+            check_padded(term, rows, self.pixels.shape[-2])
+        old = next((old for old in self.terms if old.name == term.name), None)
+        if old is None:
+            return self.with_terms((*self.terms, term))
+        if not (isinstance(term, type(old)) or isinstance(old, type(term))):
+            raise InputError(
+                f"`{term.name}` is the name of a `{type(old).__name__}` of the problem, which a "
+                f"`{type(term).__name__}` would replace; give its class another `name`"
+            )
+        if not replace and not isinstance(old, _ONE_OF_EACH):
+            raise InputError(
+                f"`term` is a second `{term.name}`; the problem has one of that name. Give `replace=True` to put it in "
+                "its place; for both, join their observations in one term, or derive a class with a `name` of its own"
+            )
+        return self.with_terms(tuple(term if own is old else own for own in self.terms))
 
     def without_term(self, name: str) -> Problem:
         """The problem without the term of that name, if it has one."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.solver_choice import default_solver
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.adjoint import ArrowAdjoint
@@ -117,14 +119,16 @@ def solve(
         solver: iteration and linear algebra; default `SchurLevenbergMarquardt()` with the linear solver that
             `choose_reduced_solver` finds for the graph. Of a `problem` that is an argument of a jitted function it
             cannot see the graph: give it there for a large problem.
-        adjoint: how to differentiate; default `ArrowAdjoint()`. `optimistix.RecursiveCheckpointAdjoint()` with
-            `SchurLevenbergMarquardt(differentiable_loop=True)` differentiates through the iterates instead.
+        adjoint: how to differentiate; default `ArrowAdjoint()`. With `optimistix.RecursiveCheckpointAdjoint()` through
+            the iterates, in reverse mode only; the solver then runs with `differentiable_loop=True`.
+            `optimistix.ImplicitAdjoint()` cannot be used: its derivative needs a residual function of optimistix.
         graduation: wider kernels to go through first, for a redescending kernel and a start that outliers dominate;
             `history` and `iterations` are those of the last kernel, the one of `problem`.
 
     Raises:
-        InputError: `initial` is of another size or precision; or nothing is observed (where weights have values to look
-            at; as the argument of a jitted function such a problem converges where it starts).
+        InputError: `initial` is of another size or precision; `adjoint` is an `optimistix.ImplicitAdjoint`; or nothing
+            is observed (where weights have values to look at; as the argument of a jitted function such a problem
+            converges where it starts).
 
     Example:
         >>> import jax, vggtgeo as vg
@@ -140,7 +144,21 @@ def solve(
     check_kind("graduation", graduation, Graduation | None, "a `vggtgeo.Graduation`")
     check_observed(problem)
     solver = default_solver(problem) if solver is None else solver
-    return _solve_jit(problem, initial, solver, ArrowAdjoint() if adjoint is None else adjoint, graduation)
+    adjoint = ArrowAdjoint() if adjoint is None else adjoint
+    return _solve_jit(problem, initial, _differentiable_by(adjoint, solver), adjoint, graduation)
+
+
+def _differentiable_by(adjoint: optx.AbstractAdjoint, solver: SchurLevenbergMarquardt) -> SchurLevenbergMarquardt:
+    """The solver as the adjoint needs it."""
+    if isinstance(adjoint, optx.ImplicitAdjoint):
+        raise InputError(
+            "`adjoint` is `optimistix.ImplicitAdjoint`, which differentiates a residual function that `solve` does not "
+            "have; it must be `vggtgeo.ArrowAdjoint()` (the same theorem with the exact Hessian; the default) or "
+            "`optimistix.RecursiveCheckpointAdjoint()` (the iterates)"
+        )
+    if isinstance(adjoint, optx.RecursiveCheckpointAdjoint):
+        return dataclasses.replace(solver, differentiable_loop=True)
+    return solver
 
 
 @eqx.filter_jit  # outside the caller's `jit`, every operation of the derivative would be compiled by itself

@@ -26,15 +26,19 @@ _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsP
 """Names of the terms that `pack` makes of its other arguments."""
 
 
-def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int) -> None:
-    """Terms of different names, with weights that are weights and indices that exist."""
+def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int) -> list[AbstractTerm | FlatTerm]:
+    """Terms of different names, with weights that are weights and indices that exist; a weight for each observation."""
     check_kind("terms", terms, (list, tuple), "a list of terms, as `[vggtgeo.RelativePose(...)]`")
     names = list(_OWN)
+    terms = [term.broadcast() if isinstance(term, AbstractTerm) else term for term in terms]
     for term in terms:
         if not isinstance(term, AbstractTerm | FlatTerm):
             raise InputError(f"`terms` holds {term!r:.60}; expected terms, as `vggtgeo.RelativePose`, or `FlatTerm`")
         if term.name in names:
-            raise InputError(f"`terms` holds a second term `{term.name}`; give its class another `name`")
+            raise InputError(
+                f"`terms` holds a second term `{term.name}`; join their observations in one term, or derive a class "
+                "with a `name` of its own"
+            )
         names.append(term.name)
         if not isinstance(term.weight, jax.core.Tracer):
             check_weight(f"{term.name}.weight", term.weight)
@@ -46,6 +50,7 @@ def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int
             _check_flat(term, observations)
         elif isinstance(term, PoseTerm | PairTerm):
             _check_touched(term, keyframes)
+    return terms
 
 
 def _check_flat(term: FlatTerm, observations: Observations) -> None:

@@ -19,7 +19,7 @@ from vggtgeo.bundle.padding import COUNTED, GivenTerm, PaddedSize, SlotIndex
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.node import DenseTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
-from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.io.errors import InputError
 
 
@@ -37,12 +37,7 @@ def padded(term: GivenTerm, index: SlotIndex, size: PaddedSize, dtype: DTypeLike
     if isinstance(term, COUNTED):
         return _lengthened(term, dict(size.terms).get(term.name, len(term.weight)))
     keyframes, edges, slots = index.shape
-    expected = (keyframes, slots) if isinstance(term, SlotTerm) else (edges, slots)
-    if term.weight.shape != expected:
-        raise InputError(
-            f"the term `{term.name}` has weights of shape {term.weight.shape}; this problem is padded to {expected}: "
-            "give it as a `vggtgeo.FlatTerm`, which `pack` pads"
-        )
+    check_padded(term, (keyframes if isinstance(term, SlotTerm) else edges,), slots)
     return term
 
 

@@ -29,6 +29,9 @@ _NEWTON_STEPS = 8
 class AbstractCamera(eqx.Module):
     """A camera model: focal lengths and principal point first, then what the model adds.
 
+    Fields:
+        parameters: [q], as `names` lists them: pixels, then the distortion's without a unit.
+
     Example:
         >>> vg.KannalaBrandt.names[:4]
         ('fx', 'fy', 'cx', 'cy')
@@ -52,6 +55,9 @@ class AbstractCamera(eqx.Module):
 class Pinhole(AbstractCamera):
     """`u = fx x / z + cx`, `v = fy y / z + cy`.
 
+    Fields:
+        parameters: [q], as `names` lists them.
+
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
         >>> vg.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.0, 1.0])).tolist()
@@ -73,6 +79,9 @@ class RadialTangential(AbstractCamera):
 
     `x' = x (1 + k1 r2 + k2 r2^2) + 2 p1 x y + p2 (r2 + 2 x^2)`,
     `y' = y (1 + k1 r2 + k2 r2^2) + p1 (r2 + 2 y^2) + 2 p2 x y`.
+
+    Fields:
+        parameters: [q], as `names` lists them.
 
     Example: without distortion it is the pinhole.
         >>> import jax.numpy as jnp, vggtgeo as vg
@@ -106,6 +115,9 @@ class RadialTangential(AbstractCamera):
 class KannalaBrandt(AbstractCamera):
     """The fisheye of Kannala and Brandt (2006), as OpenCV has it: the angle `t` from the axis is drawn at radius
     `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
+
+    Fields:
+        parameters: [q], as `names` lists them.
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
@@ -151,6 +163,9 @@ def _drawn_radius(camera: KannalaBrandt, angle: Float[Array, ""]) -> Float[Array
 class SquarePixels(AbstractCamera):
     """A model whose pixels are square: one focal length, exactly `fx = fy = f`, and the rest of `model`'s parameters.
 
+    Fields:
+        parameters: [q], as `names` lists them.
+
     Example: of a model of one's own, as of this package's fisheye.
         >>> class SquareFisheye(vg.SquarePixels):
         ...     model = vg.KannalaBrandt
@@ -178,6 +193,9 @@ class SquarePixels(AbstractCamera):
 class SquarePinhole(SquarePixels):
     """The pinhole with square pixels.
 
+    Fields:
+        parameters: [q], as `names` lists them.
+
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
         >>> vg.SquarePinhole(jnp.array([500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.2, 1.0])).tolist()
@@ -191,6 +209,9 @@ class SquarePinhole(SquarePixels):
 class SquareRadialTangential(SquarePixels):
     """`RadialTangential` with square pixels.
 
+    Fields:
+        parameters: [q], as `names` lists them.
+
     Example:
         >>> vg.SquareRadialTangential.names
         ('f', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2')
@@ -202,6 +223,9 @@ class SquareRadialTangential(SquarePixels):
 
 class SquareKannalaBrandt(SquarePixels):
     """`KannalaBrandt` with square pixels.
+
+    Fields:
+        parameters: [q], as `names` lists them.
 
     Example:
         >>> vg.SquareKannalaBrandt.names

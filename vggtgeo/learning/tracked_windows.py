@@ -194,6 +194,7 @@ def track_window(
         depth_mean=prior,
         depth_sigma=stated * prior,
         depth_weight=np.isfinite(depth).astype(float),
+        alpha=2.0,
     )
     poses = rigid.to_quaternion(np.array([oracle.pose(k) for k in frames]))
     start = poses.copy()

@@ -138,7 +138,12 @@ class RunWindows(Callback):
 
 @dataclass(frozen=True)
 class WindowDataset:
-    """Windows in a folder. count: how many. terms: classes of your own that the problems hold.
+    """Windows in a folder.
+
+    Fields:
+        folder: where `WindowWriter` put them.
+        count: how many.
+        terms: classes of your own that the problems hold.
 
     Example:
         >>> vg.WindowDataset.open("no/such/folder")  # see `WindowWriter` for one that is there

@@ -45,8 +45,10 @@ _BEFORE, _SHOWN = 30, 110
 class Checkpoints:
     """Where a run keeps its state, and whether it goes on from the one that is there.
 
-    path: of the file. resume: go on from it; where there is none, the run begins at its first frame. every: seconds
-    between two states, or more where they are large; 0: after each frame, whatever it takes.
+    Fields:
+        path: of the file.
+        resume: go on from it; where there is none, the run begins at its first frame.
+        every: seconds between two states, or more where they are large; 0: after each frame, whatever it takes.
 
     Example:
         >>> from pathlib import Path

@@ -46,7 +46,7 @@ def simulate_loop(
         points: hosted in each keyframe.
         reach: how many keyframes before and after see a keyframe's points, around the loop; half as many its surfaces.
         noise: standard deviation of matches, pixels.
-        depth_error: relative standard deviation of the depth prior.
+        depth_error: relative standard deviation of the depth prior, which counts with the paper's `alpha = 2`.
         start_error: standard deviation of each starting position, metres.
         drift: turn of the guess over the whole loop, radians.
         seed: of everything random.
@@ -87,6 +87,7 @@ def simulate_loop(
         line_weight=np.zeros(0),
         depth_mean=mean,
         depth_sigma=depth_error * mean,
+        alpha=2.0,
     )
     start = _drifted(poses, drift, start_error, rng)
     window = SimulatedWindow(observations, poses, 1 / depth, start, np.zeros(len(target), bool), noise)

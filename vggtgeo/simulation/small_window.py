@@ -117,7 +117,8 @@ def simulate_window(
         lines: segments hosted in each keyframe, four samples each.
         noise: standard deviation of matches and of the lines' offsets, pixels.
         outliers: share of the point matches that are wrong, by 10 to 30 pixels.
-        depth_error: relative standard deviation of the depth prior.
+        depth_error: relative standard deviation of the depth prior. Its weight is the paper's, `alpha = 2`: the
+            problem takes a depth as known to `depth_error / sqrt(2)`.
         start_error: standard deviation of the starting positions, metres.
         host_noise: whether the points' pixels in their hosts have that noise, too, and say so (`pixel_sigma`).
         seed: of everything random.
@@ -185,6 +186,7 @@ def simulate_window(
         line_weight=np.ones(len(line_edge)),
         depth_mean=mean,
         depth_sigma=max(depth_error, 1e-3) * mean,
+        alpha=2.0,
         pixel_sigma=1.0 if host_noise else None,
     )
     return SimulatedWindow(observations, poses, inverse, start, outlier, noise)

@@ -99,12 +99,14 @@ class Covariances(Readable):
     def _line(self) -> str:
         blocks = np.asarray(self.poses, np.float64)[:, :3, :3]
         known = np.isfinite(blocks).all((1, 2))
-        worst = 1e3 * float(np.sqrt(np.linalg.eigvalsh(blocks[known]).max(initial=0.0)))
-        unknown = f", {int((~known).sum())} undetermined" if not known.all() else ""
-        return (
-            f"Covariances({len(blocks)} keyframes, centres known to {worst:.1f} mm at worst{unknown}, variance factor "
-            f"{float(self.variance_factor):.2f})"
-        )
+        moving = blocks[known][np.any(blocks[known] != 0, (1, 2))]  # those that are held have no covariance
+        worst = f"{1e3 * np.sqrt(np.linalg.eigvalsh(moving).max(initial=0.0)):.1f} mm at worst"
+        if known.all():
+            centres = f"centres known to {worst}"
+        else:
+            centres = f"centres of {(~known).sum()} undetermined"
+            centres += f", of {len(moving)} known to {worst}" if len(moving) else ""
+        return f"Covariances({len(blocks)} keyframes, {centres}, variance factor {float(self.variance_factor):.2f})"
 
 
 def covariances(

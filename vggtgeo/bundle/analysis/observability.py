@@ -21,6 +21,7 @@ Cost: one linearisation a term, and for `k` terms `2 k + 1` Schur complements an
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -31,18 +32,28 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.analysis.directions import common_directions
-from vggtgeo.bundle.analysis.observability_report import Observability, Spectra
+from vggtgeo.bundle.analysis.observability_report import SHOWN, Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.residuals import term_residuals
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.arrow import ArrowSystem, Blocks, NodeFactors, Reduced, dense_gradient, reduce
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    Blocks,
+    NodeFactors,
+    Reduced,
+    couple,
+    dense_gradient,
+    inverse_landmark_hessian,
+    reduce,
+)
 from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
-from vggtgeo.solvers.landmark_basis import join_landmarks
+from vggtgeo.solvers.landmark_basis import expand, join_landmarks
 from vggtgeo.solvers.local_inverse import balance
 
 DENSE_KEYFRAMES = 300
@@ -53,6 +64,10 @@ KEPT = 24
 
 def observability(problem: Problem, state: State) -> Observability:
     """What the factors of `problem` determine at `state`, by kind.
+
+    `print` of the result names what is undetermined or weak, the three least known of the other directions with their
+    standard deviation in pixels, metres and radians (weights as 1 / variance), and keyframes between which the camera
+    only turned.
 
     Pure: works under `jit` and `vmap` for up to 300 keyframes. Larger maps go through scipy's sparse solvers, outside
     `jit`: only their 24 weakest directions are found, all else is the same (1,000 keyframes with 8,000 edges and five
@@ -83,15 +98,16 @@ def observability(problem: Problem, state: State) -> Observability:
     layout = sparse_layout(everything)
     blocks = (_blocks_jit(systems, keep, problem.fraction, layout) for keep in _selections(len(systems), state))
     found = [_sparse_spectrum(own, layout, coordinates) for own in blocks]
-    return _found(problem, state, systems, coordinates, jax.tree.map(lambda *leaves: jnp.stack(leaves), *found))
+    spectra = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    return _found_jit(problem, state, systems, everything, coordinates, spectra)
 
 
 @eqx.filter_jit
 def _observability_jit(problem: Problem, state: State) -> Observability:
-    systems, _, coordinates = _linearise_each(problem, state)
+    systems, everything, coordinates = _linearise_each(problem, state)
     combined = lambda keep: reduce(_combine(systems, keep, problem.fraction))
     spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), _selections(len(systems), state))
-    return _found(problem, state, systems, coordinates, spectra)
+    return _found(problem, state, systems, everything, coordinates, spectra)
 
 
 def _selections(count: int, state: State) -> Float[Array, "m k"]:
@@ -101,7 +117,12 @@ def _selections(count: int, state: State) -> Float[Array, "m k"]:
 
 
 def _found(
-    problem: Problem, state: State, systems: list[ArrowSystem], coordinates: _Coordinates, spectra: Spectra
+    problem: Problem,
+    state: State,
+    systems: list[ArrowSystem],
+    everything: ArrowSystem,
+    coordinates: _Coordinates,
+    spectra: Spectra,
 ) -> Observability:
     count, directions, first = len(systems), coordinates.common, num_offsets(state)
     part = lambda start, end: jax.tree.map(lambda leaf: leaf[start:end], spectra)
@@ -115,10 +136,47 @@ def _found(
         free=coordinates.free,
         landmark_information=sum(system.landmark_hessian[:, first:] for system in systems) * state.inverse_depth**2,
         landmark_used=_used(problem),
+        scale=coordinates.scale,
+        depth_change=_depth_change(
+            everything, spectra.vectors[0, :, :SHOWN] / coordinates.scale[:, None], problem, state
+        ),
+        edges=jnp.stack(problem.edges.ends, 1),
+        edge_parallax=_edge_parallax(problem, state),
         terms=tuple(term.name for term in problem.terms),
         keyframes=problem.num_keyframes,
         parameters=problem.parameter_names,
     )
+
+
+_found_jit = eqx.filter_jit(_found)
+
+
+def _depth_change(
+    system: ArrowSystem, directions: Float[Array, "c w"], problem: Problem, state: State
+) -> Float[Array, " w"]:
+    """Relative change of the inverse depths that follow each direction, root mean square over those in use."""
+    used = _used(problem)
+
+    def following(direction: Float[Array, " c"]) -> Float[Array, ""]:
+        moved = -inverse_landmark_hessian(system) * couple(system, jnp.where(system.free, direction, 0.0), 0.0)
+        relative = expand(system.basis, moved)[:, num_offsets(state) :] / state.inverse_depth
+        return jnp.sqrt(jnp.sum(jnp.where(used, relative, 0.0) ** 2) / jnp.maximum(jnp.sum(used), 1))
+
+    return jax.vmap(following, in_axes=1)(directions)
+
+
+def _edge_parallax(problem: Problem, state: State) -> Float[Array, " e"]:
+    """Largest `V d^2` of a landmark by one observation along each edge; infinite where there is none."""
+    ready, depth = prepared(problem), state.inverse_depth
+    largest, seen = jnp.zeros(len(problem.edges.source), depth.dtype), jnp.zeros(len(problem.edges.source), bool)
+    for term in ready.edge_terms:
+        residuals = lambda depth, term=term: term_residuals(ready, term, replace(state, inverse_depth=depth))
+        residual, slope = jax.jvp(residuals, (depth,), (jnp.ones_like(depth),))  # each sees one depth
+        pull = term.weights * term.kernel.weight(term.weights * jnp.sum(residual**2, 0))
+        own = depth[problem.edges.source, term.first_slot : term.first_slot + pull.shape[1]]
+        largest = jnp.maximum(largest, jnp.max(pull * jnp.sum(slope**2, 0) * own**2, 1, initial=0.0))
+        seen = seen | jnp.any(term.present(), 1)
+    return jnp.where(seen, largest, jnp.inf)
 
 
 def _check_large(problem: Problem, state: State) -> None:

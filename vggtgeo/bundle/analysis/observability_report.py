@@ -7,7 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.analysis.directions import direction_names
 from vggtgeo.geometry import lie
@@ -21,12 +21,15 @@ ALIGNED = 0.9
 """Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""
 NEW = 0.1
 """Squared part of a named direction that must lie outside what was named before it."""
-WEAK_LANDMARK = 1.0
-"""`V d^2` below which a landmark counts as undetermined: known to no better than 100 % of its inverse depth."""
+UNKNOWN = 1.0
+"""Information per 100 % of an inverse depth (`V d^2`) or of a focal length, below which it counts as undetermined:
+known to no better than 100 %."""
 ROUNDING_SIZE = 1800
 """Coordinates up to which rounding errors of the eigenvalues are taken to grow: 300 keyframes."""
 SHOWN = 12
 """Weak directions spelled out in a report; the rest are counted."""
+_PARTS = 3
+"""Names by which a least known direction goes, at most."""
 
 
 class Spectra(eqx.Module):
@@ -67,6 +70,15 @@ class Observability(eqx.Module):
     """`V d^2`: 1 / (relative variance of the inverse depth if poses and intrinsics were known)."""
     landmark_used: Bool[Array, "n s"]
     """Whether any term has weight on the slot."""
+    scale: Float[Array, " c"]
+    """`D^1/2`: a vector in balanced coordinates over it is in metres, radians and pixels."""
+    depth_change: Float[Array, " w"]
+    """Root mean square, over the landmarks in use, of the relative change of inverse depth that goes along with a unit
+    of each of the weakest directions of all terms (balanced); at most 12 of them."""
+    edges: Int[Array, "e 2"]
+    """Keyframes of each edge."""
+    edge_parallax: Float[Array, " e"]
+    """Largest `V d^2` of a landmark by its observation along this edge alone; infinite where the edge has none."""
     terms: tuple[str, ...] = eqx.field(static=True)
     """Names of the terms, in the order of the rows of `alone` and `without`."""
     keyframes: int = eqx.field(static=True)
@@ -99,8 +111,9 @@ class Observability(eqx.Module):
             return eqx.Module.__repr__(self)
         weak = "; ".join(known["weak"][:3]) + f" and {len(known['weak']) - 3} more" * (len(known["weak"]) > 3)
         lost, used = known["inverse_depths_undetermined"], known["inverse_depths"]
+        weak = "; ".join([weak or "none", *(["pure rotation"] if known["pure_rotation"] else [])])
         depths = f", {lost} of {used} inverse depths undetermined" if lost else ""
-        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak or 'none'}{depths})"
+        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak}{depths})"
 
 
 @dataclass(frozen=True)
@@ -133,9 +146,149 @@ def weak_directions(found: Observability, without: str | None = None) -> list[We
     values, vectors = np.asarray(spectra.values[row], float), np.asarray(spectra.vectors[row], float)
     floor = undetermined_below(len(found.free), spectra.values.dtype)
     lost, weak = values < floor, (values >= floor) & (values < WEAK)
+    along = np.asarray(spectra.along[row], float)
     return [
+        *_unknown_lenses(found, vectors[:, lost], along),
         *_taken_apart(found, vectors[:, lost], values[lost], determined=False),
         *_taken_apart(found, vectors[:, weak], values[weak], determined=True),
+    ]
+
+
+@dataclass(frozen=True)
+class LeastKnown:
+    """A determined direction of small eigenvalue: how far one standard deviation along it goes, in every unit."""
+
+    names: tuple[str, ...]
+    """Named directions that it is made of, the largest part first."""
+    explained: float
+    """Squared part of it that they are, 0 to 1."""
+    eigenvalue: float
+    parameters: dict[str, float]
+    """Of the cameras, in pixels (distortion: no unit); those that are free."""
+    centre: float
+    """Metres, of the camera centre that moves most."""
+    rotation: float
+    """Radians, of the camera that turns most."""
+    depth: float
+    """Relative, root mean square over the landmarks, which follow."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same as plain values."""
+        return {
+            "name": " against ".join(self.names),
+            "explained": self.explained,
+            "eigenvalue": self.eigenvalue,
+            "sigma": {
+                **self.parameters,
+                "centre_m": self.centre,
+                "rotation_rad": self.rotation,
+                "relative_depth": self.depth,
+            },
+        }
+
+    def __str__(self) -> str:
+        mixed = "" if self.explained >= ALIGNED else "a mixture, mostly "
+        return f"{mixed}{' against '.join(self.names)} (eigenvalue {self.eigenvalue:.1e})"
+
+    def sigma(self) -> str:
+        """One standard deviation in words."""
+        unit = lambda name: " px" if name.partition(" ")[0] in ("f", "fx", "fy", "cx", "cy") else ""
+        moved = [f"{name} {value:.2g}{unit(name)}" for name, value in self.parameters.items()]
+        moved += [f"centres {1e3 * self.centre:.2g} mm", f"rotations {np.degrees(self.rotation):.2g} deg"]
+        return ", ".join([*moved, f"depths {100 * self.depth:.2g} %"])
+
+
+def least_known(found: Observability, count: int = 3) -> list[LeastKnown]:
+    """The determined directions of smallest eigenvalue by all terms, whatever their size: the standard deviations say
+    whether one is known well enough.
+    """
+    values, free = np.asarray(found.whole.values[0], float), np.asarray(found.free)
+    first = int(np.sum(values < undetermined_below(len(free), found.whole.values.dtype)))
+    last = min(first + count, int(np.sum(np.isfinite(values))), len(found.depth_change))
+    return [_described(found, column) for column in range(first, last)]
+
+
+def _described(found: Observability, column: int) -> LeastKnown:
+    vector, value = np.asarray(found.whole.vectors[0], float)[:, column], float(found.whole.values[0][column])
+    sigma = np.where(np.asarray(found.free), vector / np.asarray(found.scale, float), 0.0) / np.sqrt(value)
+    poses = lie.TANGENT * found.keyframes
+    moved, free = sigma[:poses].reshape(-1, lie.TANGENT), np.asarray(found.free)[poses:]
+    named = zip(found.parameters, np.abs(sigma[poses:]), free, strict=True)
+    names, explained = _made_of(found, vector)
+    unknown = _unknown_parameters(found)
+    return LeastKnown(
+        names=names,
+        explained=explained,
+        eigenvalue=value,
+        parameters={name: float(change) for name, change, moves in named if moves and name not in unknown},
+        centre=float(np.linalg.norm(moved[:, :3], axis=1).max(initial=0.0)),
+        rotation=float(np.linalg.norm(moved[:, 3:], axis=1).max(initial=0.0)),
+        depth=float(found.depth_change[column]) / np.sqrt(value),
+    )
+
+
+def _unknown_parameters(found: Observability) -> set[str]:
+    """Focal lengths without information: their part of an eigenvector has no standard deviation."""
+    values, vectors = np.asarray(found.whole.values[0], float), np.asarray(found.whole.vectors[0], float)
+    lost = vectors[:, values < undetermined_below(len(found.free), found.whole.values.dtype)]
+    named = {direction.name for direction in _unknown_lenses(found, lost, np.asarray(found.whole.along[0], float))}
+    own = found.direction_names()[1 + lie.TANGENT : len(found.common)]
+    return {parameter for parameter, name in zip(found.parameters, own, strict=True) if name in named}
+
+
+def _made_of(found: Observability, vector: Float[np.ndarray, " c"]) -> tuple[tuple[str, ...], float]:
+    """Up to three named directions, each the one that explains most of what is left, and what all explain."""
+    poses, free = lie.TANGENT * found.keyframes, np.asarray(found.free)
+    single = np.eye(poses, len(free)) * free[:poses, None]
+    rows = np.concatenate([np.asarray(found.common, float), single])
+    names: list[str] = []
+    rest = vector.copy()
+    while len(names) < _PARTS and 1 - rest @ rest < ALIGNED:
+        size = np.linalg.norm(rows, axis=1)
+        share = (rows @ rest) / np.where(size > np.sqrt(NEW), size, np.inf)
+        best = int(np.argmax(np.abs(share)))
+        unit = rows[best] / size[best]
+        names.append(found.direction_names()[best])
+        rest, rows = rest - (unit @ rest) * unit, rows - np.outer(rows @ unit, unit)
+    return tuple(names), float(1 - rest @ rest)
+
+
+def rotation_pairs(found: Observability) -> list[tuple[int, int]]:
+    """Pairs of keyframes between which the camera only turned: matches join them, and no match of theirs alone knows
+    its depth to 100 %.
+    """
+    parallax: dict[tuple[int, int], float] = {}
+    for (i, j), size in zip(np.asarray(found.edges).tolist(), np.asarray(found.edge_parallax, float), strict=True):
+        if np.isfinite(size):
+            pair = (min(i, j), max(i, j))
+            parallax[pair] = max(size, parallax.get(pair, 0.0))
+    return sorted(pair for pair, size in parallax.items() if size < UNKNOWN)
+
+
+def _spell_pairs(found: Observability) -> str:
+    pairs = rotation_pairs(found)
+    joined = {tuple(sorted(edge)) for edge in np.asarray(found.edges)[np.isfinite(found.edge_parallax)].tolist()}
+    if len(pairs) == len(joined):
+        return "no match between any two keyframes has parallax, so that none determines a depth or a baseline"
+    listed = ", ".join(f"{i}-{j}" for i, j in pairs[:SHOWN]) + f" and {len(pairs) - SHOWN} more" * (len(pairs) > SHOWN)
+    return f"no match between the keyframes {listed} has parallax"
+
+
+def _unknown_lenses(
+    found: Observability, lost: Float[np.ndarray, "c w"], along: Float[np.ndarray, " m"]
+) -> list[WeakDirection]:
+    """Focal lengths known to no better than 100 % even if all else were, beside the subspace that is lost. Such a one
+    has no part in any eigenvector of small value: its own curvature, which is the measure there, is as small.
+    """
+    common, names = np.asarray(found.common, float), found.direction_names()
+    inside = np.sum((common @ lost) ** 2, 1)
+    return [
+        WeakDirection(names[i], 0.0, 1.0, determined=False)
+        for i in range(len(common))
+        if names[i].startswith(("focal length", "aspect ratio"))
+        and np.any(common[i])
+        and along[i] < UNKNOWN
+        and inside[i] < ALIGNED
     ]
 
 
@@ -169,7 +322,7 @@ def _named_parts(found: Observability, basis: Float[np.ndarray, "c w"]) -> Float
 def undetermined_landmarks(found: Observability) -> tuple[int, int]:
     """`(undetermined, used)`: landmarks known to no better than 100 % even if all else were, and landmarks in use."""
     used = np.asarray(found.landmark_used)
-    return int(np.sum(used & (np.asarray(found.landmark_information) < WEAK_LANDMARK))), int(used.sum())
+    return int(np.sum(used & (np.asarray(found.landmark_information) < UNKNOWN))), int(used.sum())
 
 
 def report(found: Observability) -> str:
@@ -181,6 +334,8 @@ def report(found: Observability) -> str:
         f"Observability of {found.keyframes} keyframes: {free} coordinates free, {size - free} held",
         f"weakest eigenvalues: {'  '.join(f'{max(value, 0):.1e}' for value in values[:6])}",
         f"weak directions: {_spell(weak_directions(found), found)}",
+        *(line for known in least_known(found) for line in (f"least known: {known}", f"  sigma: {known.sigma()}")),
+        *([f"pure rotation: {_spell_pairs(found)}"] if rotation_pairs(found) else []),
         f"inverse depths in use: {used}, undetermined even with all else known: {lost}",
     ]
     for kind in found.terms:
@@ -201,6 +356,8 @@ def as_dict(found: Observability) -> dict[str, Any]:
         "eigenvalues": [float(value) for value in np.asarray(found.whole.values[0])[:free]],
         "weak": [str(direction) for direction in weak_directions(found)],
         "weak_without": {kind: [str(direction) for direction in weak_directions(found, kind)] for kind in found.terms},
+        "least_known": [direction.to_dict() for direction in least_known(found)],
+        "pure_rotation": [list(pair) for pair in rotation_pairs(found)],
         "inverse_depths": used,
         "inverse_depths_undetermined": lost,
         "lost_without": lost_shares(found),
@@ -245,7 +402,7 @@ def _spell(weak: list[WeakDirection], found: Observability) -> str:
     if not weak:
         return "none"
     lost, more_unknown = not any(direction.determined for direction in weak), _more_unknown(weak, found)
-    if len(weak) == free and lost:
+    if len(weak) >= free and lost:
         return f"everything ({free} directions undetermined)"
     if lost and more_unknown:  # some of a subspace: they have no names of their own
         return f"at least {len(weak)} directions undetermined"

@@ -13,6 +13,14 @@ from vggtgeo.geometry import lie
 class BaselinePrior(PairTerm):
     """`r = log(|t_ij| / length) / sigma`: the distance of two camera centres.
 
+    Fields:
+        length: Metres, or the map's own unit.
+        sigma: Relative standard deviation.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+        first: int [m], keyframe i of each observation.
+        second: int [m], keyframe j of each observation.
+
     Example: the first two cameras are 20 cm apart, to a per mille.
         >>> one = jax.numpy.ones(1)
         >>> vg.BaselinePrior(first=[0], second=[1], length=0.2 * one, sigma=1e-3 * one, weight=one).name
@@ -21,9 +29,7 @@ class BaselinePrior(PairTerm):
     """
 
     length: Float[Array, " m"]
-    """Metres, or the map's own unit."""
     sigma: Float[Array, " m"]
-    """Relative standard deviation."""
 
     name = "baselines"
     unit = "sigma"

@@ -13,7 +13,15 @@ class DepthPrior(SlotTerm):
     """`r = (d - mean) / sigma`, standard deviations of the prior.
 
     The paper's raw difference (its equation 7) is `sigma = 1`; `sigma = sigma_rel * mean` makes it commensurable with
-    pixels. Its weight is `alpha * weight`.
+    pixels. Its weight is `alpha * weight`: the energy and the covariances take a depth as known to
+    `sigma / sqrt(alpha weight)`. With both 1, `sigma` is its standard deviation; the paper has `alpha = 2`.
+
+    Fields:
+        mean: 1/m; any finite number where `weight` is 0.
+        sigma: Standard deviation, 1/m, > 0 (1 where `weight` is 0).
+        alpha: Factor on the information of all depths (the paper's alpha, 2 there).
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
 
     Example:
         >>> problem.depth.mean.shape  # keyframes, slots
@@ -22,11 +30,8 @@ class DepthPrior(SlotTerm):
     """
 
     mean: Float[Array, "n s"]
-    """1/m; any finite number where `weight` is 0."""
     sigma: Float[Array, "n s"]
-    """Standard deviation, 1/m, > 0 (1 where `weight` is 0)."""
-    alpha: Float[Array, ""] = shared_field(converter=jnp.asarray, default=2.0)
-    """Weight of all depth terms against the pixels' (the paper's alpha)."""
+    alpha: Float[Array, ""] = shared_field(converter=jnp.asarray, default=1.0)
 
     name = "depth"
     unit = "sigma"

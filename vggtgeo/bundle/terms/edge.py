@@ -117,6 +117,11 @@ class PixelModel(NamedTuple):
 class EdgeTerm(AbstractTerm):
     """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its host.
 
+    Fields:
+        first_slot: Slot of the host that the first column is about.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+
     Example: a landmark lies on a plane that is known in the target camera.
         >>> class PointToPlane(vg.EdgeTerm):
         ...     normal: jax.Array
@@ -129,7 +134,6 @@ class EdgeTerm(AbstractTerm):
     """
 
     first_slot: int = eqx.field(static=True, kw_only=True, default=0)
-    """Slot of the host that the first column is about."""
 
     structure = frozenset({"weight", "kernel", "first_slot"})
 
@@ -242,6 +246,11 @@ class ImageTerm(EdgeTerm):
 
     With one pinhole for all keyframes, its derivatives come from `fast/pinhole.py`, written by hand; with other cameras
     from automatic differentiation. The tests hold the two equal.
+
+    Fields:
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+        first_slot: slot of the host that the first column is about; `pack` sets it.
 
     Example: only the column of a match is known.
         >>> class Column(vg.ImageTerm):

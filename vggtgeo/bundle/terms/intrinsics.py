@@ -10,6 +10,12 @@ from vggtgeo.bundle.terms.node import CameraTerm
 class IntrinsicsPrior(CameraTerm):
     """`r = k - mean` for each parameter, weight `1 / sigma^2`; without a robust kernel.
 
+    Fields:
+        index: Which parameter each observation is about, from 0.
+        mean: Pixels (distortion: no unit).
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+
     Example:
         >>> problem.intrinsics_prior.mean.shape
         (4,)
@@ -17,9 +23,7 @@ class IntrinsicsPrior(CameraTerm):
     """
 
     index: Int[Array, " q"]
-    """Which parameter each observation is about, from 0."""
     mean: Float[Array, " q"]
-    """Pixels (distortion: no unit)."""
 
     name = "intrinsics_prior"
     unit = "px"

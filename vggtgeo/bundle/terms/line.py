@@ -10,6 +10,12 @@ from vggtgeo.bundle.terms.edge import ImageTerm
 class LineTerm(ImageTerm):
     """`r = a u' + b v' + c`, pixels, of the sample's projection (equation 6 of the paper).
 
+    Fields:
+        coefficients: `(a, b, c)` with `a^2 + b^2 = 1`, of the line in keyframe j.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+        first_slot: slot of the host that the first column is about; `pack` sets it.
+
     Example:
         >>> problem.lines.coefficients.shape  # edges, samples, (a, b, c)
         (12, 12, 3)
@@ -17,7 +23,6 @@ class LineTerm(ImageTerm):
     """
 
     coefficients: Float[Array, "e l 3"]
-    """`(a, b, c)` with `a^2 + b^2 = 1`, of the line in keyframe j."""
 
     name = "lines"
     unit = "px"

@@ -21,6 +21,14 @@ class MarginalPrior(DenseTerm):
 
     Coordinates: six a keyframe (left tangent `log(T T_lin^-1)`, translation first), then the camera's.
 
+    Fields:
+        root: [c, c], square root of the information; zero rows say nothing.
+        offset: [c], the residual at the linearisation point.
+        poses: Linearisation points, batch `[n]`; kept as long as the prior lives (first estimates).
+        intrinsics: [q], linearisation point of the cameras' parameters.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+
     Example:
         >>> vg.no_prior(3).root.shape
         (22, 22)
@@ -30,7 +38,6 @@ class MarginalPrior(DenseTerm):
     root: Float[Array, "c c"]
     offset: Float[Array, " c"]
     poses: jaxlie.SE3
-    """Linearisation points, batch `[n]`; kept as long as the prior lives (first estimates)."""
     intrinsics: Float[Array, " q"]
 
     name = "marginal"

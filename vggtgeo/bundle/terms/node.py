@@ -37,7 +37,13 @@ def _indices(given: Any) -> Array:
 
 
 class PoseTerm(AbstractTerm):
-    """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`.
+    """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`. One number as
+    weight counts for each.
+
+    Fields:
+        keyframe: Which pose each observation is about.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
 
     Example: a position fix.
         >>> class PositionFix(vg.PoseTerm):
@@ -51,7 +57,6 @@ class PoseTerm(AbstractTerm):
     """
 
     keyframe: _Index = eqx.field(converter=_indices, kw_only=True)
-    """Which pose each observation is about."""
 
     structure = frozenset({"weight", "kernel", "keyframe"})
 
@@ -73,13 +78,23 @@ class PoseTerm(AbstractTerm):
         """Keyframes of each observation."""
         return (self.keyframe,)
 
+    def observation_shape(self) -> tuple[int, ...]:
+        return self.keyframe.shape
+
     def local_size(self, cameras: Cameras) -> int:
         """Number of local coordinates."""
         return lie.TANGENT + cameras.size
 
 
 class PairTerm(AbstractTerm):
-    """Observations of two poses: `weight` and data have the axis `[m]`.
+    """Observations of two poses: `weight` and data have the axis `[m]`. One number as weight counts for
+    each.
+
+    Fields:
+        first: Keyframe i of each observation.
+        second: Keyframe j.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
 
     Example: what the wheels say of a motion.
         >>> class Wheels(vg.PairTerm):
@@ -93,9 +108,7 @@ class PairTerm(AbstractTerm):
     """
 
     first: _Index = eqx.field(converter=_indices, kw_only=True)
-    """Keyframe i of each observation."""
     second: _Index = eqx.field(converter=_indices, kw_only=True)
-    """Keyframe j."""
 
     structure = frozenset({"weight", "kernel", "first", "second"})
 
@@ -117,6 +130,9 @@ class PairTerm(AbstractTerm):
         """Keyframes of each observation."""
         return self.first, self.second
 
+    def observation_shape(self) -> tuple[int, ...]:
+        return self.first.shape
+
     def local_size(self, cameras: Cameras) -> int:
         """Number of local coordinates."""
         return 2 * lie.TANGENT
@@ -126,9 +142,14 @@ NodeTerm = PoseTerm | PairTerm
 
 
 class CameraTerm(AbstractTerm):
-    """Observations of the camera's parameters: `weight` and data have the axis `[m]`.
+    """Observations of the camera's parameters: `weight` and data have the axis `[m]`. One number as weight counts for
+    each.
 
     Several cameras: their parameters one camera after the other, `q = g k` of them.
+
+    Fields:
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
 
     Example: pixels are square.
         >>> class SquarePixels(vg.CameraTerm):
@@ -143,6 +164,10 @@ class CameraTerm(AbstractTerm):
     @abc.abstractmethod
     def residual(self, parameters: Float[Array, " q"]) -> Float[Array, "*m"]:
         """Of one observation."""
+
+    def observation_shape(self) -> tuple[int, ...]:
+        rows = [np.shape(leaf)[:1] for leaf in jax.tree.leaves(self.data())]
+        return next(iter(rows), (1,))
 
     def residuals(self, parameters: Float[Array, " q"]) -> Float[Array, "m k"]:
         """Of all of them, the residual's own axis first."""
@@ -164,6 +189,10 @@ class CameraTerm(AbstractTerm):
 
 class DenseTerm(AbstractTerm):
     """One observation of all poses and the camera together; it fills the matrix. `weight` is a scalar.
+
+    Fields:
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
 
     Example: the one of the package is the prior of marginalisation.
         >>> isinstance(vg.no_prior(3), vg.DenseTerm)

@@ -10,6 +10,12 @@ from vggtgeo.bundle.terms.edge import ImageTerm
 class PointTerm(ImageTerm):
     """`r = pi(T_j T_i^-1 pi^-1(u_i, d_i)) - u_j`, pixels (equation 5 of the paper).
 
+    Fields:
+        target: Matched pixel in keyframe j.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+        first_slot: slot of the host that the first column is about; `pack` sets it.
+
     Example:
         >>> problem.points.target.shape  # edges, slots, (u, v)
         (12, 20, 2)
@@ -17,7 +23,6 @@ class PointTerm(ImageTerm):
     """
 
     target: Float[Array, "e p 2"]
-    """Matched pixel in keyframe j."""
 
     name = "points"
     unit = "px"

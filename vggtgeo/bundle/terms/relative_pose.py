@@ -16,6 +16,14 @@ class RelativePose(PairTerm):
     A quadratic `1/2 eta' H eta + g' eta` about a linearisation point `L` (normal equations of an alignment of surfaces)
     is the same term with `M = exp(-H^+ g) L`, see `quadratic`.
 
+    Fields:
+        measured: `M`: camera i -> camera j, `(qw, qx, qy, qz, tx, ty, tz)`.
+        root: Square root of the information, translation first: 1/m and 1/rad.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+        first: int [m], keyframe i of each observation.
+        second: int [m], keyframe j of each observation.
+
     Example: camera 1 stands where camera 0 does, to 1 cm and 0.01 rad.
         >>> import jax.numpy as jnp
         >>> root = 100.0 * jnp.eye(6)[None]
@@ -26,9 +34,7 @@ class RelativePose(PairTerm):
     """
 
     measured: Float[Array, "m 7"]
-    """`M`: camera i -> camera j, `(qw, qx, qy, qz, tx, ty, tz)`."""
     root: Float[Array, "m 6 6"]
-    """Square root of the information, translation first: 1/m and 1/rad."""
 
     name = "relative_poses"
     unit = "sigma"

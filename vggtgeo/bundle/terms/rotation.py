@@ -13,6 +13,13 @@ from vggtgeo.geometry.cameras import AbstractCamera
 class RotationPrior(PoseTerm):
     """`r = root Log(R M^T)` with `root^T root` the information of the measured rotation `M`.
 
+    Fields:
+        measured: `M`: world -> camera, unit quaternion `(w, x, y, z)`.
+        root: Square root of the information, 1/rad.
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+        keyframe: int [m], keyframe of each observation.
+
     Example: the first camera stands upright, to a degree.
         >>> import jax.numpy as jnp
         >>> upright, root = jnp.array([[1.0, 0, 0, 0]]), 57.3 * jnp.eye(3)[None]
@@ -22,9 +29,7 @@ class RotationPrior(PoseTerm):
     """
 
     measured: Float[Array, "m 4"]
-    """`M`: world -> camera, unit quaternion `(w, x, y, z)`."""
     root: Float[Array, "m 3 3"]
-    """Square root of the information, 1/rad."""
 
     name = "rotations"
     unit = "sigma"

@@ -16,6 +16,10 @@ Derivatives = tuple[Float[Array, "n s"], Float[Array, "n s"]]
 class SlotTerm(AbstractTerm):
     """Observations of inverse depths: `weight` and data have the axes `[n, s]`, keyframe and slot.
 
+    Fields:
+        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        kernel: robust kernel of each observation.
+
     Example: no landmark is nearer than it should be.
         >>> class NotNear(vg.SlotTerm):
         ...     def residual(self, inverse_depth):

@@ -65,6 +65,23 @@ def check_residual(term: AbstractTerm, residual: Any) -> Array:
     return jnp.atleast_1d(residual)
 
 
+def check_padded(term: AbstractTerm, rows: tuple[int, ...], slots: int) -> None:
+    """InputError for a term on landmarks whose weights or data are not in the padded shape of a problem: `rows` (its
+    edges or keyframes), then at most `slots`; flat lists in particular.
+    """
+    shape = np.shape(term.weight)
+    found = [("weight", shape, (*rows, slots))] if shape[:-1] != rows or shape[-1] > slots else []
+    for name, value in term.data().items():
+        found += [
+            (name, np.shape(leaf), shape) for leaf in jax.tree.leaves(value) if np.shape(leaf)[: len(shape)] != shape
+        ]
+    for name, own, expected in found:
+        raise InputError(
+            f"`{term.name}.{name}` has shape {own}; it must begin with {expected}, the padded shape of the problem. "
+            "Give flat lists, one row an observation, as a `vggtgeo.FlatTerm` to `vggtgeo.pack(..., terms=[...])`"
+        )
+
+
 def shared_field(**options: Any) -> Any:
     """A field of a term that all its observations share (a scale, a calibration), not data with an axis of its own.
 
@@ -86,6 +103,12 @@ class AbstractTerm(eqx.Module):
     The fields that a subclass adds are data: every array in them has the axes of `weight` first. What all observations
     share is declared with `vggtgeo.shared_field()`.
 
+    Fields:
+        weight: 1 / variance of the residual of each observation. 0 means that it is not there, and what is not there
+            has no derivative: by a weight of exactly 0 the derivative of a solution is 0. To learn whether an
+            observation should count, give it a small positive weight.
+        kernel: robust kernel of each observation; the square by default.
+
     Example: a term of a problem, without its first edge.
         >>> term = problem.points
         >>> term.reweighted(term.weight.at[0].set(0.0)).present()[0].any().item()
@@ -94,7 +117,6 @@ class AbstractTerm(eqx.Module):
     """
 
     weight: Float[Array, "*observations"] = eqx.field(converter=_weights, kw_only=True, default=1.0)
-    """Of each observation, 1 / variance of its residual; 0 means that it is not there."""
     kernel: AbstractKernel = eqx.field(kw_only=True, default=Square())
 
     unit: ClassVar[str] = ""
@@ -135,6 +157,17 @@ class AbstractTerm(eqx.Module):
                 f"`weight` has shape {given.shape}; expected {self.weight.shape}, that of `{self.name}.weight`"
             )
         return eqx.tree_at(lambda term: term.weight, self, given)
+
+    def observation_shape(self) -> tuple[int, ...] | None:
+        """Shape of the observations, where their number is known without weights; None where it is not."""
+        return None
+
+    def broadcast(self) -> Self:
+        """The same term with a weight for each observation, where one number is given for all."""
+        shape = self.observation_shape()
+        if shape is None or self.weight.ndim:
+            return self
+        return eqx.tree_at(lambda term: term.weight, self, jnp.broadcast_to(self.weight, shape))
 
     def present(self) -> Bool[Array, "*observations"]:
         """Which observations are there."""

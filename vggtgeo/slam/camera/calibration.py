@@ -198,4 +198,6 @@ def _set_aside(problem: Problem) -> np.ndarray:
 def without_surfaces(problem: Problem) -> Problem:
     """The problem in which aligned surfaces say nothing."""
     surfaces = [term for term in problem.terms if term.name == "surfaces"]
-    return problem.with_term(surfaces[0].reweighted(jnp.zeros_like(surfaces[0].weight))) if surfaces else problem
+    if not surfaces:
+        return problem
+    return problem.with_term(surfaces[0].reweighted(jnp.zeros_like(surfaces[0].weight)), replace=True)

@@ -51,6 +51,20 @@ _ASKED = {
 class Roles:
     """The perception objects of one run.
 
+    Fields:
+        points: Finds, describes and matches key points.
+        lines: Detects segments.
+        line_matches: Describes and matches segments.
+        depth: Gives metric depth of an image.
+        confidence: Gives the confidence of matches, pixel by pixel.
+        geometry: Finds the pose of a frame from matches.
+        alignment: Aligns a frame's picture and depth to a keyframe's as a whole, beside its key points; None leaves
+            that out.
+        flow: Follows a keyframe's key points into frames that `alignment` then refines, so that most frames need no
+            descriptors; None describes and matches every frame.
+        still_parts: What of the images, as they are read, belongs to the camera and not to the world: nothing is
+            looked for there. `vggtgeo.reconstruct` finds it.
+
     Example:
         >>> import vggtgeo as vg
         >>> from vggtgeo.models.classical import NoDepth, OrbMatcher
@@ -66,14 +80,9 @@ class Roles:
     confidence: DenseConfidence = field(default_factory=StructureTensor)
     geometry: InitialGeometry = field(default_factory=PnpGeometry)
     alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
-    """Aligns a frame's picture and depth to a keyframe's as a whole, beside its key points; None leaves that out."""
     flow: PatchFlow | None = field(default_factory=PatchFlow)
-    """Follows a keyframe's key points into frames that `alignment` then refines, so that most frames need no
-    descriptors; None describes and matches every frame."""
 
     still_parts: StillParts | None = None
-    """What of the images, as they are read, belongs to the camera and not to the world: nothing is looked for there.
-    `vggtgeo.reconstruct` finds it."""
 
     def __post_init__(self) -> None:
         """InputError for what plays no role, which would be found in the middle of a run."""
@@ -137,6 +146,17 @@ def check_size(method: str, found: Any, image: np.ndarray) -> None:
 @dataclass(frozen=True)
 class SlamSettings:
     """Numbers of the pipeline by stage; lengths in metres, angles in radians, pixels where named so.
+
+    Fields:
+        tracking: How a frame is placed.
+        keyframes: When a frame becomes a keyframe.
+        matching: Which keyframes are joined by an edge.
+        line: Residuals of lines.
+        depth_terms: What metric depth says in the adjustments.
+        weights: Weight of a match.
+        camera: How far the intrinsics may move.
+        window: The keyframes that are adjusted together while the run goes on.
+        refinement: The adjustment of the whole map at the end.
 
     Example:
         >>> import vggtgeo as vg

@@ -90,10 +90,11 @@ def _without_links(problem: Problem, label: np.ndarray) -> Problem:
     within = jnp.asarray(piece[source] == piece[target])
     for term in problem.terms:
         if isinstance(term, EdgeTerm):
-            problem = problem.with_term(term.restricted(within))
+            problem = problem.with_term(term.restricted(within), replace=True)
         elif isinstance(term, PairTerm):
             inside = piece[np.asarray(term.first)] == piece[np.asarray(term.second)]
-            problem = problem.with_term(term.reweighted(jnp.where(inside, term.weight, 0.0)))
+            lighter = term.reweighted(jnp.where(inside, term.weight, 0.0))
+            problem = problem.with_term(lighter, replace=True)
     return problem
 
 

@@ -1,0 +1,39 @@
+"""`help()` of what a user constructs explains every field."""
+
+import dataclasses
+import pydoc
+import re
+
+import pytest
+
+import vggtgeo as vg
+
+GIVEN = {
+    *("Solution", "Covariances", "Observability", "ResidualSizes", "Result", "BenchReport", "Verdict", "Trajectory"),
+    *("View", "SimulatedWindow"),
+}
+"""What functions give and no user constructs."""
+NAMES = [
+    name
+    for name in vg.__all__
+    if isinstance(getattr(vg, name), type) and dataclasses.is_dataclass(getattr(vg, name)) and name not in GIVEN
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_explains_every_field(name: str) -> None:
+    """Each public field, inherited or not, has an explanation of its own in the class's docstring, which `help()`
+    shows. Oracle: the fields of the class; pydoc's text.
+    """
+    kind = getattr(vg, name)
+    fields = [field.name for field in dataclasses.fields(kind) if not field.name.startswith("_")]
+    shown, docstring = pydoc.render_doc(kind, renderer=pydoc.plaintext), kind.__doc__
+    missing = [field for field in fields if not re.search(rf"^ +(\w+, )*{field}(, \w+)*: \S", docstring, re.MULTILINE)]
+    assert not missing, f"the docstring of `{name}` does not explain {missing}"
+    for line in docstring.strip().splitlines():
+        assert line.strip() in shown
+
+
+def test_the_classes_of_bundle_adjustment_are_among_them() -> None:
+    """The list above is not empty by mistake. Oracle: the classes that a researcher asked for help of."""
+    assert {"Observations", "SchurLevenbergMarquardt", "PaddedSize", "DepthPrior", "Huber", "FlatTerm"} <= set(NAMES)

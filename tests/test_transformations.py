@@ -1,0 +1,121 @@
+"""The table of `docs/gradients.md` on what goes through which transformation is what happens."""
+
+import dataclasses
+import re
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import vggtgeo as vg
+
+COLUMNS = ("`jit`", "`vmap`", "`grad`", "`jvp`", "second order")
+STEP = 1e-3
+"""Of the differences; the functions are of order one in their argument."""
+
+WINDOW = vg.simulate_window(2, points=4, lines=0, start_error=0.01)
+PACKED = WINDOW.pack()
+PROBLEM, STATE, INDEX = PACKED[0].with_term(vg.no_prior(2)), PACKED[1], PACKED[2]
+STEPS = 0.01 * jnp.cos(jnp.arange(6 * 2 + 4 + STATE.inverse_depth.size, dtype=float))
+MATCHES = jnp.ones(len(WINDOW.observations.point_edge))
+
+Function = Callable[[jax.Array], jax.Array]
+
+
+def weighted(share: jax.Array) -> vg.Problem:
+    """The problem with its points weighted otherwise, one by one."""
+    factor = share ** jnp.linspace(0.5, 2.0, PROBLEM.points.weight.size).reshape(PROBLEM.points.weight.shape)
+    return PROBLEM.with_term(PROBLEM.points.reweighted(factor * PROBLEM.points.weight))
+
+
+def prior_left(share: jax.Array) -> jax.Array:
+    """Size of the prior that keyframe 1 leaves on a free camera."""
+    free = dataclasses.replace(weighted(share), fixed_intrinsics=jnp.zeros(4, bool))
+    return jnp.sum(vg.marginalise(free, STATE, jnp.asarray(1)).root ** 2) * 1e5
+
+
+def solved(share: jax.Array) -> vg.Solution:
+    return vg.solve(weighted(share), STATE)
+
+
+def reordered(share: jax.Array) -> jax.Array:
+    prior = vg.MarginalPrior(**{**vars(PROBLEM.marginal), "root": share * jnp.eye(16)})
+    return jnp.sum(vg.reorder(prior, np.array([1, -1])).root ** 2)
+
+
+FUNCTIONS: dict[str, Function] = {
+    "`energy`": lambda x: vg.energy(weighted(x), STATE),
+    "`energy_terms`": lambda x: vg.energy_terms(weighted(x), STATE)["points"],
+    "`residuals_at`": lambda x: jnp.sum(vg.residuals_at(PROBLEM, STATE.moved(x * STEPS))["points"] ** 2),
+    "`residual_sizes(...).rms`": lambda x: vg.residual_sizes(weighted(x), STATE).rms["points"],
+    "`covariances(...).poses`": lambda x: jnp.sum(jnp.log(jnp.diag(vg.covariances(weighted(x), STATE).poses[1]))),
+    "`observability(...).whole.values`": lambda x: jnp.sum(vg.observability(weighted(x), STATE).whole.values[0, :2]),
+    "`marginalise(...).root`": prior_left,
+    "`reorder(...).root`": reordered,
+    "`SlotIndex.scatter_points`": lambda x: jnp.sum(
+        INDEX.scatter_points(x * MATCHES, WINDOW.observations, PROBLEM.points.weight) ** 2
+    ),
+    "`SlotIndex.gather`": lambda x: jnp.sum(jnp.asarray(INDEX.gather(x**2 * STATE.inverse_depth))),
+    "`solve(...).state`": lambda x: jnp.sum(solved(x).state.poses.translation() * jnp.arange(6.0).reshape(2, 3)),
+    "`solve(...).energy`": lambda x: solved(x).energy,
+}
+LONG = {
+    *("`solve(...).state`", "`solve(...).energy`", "`observability(...).whole.values`", "`marginalise(...).root`"),
+    *("`covariances(...).poses`", "`residuals_at`"),
+}
+NAMES = [pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in FUNCTIONS]
+
+
+def judged(found: Callable[[], Any], expected: float, rtol: float = 1e-3) -> str:
+    """Say "yes" for the expected value, "0" where there should be another, "NaN", or the name of the error."""
+    try:
+        value = np.asarray(found(), float)
+    except Exception as error:  # noqa: BLE001 # whichever a user sees
+        return f"`{type(error).__name__}`"
+    if not np.isfinite(value).all():
+        return "NaN"
+    if np.allclose(value, expected, rtol=rtol, atol=0.0):
+        return "yes"
+    return "0" if not value.any() else f"wrong ({value} for {expected})"
+
+
+def facts(function: Function) -> list[str]:
+    """The cells of a row, in the order of `COLUMNS`; derivatives are judged by central differences of plain calls."""
+    at = jnp.ones(())
+    low, value, high = (float(function(at + step)) for step in (-STEP, 0.0, STEP))
+    slope, bend = (high - low) / (2 * STEP), (high - 2 * value + low) / STEP**2
+    assert min(abs(slope), abs(bend)) > 1e-3, "the function does not change, and shows nothing"
+    return [
+        judged(lambda: jax.jit(function)(at), value),
+        judged(lambda: jax.jit(jax.vmap(function))(jnp.stack([at, at]))[1], value),
+        judged(lambda: jax.jit(jax.grad(function))(at), slope),
+        judged(lambda: jax.jit(lambda x: jax.jvp(function, (x,), (at,))[1])(at), slope),
+        judged(lambda: jax.jit(jax.jacfwd(jax.grad(function)))(at), bend, rtol=1e-2),
+    ]
+
+
+def table() -> dict[str, list[str]]:
+    """The rows of the page."""
+    text = (ROOT / "docs" / "gradients.md").read_text()
+    start = text.index(f"| of | {' | '.join(COLUMNS)} |")
+    rows = [line.strip("| \n").split(" | ") for line in text[start:].split("\n\n")[0].splitlines()[2:]]
+    return {row[0]: row[1:] for row in rows}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_row_of_the_table_is_what_happens(name: str) -> None:
+    """Each cell of the page is what the transformation gives: the right value, 0, NaN or the error that is named.
+    Oracle: plain calls and their differences.
+    """
+    found = facts(FUNCTIONS[name])
+    assert table()[name] == found, f"| {name} | {' | '.join(found)} |"
+
+
+def test_the_table_has_no_other_rows() -> None:
+    """Every row is one that is tested, and each cell is of the kinds that it can be. Oracle: the list above."""
+    assert set(table()) == set(FUNCTIONS)
+    assert all(re.fullmatch(r"yes|0|NaN|`\w+`", cell) for row in table().values() for cell in row)
