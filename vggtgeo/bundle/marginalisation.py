@@ -65,7 +65,7 @@ def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: in
     )
 
 
-def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> MarginalPrior:
+def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -> MarginalPrior:
     """The prior over poses and camera that remains when keyframe `leaving` is taken out of the window.
 
     The problem must have a `marginal` term (`problem.with_term(no_prior(n))` to begin with). The result has the same
@@ -150,14 +150,14 @@ def _linearisation_point(prior: MarginalPrior, state: State) -> State:
     )
 
 
-def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""]) -> _Quadratic:
+def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""] | int) -> _Quadratic:
     """Hessian and gradient of the leaving terms over the dense coordinates, landmarks eliminated."""
     leaving_terms = tuple(_leaving(term, problem, leaving) for term in problem.terms)
     reduced = reduce(linearise(prepared(problem.with_terms(leaving_terms)), point))
     return reduced.hessian - reduced.schur, reduced.gradient - reduced.schur_gradient
 
 
-def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""]) -> AbstractTerm:
+def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int) -> AbstractTerm:
     """The part of a term that goes with a keyframe; what is about the camera alone stays in the problem."""
     goes: Array
     if isinstance(term, EdgeTerm):
