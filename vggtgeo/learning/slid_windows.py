@@ -63,7 +63,8 @@ def stack_sequences(sequences: Sequence[TrackedWindow], keyframes: int, *, depth
         without = lambda seen: replace(seen, depth_weight=np.zeros(len(seen.host)))
         windows = [replace(window, observations=without(window.observations)) for window in windows]
     batch = stack(windows, terms)
-    return jax.tree.map(lambda leaf: leaf.reshape(len(sequences), -1, *leaf.shape[1:]), batch)
+    shape = (len(sequences), len(windows) // len(sequences))  # not -1: there may be no room for lines
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), batch)
 
 
 def _unit(window: TrackedWindow) -> BaselinePrior:
