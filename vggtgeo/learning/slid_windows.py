@@ -38,7 +38,8 @@ def cut(long: TrackedWindow, keyframes: int) -> list[TrackedWindow]:
 
 def _part(long: TrackedWindow, places: np.ndarray) -> TrackedWindow:
     seen = long.observations
-    rows = np.isin(seen.edges, places).all(1)[seen.point_edge]
+    inside: np.ndarray = np.isin(seen.edges, places).all(1)
+    rows = inside[seen.point_edge]
     return replace(
         long,
         images=long.images[places],
@@ -71,7 +72,9 @@ def _unit(window: TrackedWindow) -> BaselinePrior:
     """The distance of the first two keyframes; `slid_error_and_gradient` keeps it of the first window alone."""
     centres = np.asarray(jaxlie.SE3(jnp.asarray(window.poses[:2])).inverse().translation())
     length, one = float(np.linalg.norm(centres[1] - centres[0])), jnp.ones(1)
-    return BaselinePrior(first=[0], second=[1], length=length * one, sigma=_BASELINE_SIGMA * one, weight=one)
+    return BaselinePrior(
+        first=jnp.zeros(1, int), second=jnp.ones(1, int), length=length * one, sigma=_BASELINE_SIGMA * one, weight=one
+    )
 
 
 @eqx.filter_jit
