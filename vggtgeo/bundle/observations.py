@@ -88,7 +88,7 @@ class Observations:
         if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or len(np.unique(chosen)) < len(chosen):
             raise InputError(f"`keyframes` is {chosen.tolist()!r:.60}; it must be a list of whole numbers, each once")
         ends, host = np.asarray(self.edges), np.asarray(self.host)
-        inside: np.ndarray = np.isin(ends, chosen).all(1)
+        inside = np.all(np.isin(ends, chosen), axis=1)
         hosted = np.isin(host, chosen)
         place = np.zeros(1 + max(chosen.max(initial=0), ends.max(initial=0), host.max(initial=0)), int)
         place[chosen] = np.arange(len(chosen))

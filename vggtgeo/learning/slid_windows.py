@@ -38,7 +38,7 @@ def cut(long: TrackedWindow, keyframes: int) -> list[TrackedWindow]:
 
 def _part(long: TrackedWindow, places: np.ndarray) -> TrackedWindow:
     seen = long.observations
-    inside: np.ndarray = np.isin(seen.edges, places).all(1)
+    inside = np.all(np.isin(seen.edges, places), axis=1)
     rows = inside[seen.point_edge]
     return replace(
         long,
