@@ -10,6 +10,8 @@ section 9.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
@@ -26,36 +28,54 @@ def dense_inverse(system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
     stiffness, directions = gauge_stiffness(system, reduced), free_gauge(system)
     matrix = reduced.hessian - reduced.schur + (directions * stiffness) @ directions.T
     matrix = jnp.where(free[:, None] & free[None, :], (matrix + matrix.T) / 2, jnp.eye(len(free), dtype=matrix.dtype))
-    balanced, tolerance = matrix / scale[:, None] / scale[None, :], rank_tolerance(len(free), matrix.dtype)
-    factor = jnp.linalg.cholesky(balanced)
-    whole = jsp.linalg.cho_solve((factor, True), jnp.eye(len(free), dtype=matrix.dtype))
-    # No NaN passes the comparison.
-    inverse, outside, undetermined = jax.lax.cond(
-        jnp.linalg.norm(whole) * tolerance < 1,
-        lambda: (whole, jnp.zeros_like(whole), jnp.asarray(0)),
-        lambda: _pseudo_inverse(balanced, tolerance),
-    )
+    inverse, outside = _pseudo_inverse(matrix / scale[:, None] / scale[None, :])
     inverse = jnp.where(free[:, None] & free[None, :], inverse, 0.0) / scale[:, None] / scale[None, :]
     for column in range(directions.shape[1]):
         inverse = _hold(inverse, directions[:, column], stiffness[column])
-    null = outside @ outside.T / scale[:, None] / scale[None, :]
+    null = outside / scale[:, None] / scale[None, :]
     index = local_coordinates(system, hosts)
     return LocalInverse(
         covariance=inverse[index[:, :, None], index[:, None, :]],
         null=null[index[:, :, None], index[:, None, :]],
-        undetermined=(jnp.sum(outside**2, 1) > visible(matrix.dtype))[index],
-        rank=jnp.sum(free) - undetermined - jnp.sum(stiffness > 0),
+        undetermined=(jnp.diagonal(outside) > visible(matrix.dtype))[index],
+        rank=jnp.sum(free) - jnp.rint(jnp.trace(outside)).astype(int) - jnp.sum(stiffness > 0),
     )
 
 
-def _pseudo_inverse(
+@jax.custom_jvp
+def _pseudo_inverse(balanced: Float[Array, "c c"]) -> tuple[Float[Array, "c c"], Float[Array, "c c"]]:
+    """The inverse `P` along directions that are determined, and the projector `N` on the others."""
+    tolerance = rank_tolerance(len(balanced), balanced.dtype)
+    factor = jnp.linalg.cholesky(balanced)
+    whole = jsp.linalg.cho_solve((factor, True), jnp.eye(len(balanced), dtype=balanced.dtype))
+    # No NaN passes the comparison.
+    return jax.lax.cond(
+        jnp.linalg.norm(whole) * tolerance < 1,
+        lambda: (whole, jnp.zeros_like(whole)),
+        lambda: _by_eigenvectors(balanced, tolerance),
+    )
+
+
+@_pseudo_inverse.defjvp
+def _pseudo_inverse_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Any, Any]:
+    """At constant rank, `dN = -(P dA N + N dA P)` and `dP = -P dA P + P^2 dA N + N dA P^2` (Golub and Pereyra 1973).
+
+    The eigenvectors of the many equal eigenvalues of a singular matrix have no derivative, nor has its factor.
+    """
+    inverse, outside = _pseudo_inverse(*primals)
+    changed = (tangents[0] + tangents[0].T) / 2
+    turned = inverse @ changed @ outside
+    spread = inverse @ turned
+    return (inverse, outside), (spread + spread.T - inverse @ changed @ inverse, -(turned + turned.T))
+
+
+def _by_eigenvectors(
     balanced: Float[Array, "c c"], tolerance: float
-) -> tuple[Float[Array, "c c"], Float[Array, "c c"], Int[Array, ""]]:
-    """The inverse along directions that are determined, the others as columns (zero elsewhere), and their number."""
+) -> tuple[Float[Array, "c c"], Float[Array, "c c"]]:
     values, vectors = jnp.linalg.eigh(balanced)
     kept = values > tolerance
     inverse = (vectors * jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)) @ vectors.T
-    return inverse, vectors * jnp.where(kept, 0.0, 1.0), jnp.sum(~kept)
+    return inverse, (vectors * jnp.where(kept, 0.0, 1.0)) @ vectors.T
 
 
 def _hold(

@@ -174,6 +174,12 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`reweighted` by weights of another shape", with_pair(lambda p, s: p.points.reweighted(np.ones(3)))),
     ("`reweighted` by a text", with_pair(lambda p, s: p.points.reweighted("all"))),
     ("`gather` of one value a keyframe", lambda _: SCENE.pack()[2].gather(np.ones(3))),
+    ("`slide` of a window where a solve failed", with_pair(lambda p, s: vg.slide(p, not_finite(s), p, s))),
+    (
+        "`slide` to a window of fewer keyframes",
+        with_pair(lambda p, s: vg.slide(p, s, *vg.simulate_window(2).pack()[:2])),
+    ),
+    ("`within`: a keyframe twice", lambda _: SCENE.observations.within([0, 0])),
     ("`reorder`: a keyframe twice", lambda _: vg.reorder(vg.no_prior(3), [0, 0, 1])),
     ("`solve_batch` of one window", with_pair(vg.solve_batch)),
     ("`solve_batch`: two problems and one state", batched(lambda p, s: vg.solve_batch(p, jax.tree.map(ONLY_FIRST, s)))),

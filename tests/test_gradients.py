@@ -13,6 +13,7 @@ from scenes import Scene, make_scene
 from test_exact_hessian import prior_on
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
+from vggtgeo.bundle.batches import solve_batch
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose, factor_terms
@@ -138,6 +139,24 @@ def test_gradients_are_finite_differences(seed: int | None, both: Both, value_an
     if seed is not None:
         both = make_problem(make_scene(3, 5, 1, 2, noise=0.5, outliers=0.1, depth_error=0.05, seed=100 + seed))
     check_gradients(both, value_and_gradient)
+
+
+def test_energies_of_a_batch_have_the_derivatives_of_the_least_energy(both: Both) -> None:
+    # Proves the derivative of `Solution.energy` by each leaf, held poses and parameters too, of two problems in one
+    # program. Oracle: finite differences; nothing of it may be silently zero.
+    other = make_problem(make_scene(3, 5, 1, 2, noise=0.5, outliers=0.1, depth_error=0.05, seed=5))
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), both, other)
+    moving, static = eqx.partition(batch, eqx.is_inexact_array)
+
+    def total(moving: Both) -> jax.Array:
+        solutions = solve_batch(*eqx.combine(moving, static), solver=SOLVER, at_once=2)
+        return solutions.energy @ jnp.asarray([1.0, 2.0])
+
+    evaluate = jax.jit(jax.value_and_grad(total))
+    check_gradients(batch, lambda batch: evaluate(eqx.filter(batch, eqx.is_inexact_array)))
+    gradient = evaluate(moving)[1]
+    for name, (where, _) in LEAVES.items():
+        assert bool(jnp.all(jnp.any(where(gradient) != 0, axis=range(1, where(gradient).ndim)))), name
 
 
 @pytest.mark.slow  # a minute of compilation, and reverse mode is the transpose of this one

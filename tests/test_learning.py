@@ -20,7 +20,9 @@ from vggtgeo.learning import (
     compare,
     error_and_gradient,
     recorded_windows,
+    slid_error_and_gradient,
     stack,
+    stack_sequences,
     tracked_windows,
 )
 from vggtgeo.learning.network import LEAST
@@ -128,6 +130,30 @@ def test_the_gradient_is_that_of_the_error(batch: Batch) -> None:
     found = float(jnp.sum(gradient * direction))
     assert found == pytest.approx(by_differences, rel=1e-3), (found, by_differences)
     assert not np.asarray(gradient)[~np.asarray(window.present)].any()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("depth", [True, False])
+def test_the_gradient_through_slid_windows_is_that_of_the_error(depth: bool) -> None:
+    """The error at the end of three slid windows has the gradient of central differences, by the matches of each.
+    Without depth the unit is the first baseline. Oracle: the error.
+    """
+    sequence = vg.simulate("room", 120, 101, (160, 120), rate=10.0)
+    (long,) = tracked_windows(sequence, 1, keyframes=5, points=16, seed=1)
+    windows = stack_sequences([long], 3, depth=depth).select(0)
+    assert windows.truth.shape == (3, 3, 3)
+    rng = np.random.default_rng(0)
+    right = jnp.where(windows.right, 1.0, LEAST)
+    confidence = right * jnp.asarray(rng.uniform(0.3, 1.0, right.shape))
+    _, gradient = slid_error_and_gradient(windows, confidence)
+    for row in range(3):
+        along = np.zeros(right.shape)
+        along[row] = rng.normal(size=right.shape[1:]) * np.asarray(confidence[row])
+        errors = [jnp.log(slid_error_and_gradient(windows, confidence + h * along)[0]) for h in (1e-3, -1e-3)]
+        by_differences = float(errors[0] - errors[1]) / 2e-3
+        found = float(jnp.sum(gradient * along))
+        assert found == pytest.approx(by_differences, rel=1e-3, abs=1e-6), (row, found, by_differences)
+    assert not np.asarray(gradient)[~np.asarray(windows.present)].any()
 
 
 @pytest.mark.long

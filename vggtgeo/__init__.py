@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from vggtgeo.bundle.residuals import ResidualSizes as ResidualSizes
     from vggtgeo.bundle.residuals import residual_sizes as residual_sizes
     from vggtgeo.bundle.residuals import residuals_at as residuals_at
+    from vggtgeo.bundle.sliding import slide as slide
     from vggtgeo.bundle.solution import Solution as Solution
     from vggtgeo.bundle.solution import solve as solve
     from vggtgeo.bundle.solver_choice import choose_reduced_solver as choose_reduced_solver
@@ -177,6 +178,7 @@ _HOME = {
     "slam.settings.slam_settings": ("Roles", "SlamSettings"),
     "slam.trust.evidence": ("EvidenceRecorder",),
     "slam.trust.finding": ("Verdict",),
+    "bundle.sliding": ("slide",),
     "bundle.solution": ("Solution", "solve"),
     "bundle.solver_choice": ("choose_reduced_solver",),
     "solvers.adjoint": ("ArrowAdjoint",),

@@ -13,6 +13,8 @@ Cost: one linearisation, one symmetric eigenvalue problem of size `6 n + 4`.
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -64,7 +66,7 @@ def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: in
     )
 
 
-def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> MarginalPrior:
+def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -> MarginalPrior:
     """The prior over poses and camera that remains when keyframe `leaving` is taken out of the window.
 
     The problem must have a `marginal` term (`problem.with_term(no_prior(n))` to begin with). The result has the same
@@ -96,8 +98,13 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""]) -> Marg
     )
 
 
-def reorder(prior: MarginalPrior, order: np.ndarray) -> MarginalPrior:
+def reorder(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPrior:
     """The prior with keyframe `order[i]` in place i; -1 puts a keyframe there that it says nothing about.
+
+    order: int [n]. Pure; `prior` and `order` may be traced. A traced order has no values to check.
+
+    Raises:
+        InputError: an order that names a keyframe twice, or one that is not there.
 
     Example: the first of three keyframes has left, and a place is free at the end.
         >>> import numpy as np, vggtgeo as vg
@@ -106,26 +113,30 @@ def reorder(prior: MarginalPrior, order: np.ndarray) -> MarginalPrior:
 
     """
     check_kind("prior", prior, MarginalPrior, "a prior, such as `vggtgeo.marginalise` gives")
-    order, count = real_numbers("order", order), len(prior.poses.wxyz_xyz)
-    inside = order[order >= 0]
+    order = _order_of(order, len(prior.poses.wxyz_xyz))
+    known, tail = order >= 0, len(prior.intrinsics)
+    place = jnp.maximum(order, 0)
+    columns = (lie.TANGENT * place[:, None] + jnp.arange(lie.TANGENT)).reshape(-1)
+    by_pose = jnp.where(jnp.repeat(known, lie.TANGENT), prior.root[:, columns], 0.0)
+    identity = jnp.asarray([1.0, 0, 0, 0, 0, 0, 0], prior.root.dtype)
+    poses = jnp.where(known[:, None], prior.poses.wxyz_xyz[place], identity)
+    root = jnp.concatenate([by_pose, prior.root[:, prior.root.shape[1] - tail :]], 1)
+    return eqx.tree_at(lambda term: (term.root, term.poses.wxyz_xyz), prior, (root, poses))
+
+
+def _order_of(given: Any, count: int) -> Int[Array, " n"]:
+    traced = isinstance(given, jax.core.Tracer)
+    order = given if traced else real_numbers("order", given)
+    inside = np.zeros(0, int) if traced else order[order >= 0]
     if (
         order.dtype.kind not in "iu"
         or order.ndim != 1
         or len(np.unique(inside)) < len(inside)
-        or (order >= count).any()
+        or (inside >= count).any()
     ):
-        raise InputError(f"`order` is {order.tolist()}; it must have whole numbers below {count}, each once, or -1")
-    known, tail = order >= 0, len(prior.intrinsics)
-    columns = (lie.TANGENT * np.maximum(order, 0)[:, None] + np.arange(lie.TANGENT)).reshape(-1)
-    shared = prior.root.shape[1] - tail + np.arange(tail)
-    mask = np.concatenate([np.repeat(known, lie.TANGENT), np.ones(tail, bool)])
-    root = np.where(mask, np.asarray(prior.root)[:, np.concatenate([columns, shared])], 0.0)
-    identity = np.array([1.0, 0, 0, 0, 0, 0, 0])
-    poses = np.where(known[:, None], np.asarray(prior.poses.wxyz_xyz)[np.maximum(order, 0)], identity)
-    dtype = prior.root.dtype
-    return eqx.tree_at(
-        lambda term: (term.root, term.poses.wxyz_xyz), prior, (jnp.asarray(root, dtype), jnp.asarray(poses, dtype))
-    )
+        found = f"{order.dtype}{list(order.shape)}" if traced else order.tolist()
+        raise InputError(f"`order` is {found}; it must have whole numbers below {count}, each once, or -1")
+    return jnp.asarray(order)
 
 
 def _linearisation_point(prior: MarginalPrior, state: State) -> State:
@@ -141,14 +152,14 @@ def _linearisation_point(prior: MarginalPrior, state: State) -> State:
     )
 
 
-def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""]) -> _Quadratic:
+def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""] | int) -> _Quadratic:
     """Hessian and gradient of the leaving terms over the dense coordinates, landmarks eliminated."""
     leaving_terms = tuple(_leaving(term, problem, leaving) for term in problem.terms)
     reduced = reduce(linearise(prepared(problem.with_terms(leaving_terms)), point))
     return reduced.hessian - reduced.schur, reduced.gradient - reduced.schur_gradient
 
 
-def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""]) -> AbstractTerm:
+def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int) -> AbstractTerm:
     """The part of a term that goes with a keyframe; what is about the camera alone stays in the problem."""
     goes: Array
     if isinstance(term, EdgeTerm):
@@ -180,11 +191,14 @@ def _eliminate(
     return (remaining + remaining.T) / 2, gradient
 
 
+@jax.custom_jvp
 def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) -> _Quadratic:
-    """`R, r0` with `R' R = H` and `R' r0 = g` on the part of the space where `H` is positive."""
-    # Metres, radians and pixels differ by orders of magnitude: balance before cutting off what is rounding error.
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(quadratic), 0.0))
-    safe = jnp.where(scale > 0, scale, 1.0)
+    """`R, r0` with `R' R = H` and `R' r0 = g` on the part of the space where `H` is positive.
+
+    Only up to a rotation from the left, which no use of a prior sees; the derivative is one of those that satisfy both
+    equations, for changes of `H` that keep its rank.
+    """
+    safe = _balance(quadratic)
     values, vectors = jnp.linalg.eigh(quadratic / safe[:, None] / safe[None, :])
     floor = len(values) * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), initial=0.0)
     kept = values > 100 * floor
@@ -192,6 +206,36 @@ def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) ->
     root = jnp.where(kept[:, None], roots[:, None] * vectors.T * safe[None, :], 0.0)
     offset = jnp.where(kept, (vectors.T @ (gradient / safe)) / roots, 0.0)
     return root, offset
+
+
+@square_root.defjvp
+def _square_root_derivative(primals: _Quadratic, tangents: _Quadratic) -> tuple[_Quadratic, _Quadratic]:
+    """With a right inverse `Q` of the kept rows, `R Q = I`:
+
+        dR = Q' dH (I - Q R / 2),     dr0 = Q' (dg - dR' r0).
+
+    Hence `dR' R + R' dR = dH`, but for the part of `dH` that would raise the rank. Eigenvectors are never
+    differentiated: those of equal eigenvalues, as of the many zeros of a prior, have no derivative.
+    """
+    root, offset = square_root(*primals)
+    inverse = _right_inverse(root, _balance(primals[0]))
+    changed, pulled = tangents
+    bent = inverse.T @ (changed + changed.T) / 2
+    by_root = bent - bent @ inverse @ root / 2
+    return (root, offset), (by_root, inverse.T @ (pulled - by_root.T @ offset))
+
+
+def _balance(quadratic: Float[Array, "c c"]) -> Float[Array, " c"]:
+    """Metres, radians and pixels differ by orders of magnitude: a unit for each, before rounding error is cut off."""
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(quadratic), 0.0))
+    return jax.lax.stop_gradient(jnp.where(scale > 0, scale, 1.0))
+
+
+def _right_inverse(root: Float[Array, "c c"], unit: Float[Array, " c"]) -> Float[Array, "c c"]:
+    """`Q = D^-2 R' (R D^-2 R')^-1` of the rows that are not zero, zero columns for the others."""
+    rows = root / unit
+    empty = jnp.diag(jnp.all(root == 0, 1).astype(root.dtype))
+    return jnp.linalg.solve(rows @ rows.T + empty, rows / unit).T
 
 
 def _marginal_term(problem: Problem) -> MarginalPrior:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,8 @@ import jax
 import numpy as np
 
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import real_numbers
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,53 @@ class Observations:
         rows = {"landmark": self.host, "edge": self.edges, "point": self.point_edge, "line sample": self.line_edge}
         named = ", ".join(f"{len(given)} {name}{'s' * (len(given) != 1)}" for name, given in rows.items())
         return f"Observations({named}, {'no ' * (self.depth_mean is None)}depth prior)"
+
+    def within(self, keyframes: Sequence[int] | np.ndarray) -> Observations:
+        """What some keyframes see of each other: the observations of a window, its keyframes numbered from 0.
+
+        Args:
+            keyframes: int [k], each once; place i of the window holds `keyframes[i]`.
+
+        Raises:
+            InputError: they are no whole numbers, or one is there twice.
+
+        Example:
+            >>> import vggtgeo as vg
+            >>> vg.simulate_window(keyframes=4, points=10, lines=0).observations.within([1, 2, 3])
+            Observations(30 landmarks, 6 edges, 60 points, 0 line samples, depth prior)
+
+        """
+        chosen = real_numbers("keyframes", keyframes)
+        if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or len(np.unique(chosen)) < len(chosen):
+            raise InputError(f"`keyframes` is {chosen.tolist()!r:.60}; it must be a list of whole numbers, each once")
+        ends, host = np.asarray(self.edges), np.asarray(self.host)
+        inside = np.all(np.isin(ends, chosen), axis=1)
+        hosted = np.isin(host, chosen)
+        place = np.zeros(1 + max(chosen.max(initial=0), ends.max(initial=0), host.max(initial=0)), int)
+        place[chosen] = np.arange(len(chosen))
+        edge, landmark = np.cumsum(inside) - 1, np.cumsum(hosted) - 1
+        points, lines = inside[np.asarray(self.point_edge, int)], inside[np.asarray(self.line_edge, int)]
+        of_landmarks = ("pixel", "depth_mean", "depth_sigma", "depth_weight", "segment")
+        chosen_of = {
+            **dict.fromkeys(of_landmarks, hosted),
+            **dict.fromkeys(("point_target", "point_weight"), points),
+            **dict.fromkeys(("line_coefficients", "line_weight"), lines),
+        }
+        kept = {
+            name: np.asarray(value)[rows]
+            for name, rows in chosen_of.items()
+            if (value := getattr(self, name)) is not None
+        }
+        return dataclasses.replace(
+            self,
+            edges=place[ends[inside]],
+            host=place[host[hosted]],
+            point_edge=edge[np.asarray(self.point_edge, int)[points]],
+            point_landmark=landmark[np.asarray(self.point_landmark, int)[points]],
+            line_edge=edge[np.asarray(self.line_edge, int)[lines]],
+            line_landmark=landmark[np.asarray(self.line_landmark, int)[lines]],
+            **kept,
+        )
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, overload
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -117,9 +118,16 @@ class SlotIndex:
     def __repr__(self) -> str:
         return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
 
-    def gather(self, per_slot: np.ndarray | Array) -> np.ndarray:
-        """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`; InputError for one of another shape."""
-        found = np.asarray(per_slot)
+    @overload
+    def gather(self, per_slot: np.ndarray) -> np.ndarray: ...
+    @overload
+    def gather(self, per_slot: Array) -> Any: ...
+    def gather(self, per_slot: np.ndarray | Array) -> Any:
+        """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`; InputError for one of another shape.
+
+        NumPy; under `jit`, `vmap` and `grad`, where `per_slot` is traced, an array of JAX.
+        """
+        found = _values(per_slot)
         keyframes, _, slots = self.shape
         if found.ndim < 2 or (any(self.shape) and found.shape[:2] != (keyframes, slots)):
             raise InputError(
@@ -128,11 +136,15 @@ class SlotIndex:
             )
         return found[self.host, self.slot]
 
-    def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> np.ndarray:
+    @overload
+    def gather_points(self, per_match: np.ndarray, observations: Observations) -> np.ndarray: ...
+    @overload
+    def gather_points(self, per_match: Array, observations: Observations) -> Any: ...
+    def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> Any:
         """Values of the point matches, `[A, ...]`, as `observations` lists them, from an array `[e, p, ...]`;
-        InputError for one of another shape.
+        InputError for one of another shape. Works under `jit` like `gather`.
         """
-        found = np.asarray(per_match)
+        found = _values(per_match)
         _, edges, slots = self.shape
         if found.ndim < 2 or (any(self.shape) and (found.shape[0] != edges or found.shape[1] > slots)):
             raise InputError(
@@ -207,6 +219,11 @@ def _scattered(values: ArrayLike, into: ArrayLike, where: tuple[np.ndarray, np.n
             "in the order in which they were given to `pack`"
         )
     return whole.at[where].set(given.astype(whole.dtype), unique_indices=True)
+
+
+def _values(given: Any) -> Any:
+    """A NumPy array, or one that is traced as it is."""
+    return given if isinstance(given, jax.core.Tracer) else np.asarray(given)
 
 
 class Slots(NamedTuple):

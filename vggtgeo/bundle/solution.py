@@ -43,7 +43,7 @@ class Solution(Readable):
 
     state: State
     energy: Float[Array, ""]
-    """`1/2 sum rho` at `state`."""
+    """`1/2 sum rho` at `state`, and differentiable like it."""
     history: Float[Array, " h"]
     """Energy after each iteration, from the initial one; NaN beyond the last."""
     iterations: Int[Array, ""]
@@ -111,7 +111,8 @@ def solve(
 
     Pure: works under `jax.jit`, `jax.vmap`, `jax.grad` and `jax.jvp`. Derivatives of `Solution.state` with respect to
     every float leaf of `problem`, and to the held coordinates of `initial`, are those of the optimum (implicit function
-    theorem, exact Hessian); energy, history and counts carry none. Nothing throws: see `Solution.termination`.
+    theorem, exact Hessian), and those of `Solution.energy` those of the least energy. History, record and counts carry
+    none. Nothing throws: see `Solution.termination`.
 
     Args:
         problem: observations and priors, `vggtgeo.pack` makes one from flat lists.
@@ -185,7 +186,7 @@ def _solve_jit(
     last = eqx.combine(last, found.state)
     return Solution(
         state=found.value,
-        energy=last.energy,
+        energy=_energy_at(last.energy, BundleAdjustment(problem), found.value),
         history=last.history,
         iterations=last.iterations,
         linearisations=last.linearisations,
@@ -196,6 +197,29 @@ def _solve_jit(
         at_bound=_at_bound(problem, jax.lax.stop_gradient(found.value)),
         record=last.record,
     )
+
+
+@eqx.filter_custom_jvp
+def _energy_at(energy: Float[Array, ""], problem: BundleAdjustment, state: State) -> Float[Array, ""]:
+    """`energy`, which the iteration knows, with its derivative by the problem and the state."""
+    del problem, state
+    return energy
+
+
+@_energy_at.def_jvp
+def _energy_derivative(primals: Any, tangents: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """At an optimum the part by the state vanishes, but for what is held; near it, it takes the first error away."""
+    _, *at = primals
+    _, *moved = tangents
+    absent = jax.tree.map(lambda leaf: leaf is None, moved, is_leaf=lambda leaf: leaf is None)
+    fixed, moving = eqx.partition(at, absent, is_leaf=lambda leaf: leaf is None)
+
+    def energy(moving: Any) -> Float[Array, ""]:
+        problem, state = eqx.combine(moving, fixed)
+        found: Float[Array, ""] = problem.energy(state)
+        return found
+
+    return jax.jvp(energy, (moving,), (moved,))
 
 
 def solution_like(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:

@@ -6,6 +6,9 @@ An example of research on top of `vggtgeo.solve`; nothing else of the package us
 
 from vggtgeo.learning.network import ConfidenceNetwork as ConfidenceNetwork
 from vggtgeo.learning.recorded_windows import recorded_windows as recorded_windows
+from vggtgeo.learning.slid_windows import cut as cut
+from vggtgeo.learning.slid_windows import slid_error_and_gradient as slid_error_and_gradient
+from vggtgeo.learning.slid_windows import stack_sequences as stack_sequences
 from vggtgeo.learning.tracked_windows import TrackedWindow as TrackedWindow
 from vggtgeo.learning.tracked_windows import tracked_windows as tracked_windows
 from vggtgeo.learning.training import Batch as Batch

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.packing import pack
-from vggtgeo.bundle.padding import PaddedSize
+from vggtgeo.bundle.padding import GivenTerm, PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.learning.network import LEAST, ConfidenceNetwork
@@ -60,19 +60,25 @@ class PoseErrors(NamedTuple):
         return {name: 1e3 * float(jnp.exp(jnp.mean(jnp.log(getattr(self, name))))) for name in self._fields}
 
 
-def stack(windows: Sequence[TrackedWindow]) -> Batch:
-    """Pack `windows` into one padded shape: that of the largest."""
+Judge = Callable[[Batch, Array], tuple[Array, Array]]
+"""Error and gradient of one member of a batch under the confidence of its matches."""
+
+
+def stack(windows: Sequence[TrackedWindow], terms: Sequence[Sequence[GivenTerm]] | None = None) -> Batch:
+    """Pack `windows` into one padded shape: that of the largest. terms: what else is known in each."""
     keyframes = len(windows[0].poses)
     points = max(int(np.bincount(window.observations.host).max()) for window in windows)
     size = PaddedSize(keyframes, points, 0, keyframes - 1, keyframes * (keyframes - 1))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(_packed(window, size) for window in windows))
+    terms = [()] * len(windows) if terms is None else terms
+    packed = [_packed(window, size, own) for window, own in zip(windows, terms, strict=True)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *packed)
 
 
-def _packed(window: TrackedWindow, size: PaddedSize) -> Batch:
+def _packed(window: TrackedWindow, size: PaddedSize, terms: Sequence[GivenTerm]) -> Batch:
     seen = window.observations
     assert seen.depth_mean is not None
     guess = (window.start, window.intrinsics, seen.depth_mean)
-    problem, initial, index = pack(seen, *guess, size=size, fixed_intrinsics=True)
+    problem, initial, index = pack(seen, *guess, size=size, fixed_intrinsics=True, terms=terms)
 
     def per_match(values: np.ndarray) -> Array:
         array = np.zeros((*problem.points.weight.shape, *values.shape[1:]), values.dtype)
@@ -102,22 +108,32 @@ def error_and_gradient(window: Batch, confidence: Float[Array, "e p"]) -> tuple[
 
     """
 
-    def log_error(confidence: Array) -> Array:
+    def loss(confidence: Array) -> Array:
         weight = jnp.where(window.present, GAIN * confidence, 0.0)
         problem = eqx.tree_at(lambda p: p.points.weight, window.problem, weight)
         solution = solve(problem, window.initial)
-        off = solution.state.poses.inverse().translation() - window.truth
-        error = jnp.log(jnp.sum(off[1:] ** 2) / (len(window.truth) - 1) + _SMALLEST**2) / 2
+        error = log_error(solution.state.poses.inverse().translation()[1:], window.truth[1:])
         # A solve that stayed at its start, for a weight that is no number, must not count as an error.
         usable = jnp.isfinite(solution.energy) & jnp.isfinite(weight).all()
         return jnp.where(usable, error, jnp.nan)
 
-    error, gradient = jax.value_and_grad(log_error)(confidence)
+    error, gradient = jax.value_and_grad(loss)(confidence)
     return jnp.exp(error), gradient
 
 
+def log_error(centres: Float[Array, "n 3"], truth: Float[Array, "n 3"]) -> Float[Array, ""]:
+    """Logarithm of the RMS distance of camera centres from the true ones, metres."""
+    return jnp.log(jnp.mean(jnp.sum((centres - truth) ** 2, 1)) + _SMALLEST**2) / 2
+
+
 def train(
-    batch: Batch, *, seed: int = 0, steps: int = 150, size: int = 8, rate: float = 1e-2
+    batch: Batch,
+    *,
+    seed: int = 0,
+    steps: int = 150,
+    size: int = 8,
+    rate: float = 1e-2,
+    judge: Judge = error_and_gradient,
 ) -> Iterator[tuple[ConfidenceNetwork, float]]:
     """Train a network on the windows of `batch` by Adam; yields it with its loss after every step.
 
@@ -127,6 +143,7 @@ def train(
         steps: of the optimiser.
         size: windows a step.
         rate: learning rate at the start; it falls to a tenth along a cosine.
+        judge: what is learned from; `slid_error_and_gradient` for batches of sequences.
 
     """
     import optax
@@ -146,22 +163,23 @@ def train(
     for _ in range(steps):
         rows = rng.choice(len(batch.truth), size, replace=False)
         confidence = _apply(network, batch.features[rows])
-        found = [error_and_gradient(batch.select(row), confidence[i]) for i, row in enumerate(rows)]
+        found = [judge(batch.select(row), confidence[i]) for i, row in enumerate(rows)]
         errors, gradients = (jnp.stack(part) for part in zip(*found, strict=True))
-        good = jnp.isfinite(gradients).all((1, 2), keepdims=True)
+        good = jnp.isfinite(gradients).all(range(1, gradients.ndim), keepdims=True)
         network, memory = improve(network, memory, batch.features[rows], jnp.where(good, gradients, 0.0) / size)
         yield network, float(jnp.mean(jnp.log(errors)))
 
 
-def compare(batch: Batch, network: Callable[[Array], Array]) -> PoseErrors:
-    """Pose errors on `batch` with a confidence of one, saliency, `network`, and what an oracle knows."""
+def compare(batch: Batch, network: Callable[[Array], Array], judge: Judge = error_and_gradient) -> PoseErrors:
+    """Pose errors on `batch` with a confidence of one, saliency, `network`, and what an oracle knows; `judge` as in
+    `train`.
+    """
     ones = jnp.ones_like(batch.saliency)
     oracle = jnp.where(batch.right, ones, LEAST)
     methods = (ones, batch.saliency, _apply(network, batch.features), oracle)
     windows = [batch.select(row) for row in range(len(batch.truth))]
     errors = [
-        jnp.stack([error_and_gradient(window, confidence[row])[0] for row, window in enumerate(windows)])
-        for confidence in methods
+        jnp.stack([judge(window, confidence[row])[0] for row, window in enumerate(windows)]) for confidence in methods
     ]
     return PoseErrors(*errors)
 

@@ -55,6 +55,7 @@ from vggtgeo.solvers.arrow import (
 from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
 from vggtgeo.solvers.landmark_basis import expand, join_landmarks
 from vggtgeo.solvers.local_inverse import balance
+from vggtgeo.solvers.symmetric_eigen import symmetric_eigen
 
 DENSE_KEYFRAMES = 300
 """Most keyframes whose spectra are computed whole: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
@@ -265,7 +266,7 @@ def _spectrum(reduced: Reduced, coordinates: _Coordinates) -> Spectra:
     balanced = jnp.where(both, (information + information.T) / 2, 0.0) / scale[:, None] / scale[None, :]
     # No free direction reaches the trace: so the held ones come last, and apart.
     beyond = 2 * len(scale)
-    values, vectors = jnp.linalg.eigh(balanced + jnp.diag(jnp.where(free, 0.0, beyond).astype(scale.dtype)))
+    values, vectors = symmetric_eigen(balanced + jnp.diag(jnp.where(free, 0.0, beyond).astype(scale.dtype)))
     held = jnp.arange(len(scale)) >= jnp.sum(free)
     along = jnp.einsum("gc,cd,gd->g", coordinates.common, information, coordinates.common)
     return Spectra(

@@ -1,0 +1,118 @@
+"""A step of a sliding window as a pure function of static shapes: with `solve` the body of a `lax.scan`.
+
+A window of `n` keyframes is solved; one keyframe leaves and is marginalised, the others move up, a new one takes the
+last place. What the new window observes is packed beforehand; what the old one found is carried over: the prior, the
+poses that stay, the cameras' parameters, and which poses are held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int
+
+from vggtgeo.bundle.marginalisation import marginalise, reorder
+from vggtgeo.bundle.pair_checks import check_pair
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.geometry import lie
+from vggtgeo.io.errors import InputError
+
+
+def slide(
+    problem: Problem,
+    state: State,
+    next_problem: Problem,
+    next_initial: State,
+    *,
+    leaving: Int[Array, ""] | int = 0,
+    constant_velocity: bool = False,
+) -> tuple[Problem, State]:
+    """Marginalise keyframe `leaving` of a solved window, and make the next window ready to be solved.
+
+    Pure, of static shapes and differentiable: the body of a `jax.lax.scan` together with `solve`, under `jit`, `vmap`
+    and `grad`. Keyframes of the next window: those that stay, in their order, and a new one in the last place.
+
+    Args:
+        problem: the window that was solved, `n >= 2` keyframes, with a `marginal` term (`no_prior(n)` in the first).
+        state: its solution.
+        next_problem: what the next window observes, of the same shapes. It gets the prior, and poses that are held stay
+            so; its own `fixed_pose` counts for the new keyframe alone.
+        next_initial: where it starts: of it come the inverse depths (1/m), the pixel offsets if there are any, and the new keyframe's pose (world ->
+            camera, the last). The other poses and the cameras' parameters are those of `state`.
+        leaving: which keyframe leaves; 0 is the oldest. May be traced.
+        constant_velocity: start the new pose where the motion between the last two keyframes of `state` leads, if it
+            went on; `next_initial` then counts for inverse depths alone.
+
+    Returns:
+        The next window's problem and initial state, as `solve` takes them.
+
+    Raises:
+        InputError: windows of different shapes or cameras, fewer than two keyframes, or a keyframe that is not there.
+        ValueError: `problem` has no `marginal` term.
+
+    Example:
+        >>> import jax, vggtgeo as vg
+        >>> long = vg.simulate_window(keyframes=4, points=8, lines=0)
+        >>> parts = [long.observations.within([k, k + 1, k + 2]) for k in (0, 1)]
+        >>> windows = [(seen, long.start[k : k + 3], long.intrinsics, seen.depth_mean) for k, seen in enumerate(parts)]
+        >>> (first, second), (start, guess) = (
+        ...     [jax.tree.map(lambda leaf: leaf[k], tree) for k in (0, 1)]
+        ...     for tree in vg.pack_batch(windows, terms=[vg.no_prior(3)], fixed_intrinsics=True)[:2]
+        ... )
+        >>> problem, initial = vg.slide(first, vg.solve(first, start).state, second, guess)
+        >>> bool(vg.solve(problem, initial).converged), problem.fixed_pose.tolist()
+        (True, [False, False, False])
+
+    """
+    check_pair(problem, state)
+    check_pair(next_problem, next_initial, "next_initial")
+    _check_alike(problem, next_problem)
+    staying = _staying(leaving, problem.num_keyframes)
+    prior = reorder(marginalise(problem, state, leaving), jnp.append(staying, -1))
+    poses = state.poses.wxyz_xyz
+    newest = _extrapolated(poses) if constant_velocity else next_initial.poses.wxyz_xyz[-1]
+    fixed = jnp.append(problem.fixed_pose[staying], next_problem.fixed_pose[-1])
+    return (
+        eqx.tree_at(lambda following: following.fixed_pose, next_problem.with_term(prior), fixed),
+        replace(
+            next_initial,
+            poses=jaxlie.SE3(jnp.concatenate([poses[staying], newest[None]])),
+            intrinsics=state.intrinsics,
+        ),
+    )
+
+
+def _staying(leaving: Any, keyframes: int) -> Int[Array, " m"]:
+    """Places of the keyframes that stay."""
+    place = jnp.arange(keyframes - 1)
+    return place + (place >= leaving)
+
+
+def _extrapolated(poses: Float[Array, "n 7"]) -> Float[Array, "7"]:
+    last = jaxlie.SE3(poses[-1])
+    moved = lie.relative(jaxlie.SE3(poses[-2]), last) @ last
+    return lie.cast(moved.normalize(), poses.dtype).wxyz_xyz
+
+
+def _check_alike(problem: Problem, following: Problem) -> None:
+    if problem.num_keyframes < 2:
+        raise InputError("`problem` has 1 keyframe; expected at least 2, one that leaves and one that stays")
+    if following.num_keyframes != problem.num_keyframes or following.fixed_intrinsics.shape != (
+        problem.fixed_intrinsics.shape
+    ):
+        found, wanted = (
+            f"{window.num_keyframes} keyframes and parameters of cameras of shape {window.fixed_intrinsics.shape}"
+            for window in (following, problem)
+        )
+        raise InputError(
+            f"`next_problem` has {found}, `problem` {wanted}; pack all windows to one shape with `vggtgeo.pack_batch`"
+        )
+    if following.camera is not problem.camera:
+        raise InputError(
+            f"`next_problem` has cameras of the kind `{following.camera.__name__}`, `problem` "
+            f"`{problem.camera.__name__}`; pack all windows with one `camera`"
+        )
