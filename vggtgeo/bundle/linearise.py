@@ -1,7 +1,7 @@
 """Normal equations, gradient and exact Hessian of any sum of terms, in the arrow's shape.
 
-One pass over the edges, sorted by host: every edge term gives columns `[6 + q + 2, m p]` (see `terms/edge.py`); their
-Gram matrix is kept in relative coordinates, and their products with the depth column are added into the host's cross
+One pass over the edges, sorted by row: every edge term gives columns `[6 + q + 2, m p]` (see `terms/edge.py`); their
+Gram matrix is kept in relative coordinates, and their products with the depth column are added into the row's cross
 terms in place. Slot terms lie on the diagonal of the landmarks, terms on poses and pairs become blocks, the camera's
 and the dense ones one small matrix (layout chosen by measurement on CPU, see `benchmarks/solver.py`).
 """
@@ -16,7 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.objective import cameras_of, edge_data, hosts_of, motions_of, of_edge, relative_poses, view_of
+from vggtgeo.bundle.objective import (
+    Place,
+    cameras_of,
+    edge_data,
+    hosts_of,
+    motions_of,
+    of_edge,
+    places,
+    relative_poses,
+    view_of,
+)
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, times_depth_column
 from vggtgeo.bundle.terms.node import PairTerm, node_models
@@ -39,19 +49,19 @@ def linearise(
     wide = lie.TANGENT * degree
 
     def body(cross: Array, edge: Any) -> tuple[Array, Array]:
-        ends, index, motion, data = edge
-        host = ends[0]
-        seen = of_edge(problem, view_of(cameras, hosts, ends, motion), data)
+        place, index, motion, data = edge
+        row = place.row
+        seen = of_edge(problem, view_of(cameras, hosts, place, motion), data)
         gram, coupled = (_exact if exact else _reweighted)(seen, correction, state.inverse_depth.shape[1])
-        zero = jnp.zeros_like(host)
-        cross = jax.lax.dynamic_update_slice(cross, coupled[None, : lie.TANGENT], (host, lie.TANGENT * index, zero))
+        zero = jnp.zeros_like(row)
+        cross = jax.lax.dynamic_update_slice(cross, coupled[None, : lie.TANGENT], (row, lie.TANGENT * index, zero))
         tail = coupled[None, lie.TANGENT :]
-        shared = jax.lax.dynamic_slice(cross, (host, zero + wide, zero), (1, *tail.shape[1:]))
-        return jax.lax.dynamic_update_slice(cross, shared + tail, (host, zero + wide, zero)), gram
+        shared = jax.lax.dynamic_slice(cross, (row, zero + wide, zero), (1, *tail.shape[1:]))
+        return jax.lax.dynamic_update_slice(cross, shared + tail, (row, zero + wide, zero)), gram
 
     cross = _slot_terms(problem, state, wide, correction, exact)
     if problem.edge_terms:
-        edges = (problem.edges.ends, problem.edges.index_at_host, motions_of(relative), edge_data(problem))
+        edges = (places(problem), problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         cross, gram = jax.lax.scan(body, cross, edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
@@ -59,7 +69,7 @@ def linearise(
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     held = _held(problem, state, cross[:, -2])
     system = ArrowSystem(
-        graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host),
+        graph=EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host, problem.host),
         source_adjoint=lie.adjoint(relative),
         gram=gram,
         cross=cross,
@@ -93,20 +103,20 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     if not problem.edge_terms:
         return ArrowVector(dense, landmarks)
 
-    def edge(ends: tuple[Array, Array], motion: Any, data: Any) -> tuple[Array, Array]:
+    def edge(place: Place, motion: Any, data: Any) -> tuple[Array, Array]:
         local, slots = jnp.zeros(lie.TANGENT + problem.num_parameters, landmarks.dtype), jnp.zeros_like(landmarks[0])
-        for term, seen in of_edge(problem, view_of(cameras, hosts, ends, motion), data):
+        for term, seen in of_edge(problem, view_of(cameras, hosts, place, motion), data):
             by_shared, by_depth = term.gradient(seen)
             local += by_shared
             slots = slots.at[term.first_slot : term.first_slot + len(by_depth)].add(by_depth)
         return local, slots
 
-    local, by_depth = jax.vmap(edge)(problem.edges.ends, motions_of(relative), edge_data(problem))
+    local, by_depth = jax.vmap(edge)(places(problem), motions_of(relative), edge_data(problem))
     eta = local[:, : lie.TANGENT]
     nodes = jnp.zeros((problem.num_keyframes, lie.TANGENT), local.dtype).at[problem.edges.target].add(eta)
     nodes = nodes.at[problem.edges.source].add(-jnp.einsum("eba,eb->ea", lie.adjoint(relative), eta))
     dense += jnp.concatenate([nodes.reshape(-1), local[:, lie.TANGENT :].sum(0)])
-    return ArrowVector(dense, landmarks.at[problem.edges.source].add(by_depth))
+    return ArrowVector(dense, landmarks.at[problem.edges.row].add(by_depth))
 
 
 def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
@@ -179,17 +189,17 @@ def _placed(seen: Seen, parts: list[Float[Array, "r _"]], slots: int) -> Float[A
 
 def _slot_terms(
     problem: Problem, state: State, wide: int, correction: Float[Array, ""] | None, exact: bool
-) -> Float[Array, "n r s"]:
+) -> Float[Array, "h r s"]:
     """Cross terms before any edge: gradient and curvature of the terms on landmarks in the last two rows."""
-    keyframes, slots = state.inverse_depth.shape
-    cross = jnp.zeros((keyframes, wide + problem.num_parameters + 2, slots), state.inverse_depth.dtype)
+    rows, slots = state.inverse_depth.shape
+    cross = jnp.zeros((rows, wide + problem.num_parameters + 2, slots), state.inverse_depth.dtype)
     for term in problem.slot_terms:
         gradient, curvature = term.derivatives(state.inverse_depth, correction, exact)
         cross = cross.at[:, -2].add(gradient).at[:, -1].add(curvature)
     return cross
 
 
-def _held(problem: Problem, state: State, gradient: Float[Array, "n s"]) -> Bool[Array, "n s"] | None:
+def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool[Array, "h s"] | None:
     """Landmarks on their bound that the energy presses against it; those of segments move as a whole and never are."""
     if not problem.positive_depth:
         return None

@@ -152,7 +152,7 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""]) -> A
     if isinstance(term, EdgeTerm):
         goes = (problem.edges.source == leaving)[:, None]
     elif isinstance(term, SlotTerm):
-        goes = (jnp.arange(problem.num_keyframes) == leaving)[:, None]
+        goes = (problem.host_of_row == leaving)[:, None]
     elif isinstance(term, PoseTerm):
         goes = term.keyframe == leaving
     elif isinstance(term, PairTerm):

@@ -1,7 +1,9 @@
 """The bundle-adjustment problem: a state, a graph, and a sum of terms. All shapes are static, absence is weight 0.
 
-Sizes: `n` keyframes, `s` inverse depths ("slots") a keyframe, `e` directed edges `(i, j)`: slots of keyframe i observed
-in keyframe j, `q` parameters of the camera that all keyframes share, or of all `g` cameras, `k` each.
+Sizes: `n` keyframes, `h` rows of `s` inverse depths ("slots"), `e` directed edges `(i, j)`: slots of a row of keyframe
+i observed in keyframe j. A keyframe has one row, so `h = n`; one that hosts far more landmarks than others has several
+(`Problem.host`), so that arrays are not padded to the richest. `q` parameters of the camera that all keyframes share,
+or of all `g` cameras, `k` each.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
@@ -45,7 +48,7 @@ class State(eqx.Module):
     intrinsics: Float[Array, "*g k"]
     """Parameters of the camera, `fx, fy, cx, cy` in pixels, then those of its distortion: `[k]`, or `[g, k]` of `g`
     cameras."""
-    inverse_depth: Float[Array, "n s"]
+    inverse_depth: Float[Array, "h s"]
     """1/m, along the optical axis of the host keyframe, one a slot."""
 
     @property
@@ -57,9 +60,9 @@ class State(eqx.Module):
         """The state that a step leads to, in the coordinates of every Hessian and covariance of this package.
 
         step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), the cameras' parameters (pixels), then the
-        inverse depths (1/m), keyframe by keyframe. Pure; the derivative at a zero step is the tangent map.
+        inverse depths (1/m), row by row. Pure; the derivative at a zero step is the tangent map.
         """
-        poses = lie.TANGENT * len(self.inverse_depth)
+        poses = lie.TANGENT * len(self.poses.wxyz_xyz)
         dense = poses + self.intrinsics.size
         return State(
             lie.move(self.poses, step[:poses].reshape(-1, lie.TANGENT)),
@@ -69,16 +72,23 @@ class State(eqx.Module):
 
 
 class Edges(eqx.Module):
-    """The covisibility graph: directed edges sorted by host keyframe."""
+    """The covisibility graph: directed edges sorted by host keyframe, and by the row of its landmarks."""
 
     source: Int[Array, " e"]
     """Host keyframe i, ascending."""
     target: Int[Array, " e"]
     """Keyframe j in which the slots of i are observed."""
     index_at_host: Int[Array, " e"]
-    """Position of the edge among the edges of its host, from 0."""
-    of_host: Int[Array, "n k"]
-    """The edges of each host, in their order, and `e` where it has fewer than `k`: the inverse of `index_at_host`."""
+    """Position of the edge among the edges of its row, from 0."""
+    of_host: Int[Array, "h k"]
+    """The edges of each row, in their order, and `e` where it has fewer than `k`: the inverse of `index_at_host`."""
+    row_of: Int[Array, " e"] | None = None
+    """Row of landmarks that each edge observes, ascending; None: that of its host's number."""
+
+    @property
+    def row(self) -> Int[Array, " e"]:
+        """Row of landmarks that each edge observes."""
+        return self.source if self.row_of is None else self.row_of
 
     @property
     def ends(self) -> tuple[Int[Array, " e"], Int[Array, " e"]]:
@@ -105,8 +115,8 @@ class Problem(eqx.Module):
 
     """
 
-    pixels: Float[Array, "n s 2"]
-    """Where slot s of keyframe i looks: point slots first, then line samples."""
+    pixels: Float[Array, "h s 2"]
+    """Where each slot looks in its host keyframe: point slots first, then line samples."""
     edges: Edges
     terms: tuple[AbstractTerm, ...]
     """What is minimised: the sum of their energies."""
@@ -114,7 +124,7 @@ class Problem(eqx.Module):
     """Keyframes whose pose is held (the gauge)."""
     fixed_intrinsics: Bool[Array, "*g k"]
     """Parameters of the cameras that are held."""
-    fraction: Float[Array, "n g m"] | None = None
+    fraction: Float[Array, "h g m"] | None = None
     """Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a segment is an
     affine function of this position along it (0 and 1 at its ends). None: each sample has its own inverse depth."""
     camera_of: Int[Array, " n"] | None = None
@@ -123,6 +133,8 @@ class Problem(eqx.Module):
     """Model of the cameras whose parameters the state holds."""
     positive_depth: bool = eqx.field(static=True, default=True)
     """Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver without bounds."""
+    host: Int[Array, " h"] | None = None
+    """Keyframe that hosts each row of landmarks, ascending; None: row i is that of keyframe i."""
 
     def __getattr__(self, name: str) -> Any:
         for term in vars(self).get("terms", ()):
@@ -194,7 +206,12 @@ class Problem(eqx.Module):
 
     @property
     def num_keyframes(self) -> int:
-        return self.pixels.shape[0]
+        return len(self.fixed_pose)
+
+    @property
+    def host_of_row(self) -> Int[Array, " h"]:
+        """Keyframe that hosts each row of landmarks."""
+        return jnp.arange(self.num_keyframes) if self.host is None else self.host
 
     @property
     def num_parameters(self) -> int:

@@ -10,11 +10,13 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.bundle.objective import (
     EdgeData,
     Motions,
+    Place,
     cameras_of,
     edge_data,
     hosts_of,
     motions_of,
     of_edge,
+    places,
     prepared,
     relative_poses,
     view_of,
@@ -101,7 +103,7 @@ def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."
     """Every residual of `problem` at `state`, before weights and kernel, by the name of its term.
 
     The axes of the term's `weight` come first, then the entries of a residual where it has more than one: points
-    `[e, p, 2]`, lines `[e, l]`, depth `[n, s]`. Any finite number where an observation is absent. Pure: works under
+    `[e, p, 2]`, lines `[e, l]`, depth `[h, s]`. Any finite number where an observation is absent. Pure: works under
     `jit` and `vmap`.
 
     Example:
@@ -143,13 +145,13 @@ def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[
     if not alone.edge_terms:
         return jnp.zeros((1, *term.weight.shape), state.inverse_depth.dtype)
 
-    def edge(ends: tuple[Array, Array], motion: Motions, data: EdgeData) -> Array:
-        ((one, view),) = of_edge(alone, view_of(cameras, hosts, ends, motion), data)
+    def edge(place: Place, motion: Motions, data: EdgeData) -> Array:
+        ((one, view),) = of_edge(alone, view_of(cameras, hosts, place, motion), data)
         assert isinstance(one, EdgeTerm)
         return one.residuals(view)
 
     each = jax.vmap(edge, out_axes=1)
-    return each(problem.edges.ends, motions_of(relative_poses(problem, state)), edge_data(alone))
+    return each(places(problem), motions_of(relative_poses(problem, state)), edge_data(alone))
 
 
 def count_rows(problem: Problem, term: AbstractTerm, state: State) -> Int[Array, ""]:

@@ -59,10 +59,11 @@ class Covariances(Readable):
     """Of the left tangent `log(T T_true^-1)`, translation first: m^2, m rad, rad^2, in the camera's own frame."""
     intrinsics: Float[Array, "q q"]
     """Of the parameters of all cameras, `Problem.parameter_names`: pixels^2 (distortion: no unit)."""
-    inverse_depth: Float[Array, "h s"]
-    """Variances, 1/m^2; infinite for slots that hold nothing."""
-    neighbours: Float[Array, "h k 6 6"]
-    """Of each pose (rows) with that of the keyframe at the other end of each edge that leaves it, `edges.of_host`."""
+    inverse_depth: Float[Array, "r s"]
+    """Variances, 1/m^2; infinite for slots that hold nothing. Of the rows of these keyframes (`Problem.host`): `r = h`
+    unless one has several."""
+    neighbours: Float[Array, "r k 6 6"]
+    """Of the pose that hosts each row with that at the other end of each edge of the row, `edges.of_host`."""
     variance_factor: Float[Array, ""]
     """Estimated variance of a residual of weight 1: `2 energy / (rows - unknowns)`, 1 without redundancy. About 1 if
     the weights are right; 4 to 7 % low under Huber with delta 1.5, which caps large residuals."""
@@ -145,9 +146,27 @@ def covariances(
     expected = "what `vggtgeo.choose_reduced_solver` gives"
     check_kind("reduced_solver", reduced_solver, AbstractReducedSolver | None, expected)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
-    asked = jnp.arange(problem.num_keyframes) if keyframes is None else _numbers_of(keyframes, problem.num_keyframes)
-    _check_size(solver, problem.num_keyframes, len(asked))
-    return _covariances_jit(problem, state, solver, asked)
+    rows, first = _rows(problem, keyframes)
+    _check_size(solver, problem.num_keyframes, len(rows))
+    return _covariances_jit(problem, state, solver, rows, first)
+
+
+def _rows(problem: Problem, keyframes: Any) -> tuple[Int[Array, " r"], Int[Array, " h"] | None]:
+    """The rows of landmarks of the keyframes asked for, and which of them is the first of each keyframe; None: all."""
+    asked = None if keyframes is None else _numbers_of(keyframes, problem.num_keyframes)
+    if problem.host is None:
+        return jnp.arange(problem.num_keyframes) if asked is None else asked, None
+    if asked is None:
+        return jnp.arange(len(problem.host)), jnp.searchsorted(problem.host, jnp.arange(problem.num_keyframes))
+    if isinstance(problem.host, jax.core.Tracer) or isinstance(asked, jax.core.Tracer):
+        raise InputError(
+            "`keyframes` of a problem in which one has several rows of landmarks; expected arrays with values: call "
+            "`covariances` outside `jit`, ask for all, or give `pack` a `size`"
+        )
+    with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
+        each = [np.flatnonzero(np.asarray(problem.host) == keyframe) for keyframe in np.asarray(asked)]
+    first = np.cumsum([0, *(len(own) for own in each[:-1])])
+    return jnp.asarray(np.concatenate(each)), jnp.asarray(first)
 
 
 def _numbers_of(keyframes: Any, count: int) -> Int[Array, " h"]:
@@ -165,12 +184,16 @@ def _numbers_of(keyframes: Any, count: int) -> Int[Array, " h"]:
 
 @eqx.filter_jit  # one operation after the other, as outside `jit`, would be compiled one by one: for most of a minute
 def _covariances_jit(
-    problem: Problem, state: State, solver: AbstractReducedSolver, asked: Int[Array, " h"]
+    problem: Problem,
+    state: State,
+    solver: AbstractReducedSolver,
+    rows: Int[Array, " r"],
+    first: Int[Array, " h"] | None,
 ) -> Covariances:
     ready = prepared(problem)
-    found = covariance(linearise(ready, state), solver, asked)
+    found = covariance(linearise(ready, state), solver, rows)
     return Covariances(
-        poses=found.nodes,
+        poses=found.nodes if first is None else found.nodes[first],
         intrinsics=found.shared,
         inverse_depth=found.landmarks,
         neighbours=found.neighbours,

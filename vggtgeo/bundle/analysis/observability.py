@@ -246,14 +246,14 @@ def _along_all(
     return jnp.maximum(jnp.concatenate([common, single]), 0.0)
 
 
-def _used(problem: Problem) -> Bool[Array, "n s"]:
+def _used(problem: Problem) -> Bool[Array, "h s"]:
     """Slots that any term speaks of."""
     used = jnp.zeros(problem.pixels.shape[:2], bool)
     for slot in problem.slot_terms:
         used = used | slot.present()
     for term in problem.edge_terms:
         seen = _at_slots(term, used.shape[1])
-        used = used.at[problem.edges.source].max(seen)
+        used = used.at[problem.edges.row].max(seen)
     return used
 
 

@@ -16,14 +16,14 @@ class DepthPrior(SlotTerm):
     pixels. Its weight is `alpha * weight`.
 
     Example:
-        >>> problem.depth.mean.shape  # keyframes, slots
+        >>> problem.depth.mean.shape  # rows of landmarks (one a keyframe), slots
         (4, 32)
 
     """
 
-    mean: Float[Array, "n s"]
+    mean: Float[Array, "h s"]
     """1/m; any finite number where `weight` is 0."""
-    sigma: Float[Array, "n s"]
+    sigma: Float[Array, "h s"]
     """Standard deviation, 1/m, > 0 (1 where `weight` is 0)."""
     alpha: Float[Array, ""] = shared_field(converter=jnp.asarray, default=2.0)
     """Weight of all depth terms against the pixels' (the paper's alpha)."""
@@ -32,7 +32,7 @@ class DepthPrior(SlotTerm):
     unit = "sigma"
 
     @property
-    def weights(self) -> Float[Array, "n s"]:
+    def weights(self) -> Float[Array, "h s"]:
         return self.alpha * self.weight
 
     def residual(self, inverse_depth: Float[Array, ""]) -> Float[Array, ""]:

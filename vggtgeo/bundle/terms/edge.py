@@ -78,7 +78,7 @@ class LocalModel(NamedTuple):
 
 
 class EdgeTerm(AbstractTerm):
-    """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its host.
+    """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its row.
 
     Example: a landmark lies on a plane that is known in the target camera.
         >>> class PointToPlane(vg.EdgeTerm):
