@@ -44,6 +44,7 @@ from vggtgeo.bundle.padding import (
 )
 from vggtgeo.bundle.precision import check_precision, weight_of
 from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.resolution import check_resolution
 from vggtgeo.bundle.term_checks import check_terms
 from vggtgeo.bundle.term_padding import padded, placed
 from vggtgeo.bundle.terms.depth import DepthPrior
@@ -104,7 +105,8 @@ def pack(
             and lines, an observation between keyframes that its landmark is not hosted in, an inverse depth, focal
             length or standard deviation that is not positive, weights that are negative or NaN, lines that are not
             normalised, an edge twice or to itself, a kernel that is none, a size that is too small, or nothing that is
-            observed: all weights zero.
+            observed: all weights zero; or positions so far from the origin that this precision has no digits for most
+            of the matches.
 
     Example:
         >>> import vggtgeo as vg
@@ -128,6 +130,8 @@ def pack(
     warn_of_far(inverse_depth)
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
     check_terms(terms, observations, len(poses))
+    focal = np.atleast_2d(intrinsics)[np.zeros(len(poses), int) if camera_of is None else camera_of, 0]
+    check_resolution(observations, poses, focal, inverse_depth, dtype)
     guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
     check_precision({**vars(observations), **guess, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
     size, graph, host, index = _layout(observations, len(poses), size)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.objective import (
     EdgeData,
@@ -166,3 +166,15 @@ def _size(term: AbstractTerm, residual: Float[Array, "m *b"]) -> tuple[Float[Arr
     squared = jnp.sum(residual**2, 0)
     trusted = term.weights * term.kernel.weight(term.weights * squared)
     return jnp.sqrt(jnp.sum(trusted * squared) / jnp.sum(trusted)), jnp.sum(term.present())
+
+
+def used_slots(problem: Problem) -> Bool[Array, "h s"]:
+    """Slots that any term has an observation of."""
+    used = jnp.zeros(problem.pixels.shape[:2], bool)
+    for slot in problem.slot_terms:
+        used = used | slot.present()
+    for term in problem.edge_terms:
+        present = term.present()
+        after = used.shape[1] - term.first_slot - present.shape[1]
+        used = used.at[problem.edges.row].max(jnp.pad(present, ((0, 0), (term.first_slot, after))))
+    return used

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.analysis.redundancy import changing
+from vggtgeo.bundle.diagnosis import refuse_not_finite
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.observed import check_weights
@@ -32,6 +33,7 @@ from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import covariance
+from vggtgeo.solvers.finite import is_finite, unless
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600
@@ -41,17 +43,22 @@ ITERATIVE_KEYFRAMES = 32
 
 
 class Covariances(Readable):
-    """Marginal covariances at a solution; no entry is NaN.
+    """Marginal covariances at a solution, by the stated weights; they are not scaled by the variance factor.
 
     What nothing determines has infinite variance (and zero covariance with the rest); what is held has zero. Without
-    metric depth the scale is free: the covariances are then those of the solution with the scale held where it is.
+    metric depth the scale is free: the covariances are then those of the solution with the scale held where it is. All
+    are NaN only where the linearisation is not finite, which outside `jit` is an error.
+
+    They are as right as the weights. A variance factor far above 1 says that residuals are larger than the weights
+    state: wrong weights, wrong matches, or data that contradict each other or the poses that are held. `scaled()` gives
+    the covariances times that factor; the printed line has both.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.eval_shape(vg.covariances, problem, solution.state)
         >>> found.poses.shape, found.intrinsics.shape
         ((4, 6, 6), (4, 4))
         >>> vg.covariances(problem, solution.state)
-        Covariances(4 keyframes, centres known to 5.5 mm at worst, variance factor 0.27)
+        Covariances(4 keyframes, centres known to 5.5 mm at worst, 2.9 mm by the residuals, variance factor 0.27)
 
     """
 
@@ -101,10 +108,11 @@ class Covariances(Readable):
         blocks = np.asarray(self.poses, np.float64)[:, :3, :3]
         known = np.isfinite(blocks).all((1, 2))
         worst = 1e3 * float(np.sqrt(np.linalg.eigvalsh(blocks[known]).max(initial=0.0)))
+        factor = float(self.variance_factor)
         unknown = f", {int((~known).sum())} undetermined" if not known.all() else ""
         return (
-            f"Covariances({len(blocks)} keyframes, centres known to {worst:.1f} mm at worst{unknown}, variance factor "
-            f"{float(self.variance_factor):.2f})"
+            f"Covariances({len(blocks)} keyframes, centres known to {worst:.1f} mm at worst{unknown}, "
+            f"{worst * factor**0.5:.1f} mm by the residuals, variance factor {factor:.2f})"
         )
 
 
@@ -148,7 +156,9 @@ def covariances(
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
     rows, first = _rows(problem, keyframes)
     _check_size(solver, problem.num_keyframes, len(rows))
-    return _covariances_jit(problem, state, solver, rows, first)
+    found = _covariances_jit(problem, state, solver, rows, first)
+    refuse_not_finite(problem, state, jnp.isfinite(found.variance_factor))
+    return found
 
 
 def _rows(problem: Problem, keyframes: Any) -> tuple[Int[Array, " r"], Int[Array, " h"] | None]:
@@ -191,8 +201,9 @@ def _covariances_jit(
     first: Int[Array, " h"] | None,
 ) -> Covariances:
     ready = prepared(problem)
-    found = covariance(linearise(ready, state), solver, rows)
-    return Covariances(
+    system = linearise(ready, state)
+    found = covariance(system, solver, rows)
+    known = Covariances(
         poses=found.nodes if first is None else found.nodes[first],
         intrinsics=found.shared,
         inverse_depth=found.landmarks,
@@ -200,6 +211,7 @@ def _covariances_jit(
         variance_factor=variance_factor(ready, state, found.rank),
         parameters=problem.parameter_names,
     )
+    return unless(is_finite(system), known)
 
 
 def _check_size(solver: AbstractReducedSolver, keyframes: int, asked: int) -> None:

@@ -34,15 +34,17 @@ from jaxtyping import Array, Bool, Float
 from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
+from vggtgeo.bundle.diagnosis import refuse_not_finite
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.residuals import used_slots
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, Blocks, NodeFactors, Reduced, dense_gradient, reduce
 from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
+from vggtgeo.solvers.finite import is_finite, unless
 from vggtgeo.solvers.local_inverse import balance
 from vggtgeo.solvers.segments import join_segments
 
@@ -78,9 +80,12 @@ def observability(problem: Problem, state: State) -> Observability:
     check_finite(state)
     check_weights(problem)
     if problem.num_keyframes <= DENSE_KEYFRAMES:
-        return _observability_jit(problem, state)
+        found = _observability_jit(problem, state)
+        refuse_not_finite(problem, state, jnp.all(jnp.isfinite(found.landmark_information)))
+        return found
     _check_large(problem, state)
     systems, everything, coordinates = _linearise_jit(problem, state)
+    refuse_not_finite(problem, state, is_finite(everything))
     layout = sparse_layout(everything)
     blocks = (_blocks_jit(systems, keep, problem.fraction, layout) for keep in _selections(len(systems), state))
     found = [_sparse_spectrum(own, layout, coordinates) for own in blocks]
@@ -89,10 +94,11 @@ def observability(problem: Problem, state: State) -> Observability:
 
 @eqx.filter_jit
 def _observability_jit(problem: Problem, state: State) -> Observability:
-    systems, _, coordinates = _linearise_each(problem, state)
+    systems, everything, coordinates = _linearise_each(problem, state)
     combined = lambda keep: reduce(_combine(systems, keep, problem.fraction))
     spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), _selections(len(systems), state))
-    return _found(problem, state, systems, coordinates, spectra)
+    found = _found(problem, state, systems, coordinates, spectra)
+    return unless(is_finite(everything), found)
 
 
 def _selections(count: int, state: State) -> Float[Array, "m k"]:
@@ -115,7 +121,7 @@ def _found(
         common=balanced / jnp.where(size > 0, size, 1.0),
         free=coordinates.free,
         landmark_information=sum(system.landmark_hessian for system in systems) * state.inverse_depth**2,
-        landmark_used=_used(problem),
+        landmark_used=used_slots(problem),
         terms=tuple(term.name for term in problem.terms),
         keyframes=problem.num_keyframes,
         parameters=problem.parameter_names,
@@ -244,19 +250,3 @@ def _along_all(
     """`d' S d` of all named directions: a coordinate of a keyframe has its entry of the diagonal."""
     single = jnp.where(coordinates.free, diagonal, 0.0)[: coordinates.poses]
     return jnp.maximum(jnp.concatenate([common, single]), 0.0)
-
-
-def _used(problem: Problem) -> Bool[Array, "h s"]:
-    """Slots that any term speaks of."""
-    used = jnp.zeros(problem.pixels.shape[:2], bool)
-    for slot in problem.slot_terms:
-        used = used | slot.present()
-    for term in problem.edge_terms:
-        seen = _at_slots(term, used.shape[1])
-        used = used.at[problem.edges.row].max(seen)
-    return used
-
-
-def _at_slots(term: EdgeTerm, slots: int) -> Bool[Array, "e s"]:
-    present = term.present()
-    return jnp.pad(present, ((0, 0), (term.first_slot, slots - term.first_slot - present.shape[1])))

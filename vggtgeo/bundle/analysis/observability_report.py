@@ -97,6 +97,8 @@ class Observability(eqx.Module):
             known = self.to_dict()
         except TypeError:  # inside `jit`, or of a batch
             return eqx.Module.__repr__(self)
+        if not np.isfinite(np.asarray(self.landmark_information)).all():
+            return "Observability(unknown: the linearisation is not finite)"
         weak = "; ".join(known["weak"][:3]) + f" and {len(known['weak']) - 3} more" * (len(known["weak"]) > 3)
         lost, used = known["inverse_depths_undetermined"], known["inverse_depths"]
         depths = f", {lost} of {used} inverse depths undetermined" if lost else ""
