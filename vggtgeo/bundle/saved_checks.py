@@ -62,7 +62,7 @@ def _check_shapes(problem: Problem, state: State, rows: int, edges: int, slots: 
         raise InputError("it has one of the arrays `problem/host` and `problem/edges/row_of`, not both")
     if problem.host is not None:
         expected["problem/host"] = (problem.host, (rows,))
-        expected["problem/edges/row_of"] = (problem.edges.row_of, (edges,))
+        expected["problem/edges/row_of"] = (problem.edges.row, (edges,))
     if problem.camera_of is not None:
         expected["problem/camera_of"] = (problem.camera_of, (keyframes,))
     if problem.fraction is not None:

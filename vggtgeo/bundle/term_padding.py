@@ -52,7 +52,7 @@ def placed(term: FlatTerm, index: SlotIndex, slots: tuple[int, int], dtype: DTyp
     rows, edges, _ = index.shape
     on_edges = issubclass(term.kind, EdgeTerm)
     outer, where = rows, index.host[term.landmark]
-    if on_edges:
+    if on_edges and term.edge is not None:
         outer, where = edges, index.stored_edge(term.edge, term.landmark)
     at = (where, index.slot[term.landmark] - first)
 

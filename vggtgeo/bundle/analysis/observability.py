@@ -80,9 +80,9 @@ def observability(problem: Problem, state: State) -> Observability:
     check_finite(state)
     check_weights(problem)
     if problem.num_keyframes <= DENSE_KEYFRAMES:
-        found = _observability_jit(problem, state)
-        refuse_not_finite(problem, state, jnp.all(jnp.isfinite(found.landmark_information)))
-        return found
+        known = _observability_jit(problem, state)
+        refuse_not_finite(problem, state, jnp.all(jnp.isfinite(known.landmark_information)))
+        return known
     _check_large(problem, state)
     systems, everything, coordinates = _linearise_jit(problem, state)
     refuse_not_finite(problem, state, is_finite(everything))
