@@ -272,6 +272,6 @@ def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEd
         ends[(position + part * step)[there]] = target[there]
     of_host = np.full((len(host), size.degree), len(row))
     of_host[row, index] = np.arange(len(row))
-    arrays = [jnp.asarray(array, jnp.int32) for array in (host[row], ends, index, of_host)]
+    arrays = (jnp.asarray(array, jnp.int32) for array in (host[row], ends, index, of_host))
     own = None if size.rows is None else jnp.asarray(row, jnp.int32)
-    return StoredEdges(Edges(*arrays, row_of=own), position, step)
+    return StoredEdges(replace(Edges(*arrays), row_of=own), position, step)
