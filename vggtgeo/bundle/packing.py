@@ -130,10 +130,10 @@ def pack(
     warn_of_far(inverse_depth)
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
     check_terms(terms, observations, len(poses))
-    focal = np.atleast_2d(intrinsics)[np.zeros(len(poses), int) if camera_of is None else camera_of, 0]
-    check_resolution(observations, poses, focal, inverse_depth, dtype)
     guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
     check_precision({**vars(observations), **guess, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
+    focal = np.atleast_2d(intrinsics)[np.zeros(len(poses), int) if camera_of is None else camera_of, 0]
+    check_resolution(observations, poses, focal, inverse_depth, dtype)
     size, graph, host, index = _layout(observations, len(poses), size)
     padding = size.keyframes - len(poses)
     fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
