@@ -183,7 +183,7 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     zero = jax.tree.map(jnp.zeros_like, solved)
     value, tangent = jax.jvp(found, (moving, zero), (moved, solved))
     if options.not_stationary == "error":
-        value = eqx.error_if(value, left > STATIONARY, _NOT_STATIONARY)
+        value = eqx.error_if(value, ~(left <= STATIONARY), _NOT_STATIONARY)
     return (value, told), (
         _times(tangent, trusted),
         jax.tree.map(jnp.zeros_like, eqx.filter(told, eqx.is_inexact_array)),
@@ -203,8 +203,8 @@ _NOT_SOLVED = (
 
 
 def _trusted(left: Float[Array, ""], options: ArrowAdjoint) -> Float[Array, ""]:
-    """1, or NaN where the point is not at rest and derivatives are to be NaN there."""
-    doubtful = (left > STATIONARY) & (options.not_stationary == "nan")
+    """1, or NaN where the point is not at rest and derivatives are to be NaN there, or has no derivative at all."""
+    doubtful = ((left > STATIONARY) & (options.not_stationary == "nan")) | ~jnp.isfinite(left)
     return jnp.where(doubtful, jnp.nan, 1.0)
 
 

@@ -1,7 +1,8 @@
 """Arrow-shaped normal equations of an edge-factored least-squares problem, and their Schur complement.
 
 Unknowns: `n` nodes of `b` coordinates each, `q` shared coordinates (together `c = n b + q`: the dense part `x`), and
-`s` scalar landmarks `z` hosted by every node. A residual lives on a directed edge `(i, j)` and sees the nodes only
+`h` rows of `s` scalar landmarks `z`. A node hosts one row or several: so rows stay short where one node hosts most
+landmarks. An edge belongs to a row. A residual lives on a directed edge `(i, j)` and sees the nodes only
 through the relative coordinates `eta = x_j - A x_i`, one shared block and one landmark of its host i. So
 
     [ H   W ] [x]     [g]          H = sum_e P_e' G_e P_e + priors,     W = sum_e P_e' C_e,
@@ -9,7 +10,7 @@ through the relative coordinates `eta = x_j - A x_i`, one shared block and one l
 
 where `G_e` (Gram matrix) and `C_e` (cross terms with the host's landmarks) are kept in relative coordinates: forming
 them costs `b + q` columns a residual instead of `2 b + q`, and the Schur complement `W V^-1 W'` is one symmetric
-product of `[b k + q + 2, s]` a host, carried to node coordinates as a small matrix afterwards.
+product of `[b k + q + 2, s]` a row, carried to node coordinates as a small matrix afterwards.
 
 The shared coordinates `y` may come in groups of `v`, of which a node sees one, `u_i = E_i y`, and an edge those of its
 two ends. Its local coordinates are then `(eta, u_j, u_i)`, `b + 2 v` of them however many groups there are, and
@@ -39,26 +40,24 @@ Assembled = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
 class EdgeGraph(eqx.Module):
-    """Directed edges between nodes; `of_host[i, r]` is the r-th edge that leaves node i (`e` where there is none)."""
+    """Directed edges between nodes; `of_host[i, r]` is the r-th edge of row i of landmarks (`e`: there is none)."""
 
     source: Int[Array, " e"]
     target: Int[Array, " e"]
-    of_host: Int[Array, "n k"]
+    of_host: Int[Array, "h k"]
     group: Int[Array, " n"] | None = None
     """Group of shared coordinates that each node sees; None: every node sees all of them."""
+    host: Int[Array, " h"] | None = None
+    """Node that hosts each row; None: row i is that of node i, and `h = n`."""
 
-    def neighbours(self) -> Int[Array, "n k"]:
-        """Target node of each edge of each host; `n` where there is no edge."""
-        padded = jnp.append(self.target, self.of_host.shape[0])
-        return padded[self.of_host]
+    @property
+    def host_of_row(self) -> Int[Array, " h"]:
+        """Node that hosts each row."""
+        return jnp.arange(len(self.of_host)) if self.host is None else self.host
 
     def ends(self) -> Int[Array, "e 2"]:
         """Nodes of each edge in the order of its local coordinates: target, host."""
         return jnp.stack([self.target, self.source], 1)
-
-    def around(self) -> Int[Array, "n m"]:
-        """Neighbours of each host, as `neighbours`, then itself."""
-        return jnp.concatenate([self.neighbours(), jnp.arange(self.of_host.shape[0])[:, None]], 1)
 
     def seen(self, nodes: Int[Array, "*t m"], size: int) -> Int[Array, "*t p"] | None:
         """Which shared coordinates nodes see, in groups of `size`, one node after the other; None: all of them, once.
@@ -75,21 +74,21 @@ class ArrowVector(eqx.Module):
     """A step or a gradient: dense part and landmarks."""
 
     dense: Float[Array, " c"]
-    landmarks: Float[Array, "n s"]
+    landmarks: Float[Array, "h s"]
 
 
 class SegmentLandmarks(eqx.Module):
     """Landmarks that lie on straight lines: the coordinates `(y_a, y_b)` of `segments.py`."""
 
-    fraction: Float[Array, "n g q"]
+    fraction: Float[Array, "h g q"]
     """Position of each sample along its segment."""
-    ratio: Float[Array, "n g"]
+    ratio: Float[Array, "h g"]
     """`l`, which makes the landmark block diagonal."""
-    determined: Bool[Array, "n g"]
+    determined: Bool[Array, "h g"]
     """Whether the samples determine `y_b` at all."""
 
     @property
-    def basis(self) -> Float[Array, "n g q 2"]:
+    def basis(self) -> Float[Array, "h g q 2"]:
         """Samples by `(y_a, y_b)`."""
         first = 1 - self.fraction
         second = self.fraction - self.ratio[..., None] * first
@@ -99,11 +98,11 @@ class SegmentLandmarks(eqx.Module):
 class TripleLandmarks(eqx.Module):
     """The factors of `L` of landmarks of three unknowns, see `triples.py`."""
 
-    ratio_u: Float[Array, "n p"]
+    ratio_u: Float[Array, "h p"]
     """`a`, of `u` and `d`."""
-    ratio_v: Float[Array, "n p"]
+    ratio_v: Float[Array, "h p"]
     """`b`, of `v` and `d`."""
-    ratio_uv: Float[Array, "n p"]
+    ratio_uv: Float[Array, "h p"]
     """`c`, of `u` and `v`."""
 
 
@@ -136,7 +135,7 @@ class ArrowSystem(eqx.Module):
     gram: Float[Array, "e m m"]
     """`m = b + q + 1`: second derivatives in `(eta, shared)`; the last row and column hold the gradient. In groups
     `m = b + 2 v + 1`, in `(eta, u of target, u of host)`."""
-    cross: Float[Array, "n r s"]
+    cross: Float[Array, "h r s"]
     """`r = b k + p + 2`: second derivatives of `(eta of edge 0 ... k-1, shared)` with each landmark, then the
     landmark's gradient and its own second derivative. In groups the shared ones are `(u of the targets of edge
     0 ... k-1, u of the host)`. One array, because slicing it would copy it."""
@@ -152,11 +151,11 @@ class ArrowSystem(eqx.Module):
     """Directions along which the energy may be flat for a known reason (a free scale): unit columns, or zero."""
     factors: NodeFactors | None = None
     """Terms on nodes and pairs of nodes: blocks of the matrix, however many there are."""
-    held: Bool[Array, "n s"] | None = None
+    held: Bool[Array, "h s"] | None = None
     """Landmarks that stay where they are, at a bound that they press against; None = none."""
     segments: SegmentLandmarks | None = None
     """Where the last `2 g` landmarks are coordinates of segments of `q` samples."""
-    blocks: Float[Array, "n 3 t"] | None = None
+    blocks: Float[Array, "h 3 t"] | None = None
     """Where the first `3 t` landmarks are `t` of three unknowns, all `u`, all `v`, all `d`: second derivatives
     `uu, vv, uv`. The last row of `cross` then holds `ud, vd` for `u` and `v`. None once `join_triples` has made the
     blocks diagonal."""
@@ -171,7 +170,7 @@ class ArrowSystem(eqx.Module):
     @property
     def shared(self) -> int:
         """Number of shared coordinates, `q`."""
-        return len(self.free) - self.graph.of_host.shape[0] * self.source_adjoint.shape[-1]
+        return len(self.free) - self.num_nodes * self.source_adjoint.shape[-1]
 
     @property
     def seen(self) -> int:
@@ -180,12 +179,27 @@ class ArrowSystem(eqx.Module):
         return local if self.graph.group is None else local // 2
 
     @property
-    def landmark_gradient(self) -> Float[Array, "n s"]:
+    def landmark_gradient(self) -> Float[Array, "h s"]:
         return self.cross[:, -2]
 
     @property
-    def landmark_hessian(self) -> Float[Array, "n s"]:
+    def landmark_hessian(self) -> Float[Array, "h s"]:
         return self.cross[:, -1]
+
+    @property
+    def num_nodes(self) -> int:
+        block = self.source_adjoint.shape[-1]
+        if self.graph.group is not None:
+            return len(self.graph.group)
+        return (len(self.free) - self.gram.shape[-1] + block + 1) // block
+
+    def neighbours(self) -> Int[Array, "h k"]:
+        """Target node of each edge of each row; `n` where there is no edge."""
+        return jnp.append(self.graph.target, self.num_nodes)[self.graph.of_host]
+
+    def around(self) -> Int[Array, "h m"]:
+        """Neighbours of each row, then its host."""
+        return jnp.concatenate([self.neighbours(), self.graph.host_of_row[:, None]], 1)
 
 
 class Reduced(eqx.Module):
@@ -199,13 +213,13 @@ class Reduced(eqx.Module):
     """`W V^-1 h`."""
 
 
-def moving_landmarks(system: ArrowSystem) -> Bool[Array, "n s"]:
+def moving_landmarks(system: ArrowSystem) -> Bool[Array, "h s"]:
     """Landmarks that something determines and that no bound holds."""
     determined = system.landmark_hessian != 0
     return determined if system.held is None else determined & ~system.held
 
 
-def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "n s"]:
+def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "h s"]:
     """`V^-1`, zero for landmarks that stay where they are: nothing determines them, or they are held."""
     determined = moving_landmarks(system)
     return jnp.where(determined, 1 / jnp.where(determined, system.landmark_hessian, 1.0), 0.0)
@@ -214,7 +228,7 @@ def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "n s"]:
 def reduce(system: ArrowSystem) -> Reduced:
     """Assemble the dense Hessian and the undamped Schur complement in node coordinates.
 
-    Cost: one product of `[r, s]` with its transpose a host, the rest is small matrices.
+    Cost: one product of `[r, s]` with its transpose a row, the rest is small matrices.
     """
     schur, schur_gradient = _dense(assemble_hosts(system, host_products(system), DenseLayout()))
     hessian, gradient = _dense(assemble_edges(system, DenseLayout()))
@@ -227,27 +241,27 @@ def reduce(system: ArrowSystem) -> Reduced:
     )
 
 
-def host_products(system: ArrowSystem) -> Float[Array, "n t t"]:
-    """`C V^-1 C'` of each host in relative coordinates; `t = b k + p + 1`, the gradient comes last."""
-    # A loop over hosts: twice as fast on a CPU as one batched product (the scaled rows stay in the cache).
+def host_products(system: ArrowSystem) -> Float[Array, "h t t"]:
+    """`C V^-1 C'` of each row in relative coordinates; `t = b k + p + 1`, the gradient comes last."""
+    # A loop over rows: twice as fast on a CPU as one batched product (the scaled rows stay in the cache).
     product = lambda host: (host[0] * host[1]) @ host[0].T
     return jax.lax.map(product, (system.cross, inverse_landmark_hessian(system)))[:, :-1, :-1]
 
 
-def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "n relative"]:
-    """Dense step in the coordinates of each host's cross terms: `(eta of each edge, shared)`."""
-    hosts, degree = system.graph.of_host.shape
-    block = system.source_adjoint.shape[-1]
-    nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
+def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "h relative"]:
+    """Dense step in the coordinates of each row's cross terms: `(eta of each edge, shared)`."""
+    rows, degree = system.graph.of_host.shape
+    count, block = system.num_nodes, system.source_adjoint.shape[-1]
+    nodes, shared = dense[: count * block].reshape(count, block), dense[count * block :]
     eta = nodes[system.graph.target] - jnp.einsum("eab,eb->ea", system.source_adjoint, nodes[system.graph.source])
     eta = jnp.concatenate([eta, jnp.zeros_like(eta[:1])])[system.graph.of_host]
-    own = _seen_of(shared, hosts, seen_by_hosts(system))
-    return jnp.concatenate([eta.reshape(hosts, degree * block), own], 1)
+    own = _seen_of(shared, rows, seen_by_hosts(system))
+    return jnp.concatenate([eta.reshape(rows, degree * block), own], 1)
 
 
-def seen_by_hosts(system: ArrowSystem) -> Int[Array, "n p"] | None:
-    """Which shared coordinates each host's cross terms see; None: all."""
-    return system.graph.seen(system.graph.around(), system.seen)
+def seen_by_hosts(system: ArrowSystem) -> Int[Array, "h p"] | None:
+    """Which shared coordinates the cross terms of each row see; None: all."""
+    return system.graph.seen(system.around(), system.seen)
 
 
 def _seen_of(shared: Float[Array, " q"], count: int, seen: Int[Array, "t p"] | None) -> Float[Array, "t p"]:
@@ -259,14 +273,14 @@ def add_shared(values: Float[Array, "t p"], seen: Int[Array, "t p"] | None, coun
     return values.sum(0) if seen is None else jnp.zeros(count, values.dtype).at[seen].add(values)
 
 
-def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> Float[Array, "n s"]:
+def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> Float[Array, "h s"]:
     """`W' dense + gradient * h`, in one pass over the cross terms."""
     relative = to_relative(system, dense)
     tail = jnp.broadcast_to(jnp.asarray([gradient, 0.0], dense.dtype), (len(relative), 2))
     return jnp.einsum("nrs,nr->ns", system.cross, jnp.concatenate([relative, tail], 1))
 
 
-def back_substitute(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "n s"]:
+def back_substitute(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "h s"]:
     """`-V^-1 (h + W' dense)`: the landmarks that minimise the undamped model at a given dense step."""
     return -inverse_landmark_hessian(system) * couple(system, dense, 1.0)
 
@@ -281,7 +295,7 @@ def multiply(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
 
 def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, " c"]:
     """`H dense`, edge by edge: no matrix over all nodes is formed."""
-    hosts, block = system.graph.of_host.shape[0], system.source_adjoint.shape[-1]
+    hosts, block = system.num_nodes, system.source_adjoint.shape[-1]
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
     at_target = nodes[system.graph.target]
     at_source = jnp.einsum("eab,eb->ea", system.source_adjoint, nodes[system.graph.source])
@@ -301,7 +315,7 @@ def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array
 
 
 def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array, " c"]) -> Float[Array, " c"]:
-    hosts, block = system.graph.of_host.shape[0], system.source_adjoint.shape[-1]
+    hosts, block = system.num_nodes, system.source_adjoint.shape[-1]
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
     nodes = jnp.concatenate([nodes, jnp.zeros_like(nodes[:1])])
     spread = _seen_of(shared, len(factors.first), _seen_by_factors(system, factors))
@@ -311,7 +325,7 @@ def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array
 
 def _factors_gathered(system: ArrowSystem, factors: NodeFactors, local: Float[Array, "m l"]) -> Float[Array, " c"]:
     """Values in the factors' local coordinates added up at the nodes and the shared coordinates."""
-    hosts, block = system.graph.of_host.shape[0], system.source_adjoint.shape[-1]
+    hosts, block = system.num_nodes, system.source_adjoint.shape[-1]
     nodes = jnp.zeros((hosts + 1, block), local.dtype)
     nodes = nodes.at[factors.first].add(local[:, :block]).at[factors.second].add(local[:, block : 2 * block])
     shared = add_shared(local[:, 2 * block :], _seen_by_factors(system, factors), system.shared)
@@ -322,21 +336,22 @@ def _seen_by_factors(system: ArrowSystem, factors: NodeFactors) -> Int[Array, "m
     return system.graph.seen(factors.first[:, None], system.seen)
 
 
-def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "n s"]) -> Float[Array, " c"]:
+def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "h s"]) -> Float[Array, " c"]:
     """`W z`: landmark values carried to the dense coordinates."""
     return from_relative(system, jnp.einsum("nrs,ns->nr", system.cross, landmarks)[:, :-2])
 
 
-def from_relative(system: ArrowSystem, relative: Float[Array, "n relative"]) -> Float[Array, " c"]:
-    """The transpose of `to_relative`: forces on each host's relative coordinates, added up at the nodes."""
-    hosts, degree = system.graph.of_host.shape
+def from_relative(system: ArrowSystem, relative: Float[Array, "h relative"]) -> Float[Array, " c"]:
+    """The transpose of `to_relative`: forces on each row's relative coordinates, added up at the nodes."""
+    rows, degree = system.graph.of_host.shape
     block = system.source_adjoint.shape[-1]
-    eta = relative[:, : degree * block].reshape(hosts, degree, block)
+    eta = relative[:, : degree * block].reshape(rows, degree, block)
     eta = jnp.where(system.graph.of_host[..., None] < len(system.graph.source), eta, 0.0)
     to_host = -jnp.einsum("nkab,nka->nb", padded_transports(system), eta)
-    nodes = jnp.zeros((hosts + 1, block), eta.dtype).at[system.graph.neighbours()].add(eta)[:-1]
+    nodes = jnp.zeros((system.num_nodes + 1, block), eta.dtype).at[system.neighbours()].add(eta)[:-1]
+    nodes = nodes + to_host if system.graph.host is None else nodes.at[system.graph.host].add(to_host)
     shared = add_shared(relative[:, degree * block :], seen_by_hosts(system), system.shared)
-    return jnp.concatenate([(nodes + to_host).reshape(-1), shared])
+    return jnp.concatenate([nodes.reshape(-1), shared])
 
 
 def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
@@ -365,7 +380,7 @@ def _gather_at_nodes(
     system: ArrowSystem, at_target: Float[Array, "e b"], at_source: Float[Array, "e b"]
 ) -> Float[Array, "n b"]:
     """Add forces on relative coordinates up at the nodes: `at_target` at targets, `-A' at_source` at sources."""
-    nodes = jnp.zeros((system.graph.of_host.shape[0], at_target.shape[1]), at_target.dtype)
+    nodes = jnp.zeros((system.num_nodes, at_target.shape[1]), at_target.dtype)
     carried = jnp.einsum("eba,eb->ea", system.source_adjoint, at_source)
     return nodes.at[system.graph.target].add(at_target).at[system.graph.source].add(-carried)
 
@@ -406,16 +421,16 @@ class Blocks(eqx.Module):
     corner: Float[Array, "o o"]
 
 
-def padded_transports(system: ArrowSystem) -> Float[Array, "n k b b"]:
-    """`A` of each edge of each host, zero where there is no edge."""
+def padded_transports(system: ArrowSystem) -> Float[Array, "h k b b"]:
+    """`A` of each edge of each row, zero where there is no edge."""
     padded = jnp.concatenate([system.source_adjoint, jnp.zeros_like(system.source_adjoint[:1])])
     return padded[system.graph.of_host]
 
 
-def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout: AbstractLayout) -> Blocks:
-    """Carry each host's matrix from relative to node and shared coordinates and add them all up."""
+def assemble_hosts(system: ArrowSystem, products: Float[Array, "h t t"], layout: AbstractLayout) -> Blocks:
+    """Carry each row's matrix from relative to node and shared coordinates and add them all up."""
     hosts, degree = system.graph.of_host.shape
-    block = system.source_adjoint.shape[-1]
+    nodes, block = system.num_nodes, system.source_adjoint.shape[-1]
     wide = degree * block
     transports = padded_transports(system).reshape(hosts, wide, block)
     own = -jnp.einsum("nrw,nwb->nrb", products[:, :, :wide], transports)
@@ -425,14 +440,14 @@ def assemble_hosts(system: ArrowSystem, products: Float[Array, "n t t"], layout:
     top = jnp.concatenate([products[:, :wide, :wide], own[:, :wide]], 2)
     bottom = jnp.concatenate([to_neighbour, corner], 2)
     local = jnp.concatenate([top, bottom], 1).reshape(hosts, degree + 1, block, degree + 1, block)
-    index = system.graph.around()
+    index = system.around()
     rows, columns = jnp.broadcast_arrays(index[:, :, None], index[:, None, :])
-    blocks = layout.empty(hosts, block, products.dtype)
+    blocks = layout.empty(nodes, block, products.dtype)
     blocks = layout.add(blocks, rows, columns, local.transpose(0, 1, 3, 2, 4))
     border = jnp.concatenate([products[:, wide:, :wide], own[:, wide:]], 2)
     border = border.reshape(hosts, -1, degree + 1, block).transpose(0, 2, 3, 1)
     seen = seen_by_hosts(system)
-    borders = _add_border(jnp.zeros((hosts + 1, block, system.shared + 1), products.dtype), index, border, seen)[:-1]
+    borders = _add_border(jnp.zeros((nodes + 1, block, system.shared + 1), products.dtype), index, border, seen)[:-1]
     return Blocks(blocks, borders, _corner(system, products[:, wide:, wide:], seen))
 
 
@@ -462,8 +477,7 @@ def _corner(system: ArrowSystem, value: Float[Array, "t l l"], seen: Int[Array, 
 
 def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     """Hessian and gradient of all edges in node and shared coordinates."""
-    hosts = system.graph.of_host.shape[0]
-    block = system.source_adjoint.shape[-1]
+    hosts, block = system.num_nodes, system.source_adjoint.shape[-1]
     source, target = system.graph.source, system.graph.target
     eta, border = system.gram[:, :block, :block], system.gram[:, :block, block:]
     own = jnp.einsum("eba,ebc,ecd->ead", system.source_adjoint, eta, system.source_adjoint)

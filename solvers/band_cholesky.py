@@ -54,5 +54,5 @@ class BandCholesky(AbstractReducedSolver[Bands]):
     def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> BandElimination:
         return band_elimination(system, self.prepare(system))
 
-    def inverse(self, system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
-        return band_inverse(system, self.prepare(system), hosts)
+    def inverse(self, system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
+        return band_inverse(system, self.prepare(system), rows)

@@ -55,11 +55,11 @@ def band_elimination(system: ArrowSystem, bands: Bands) -> BandElimination:
     return BandElimination(bands.layout, found, updates, weights)
 
 
-def band_inverse(system: ArrowSystem, bands: Bands, hosts: Int[Array, " h"]) -> LocalInverse:
+def band_inverse(system: ArrowSystem, bands: Bands, rows: Int[Array, " h"]) -> LocalInverse:
     """The blocks of the inverse that the band has, of each host; held along flat directions by low-rank corrections."""
     factor = band_elimination(system, bands)
-    known, unknown = (_local(system, factor.layout, part, hosts) for part in selected_inverse(factor.elimination))
-    index = local_coordinates(system, hosts)
+    known, unknown = (_local(system, factor.layout, part, rows) for part in selected_inverse(factor.elimination))
+    index = local_coordinates(system, rows)
     scale = _scale(system)[index]
     free = system.free[index]
     both = free[:, :, None] & free[:, None, :]
@@ -103,15 +103,15 @@ def _held_correction(
 
 
 def _local(
-    system: ArrowSystem, layout: BandLayout, found: SelectedInverse, hosts: Int[Array, " h"]
+    system: ArrowSystem, layout: BandLayout, found: SelectedInverse, rows: Int[Array, " h"]
 ) -> Float[Array, "h l l"]:
     """Blocks of the local coordinates of each host, in balanced units."""
-    nodes, block = local_nodes(system, hosts), system.source_adjoint.shape[-1]
+    nodes, block = local_nodes(system, rows), system.source_adjoint.shape[-1]
     rows, columns = jnp.broadcast_arrays(nodes[:, :, None], nodes[:, None, :])
     inner = layout.gather(found.groups, rows, columns).transpose(0, 1, 3, 2, 4)
-    inner = inner.reshape(len(hosts), nodes.shape[1] * block, -1)
-    border = layout.nodes_of(found.border)[nodes].reshape(len(hosts), nodes.shape[1] * block, -1)
-    corner = jnp.broadcast_to(found.corner, (len(hosts), *found.corner.shape))
+    inner = inner.reshape(len(rows), nodes.shape[1] * block, -1)
+    border = layout.nodes_of(found.border)[nodes].reshape(len(rows), nodes.shape[1] * block, -1)
+    corner = jnp.broadcast_to(found.corner, (len(rows), *found.corner.shape))
     return jnp.concatenate(
         [jnp.concatenate([inner, border], 2), jnp.concatenate([jnp.swapaxes(border, 1, 2), corner], 2)], 1
     )

@@ -103,7 +103,7 @@ class BandLayout(AbstractLayout):
 
 def band_layout(system: ArrowSystem, reach: int, place: Int[Array, " n"] | None) -> BandLayout:
     """The layout that holds every edge that reaches over at most `reach` places."""
-    return BandLayout(system.graph.of_host.shape[0], max(2 * reach, 1), place)
+    return BandLayout(system.num_nodes, max(2 * reach, 1), place)
 
 
 class BandMatrix(eqx.Module):
@@ -231,7 +231,7 @@ def _band(blocks: Blocks, layout: BandLayout) -> BandMatrix:
     )
 
 
-def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "n t t"]:
+def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "h t t"]:
     """Which entries of the hosts' products couple no far edge with anything else."""
     hosts, degree = system.graph.of_host.shape
     block = system.source_adjoint.shape[-1]

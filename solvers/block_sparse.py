@@ -51,8 +51,8 @@ class SparseLayout(AbstractLayout):
 
 def sparse_layout(system: ArrowSystem) -> SparseLayout:
     """The layout that holds all that `system` couples; outside `jit`. Needs integers that hold the square of `n`."""
-    nodes = len(system.graph.of_host)
-    around = np.concatenate([np.asarray(system.graph.neighbours()), np.arange(nodes)[:, None]], 1)
+    nodes = system.num_nodes
+    around = np.concatenate([np.asarray(system.neighbours()), np.asarray(system.graph.host_of_row)[:, None]], 1)
     pairs = [tuple(np.broadcast_arrays(around[:, :, None], around[:, None, :]))]
     if system.factors is not None:
         first, second = np.asarray(system.factors.first), np.asarray(system.factors.second)

@@ -183,7 +183,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         product, preconditioner = self.product.prepare(system), self.preconditioner.prepare(definite())
         return IterativeFactor(self, product, preconditioner, flat_stiffness(system))
 
-    def inverse(self, system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
+    def inverse(self, system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
         """Column by column, host after host: ask for few of them. All that converges counts as determined."""
         factor = self.factor(system, lambda: system)
         gauge = free_gauge(system)
@@ -194,7 +194,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
             found = jax.vmap(unit)(index)
             return found.solution[:, index], ~found.converged
 
-        index = local_coordinates(system, hosts)
+        index = local_coordinates(system, rows)
         covariance, undetermined = jax.lax.map(around, index)
         flat = factor.stiffness > 0
         size = jnp.where(flat, jnp.sum(gauge * along, 0), 1.0)

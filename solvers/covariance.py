@@ -26,14 +26,15 @@ from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 
 class ArrowCovariance(eqx.Module):
-    """Marginal covariances of `h` hosts; never NaN.
+    """Marginal covariances around `h` rows of landmarks; never NaN.
 
     Zero where held; infinite variance and zero covariance where undetermined.
     """
 
     nodes: Float[Array, "h b b"]
+    """Of the node that hosts each row."""
     neighbours: Float[Array, "h k b b"]
-    """Of each host (rows) with the target of its edge of each rank; zero where there is no edge."""
+    """Of that node with the target of the row's edge of each rank; zero where there is no edge."""
     shared: Float[Array, "q q"]
     landmarks: Float[Array, "h s"]
     """Variances."""
@@ -42,38 +43,38 @@ class ArrowCovariance(eqx.Module):
 
 
 def covariance(
-    system: ArrowSystem, solver: AbstractReducedSolver | None = None, hosts: Int[Array, " h"] | None = None
+    system: ArrowSystem, solver: AbstractReducedSolver | None = None, rows: Int[Array, " h"] | None = None
 ) -> ArrowCovariance:
     """Inverse of the system's matrix over the free coordinates; the matrix must be positive semidefinite.
 
-    solver: whose structure inverts; None = dense. hosts: which; None = all.
+    solver: whose structure inverts; None = dense. rows: which rows of landmarks; None = all.
     """
-    hosts = jnp.arange(len(system.graph.of_host)) if hosts is None else hosts
-    found = (DenseCholesky() if solver is None else solver).inverse(system, hosts)
+    rows = jnp.arange(len(system.graph.of_host)) if rows is None else rows
+    found = (DenseCholesky() if solver is None else solver).inverse(system, rows)
     degree, block = system.graph.of_host.shape[1], system.source_adjoint.shape[-1]
     local = _marked(found.covariance, found.undetermined)
     own, end = slice(degree * block, (degree + 1) * block), (degree + 1) * block
-    beside = local[:, own, : degree * block].reshape(len(hosts), block, degree, block).transpose(0, 2, 1, 3)
-    present = system.graph.of_host[hosts] < len(system.graph.source)
+    beside = local[:, own, : degree * block].reshape(len(rows), block, degree, block).transpose(0, 2, 1, 3)
+    present = system.graph.of_host[rows] < len(system.graph.source)
     return ArrowCovariance(
         nodes=local[:, own, own],
         neighbours=jnp.where(present[:, :, None, None] & jnp.isfinite(beside), beside, 0.0),
         shared=local[0, end:, end:],
-        landmarks=_landmarks(system, found, hosts),
+        landmarks=_landmarks(system, found, rows),
         rank=found.rank + jnp.sum(moving_landmarks(system)),
     )
 
 
-def _landmarks(system: ArrowSystem, found: LocalInverse, hosts: Int[Array, " h"]) -> Float[Array, "h s"]:
+def _landmarks(system: ArrowSystem, found: LocalInverse, rows: Int[Array, " h"]) -> Float[Array, "h s"]:
     """`V^-1 + V^-1 W' S^-1 W V^-1`, its diagonal."""
-    hessian_inverse, cross = inverse_landmark_hessian(system)[hosts], system.cross[hosts, :-2]
-    basis = jax.tree.map(lambda leaf: leaf[hosts], system.basis)
+    hessian_inverse, cross = inverse_landmark_hessian(system)[rows], system.cross[rows, :-2]
+    basis = jax.tree.map(lambda leaf: leaf[rows], system.basis)
     # In this order: the square of a large inverse overflows, its product with the coupling does not.
     pulled = expand(basis, hessian_inverse[:, None] * cross)
-    spread = lambda local, rows: jnp.einsum("nrs,nrt,nts->ns", rows, to_relative(system, hosts, local), rows)
+    spread = lambda local, side: jnp.einsum("nrs,nrt,nts->ns", side, to_relative(system, rows, local), side)
     variance = expand_variance(basis, hessian_inverse) + spread(found.covariance, pulled)
     lost = hessian_inverse * spread(found.null, cross) > visible(cross.dtype)
-    unknown = (system.landmark_hessian[hosts] == 0) | lost
+    unknown = (system.landmark_hessian[rows] == 0) | lost
     known = (expand_variance(basis, unknown.astype(cross.dtype)) == 0) & jnp.isfinite(variance)
     return jnp.where(known, variance, jnp.inf)
 

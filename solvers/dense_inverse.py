@@ -21,7 +21,7 @@ from vggtgeo.solvers.flat_directions import free_gauge, gauge_stiffness
 from vggtgeo.solvers.local_inverse import LocalInverse, balance, local_coordinates, rank_tolerance, visible
 
 
-def dense_inverse(system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
+def dense_inverse(system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
     """The inverse over the free coordinates, held along flat gauge directions; NaN nowhere."""
     free, reduced = system.free, reduce(system)
     scale = balance(system, jnp.diagonal(reduced.hessian))
@@ -33,7 +33,7 @@ def dense_inverse(system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
     for column in range(directions.shape[1]):
         inverse = _hold(inverse, directions[:, column], stiffness[column])
     null = outside / scale[:, None] / scale[None, :]
-    index = local_coordinates(system, hosts)
+    index = local_coordinates(system, rows)
     return LocalInverse(
         covariance=inverse[index[:, :, None], index[:, None, :]],
         null=null[index[:, :, None], index[:, None, :]],

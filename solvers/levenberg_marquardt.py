@@ -49,8 +49,11 @@ class Termination(eqx.Enumeration):
         "solver minimises; give `vggtgeo.solvers.problem.energy_of`. The initial state was returned."
     )
     nonfinite_step = (
-        "Failed: the normal equations have no finite solution. Look for weights or standard deviations that are far "
-        "too large or too small; the last state that was accepted was returned."
+        "Failed: the normal equations have no finite solution; the last state that was accepted was returned."
+    )
+    beyond_precision = (
+        "Failed: the positions have fewer digits in this precision than the observations need. Subtract one offset "
+        "from all positions in the world, those in terms included, or use double precision (`jax_enable_x64`)."
     )
 
 

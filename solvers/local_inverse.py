@@ -17,7 +17,7 @@ from vggtgeo.solvers.arrow import ArrowSystem, padded_transports, seen_by_hosts
 
 
 class LocalInverse(eqx.Module):
-    """Blocks of the inverse over the local coordinates of some hosts."""
+    """Blocks of the inverse over the local coordinates of some rows of landmarks."""
 
     covariance: Float[Array, "h l l"]
     """Of the directions that something determines; zero where held."""
@@ -28,32 +28,31 @@ class LocalInverse(eqx.Module):
     """Number of dense coordinates that are determined, flat gauge directions not counted."""
 
 
-def local_nodes(system: ArrowSystem, hosts: Int[Array, " h"]) -> Int[Array, "h m"]:
-    """Neighbours of each host, then itself; any node where a host has fewer neighbours."""
-    nodes = len(system.graph.of_host)
-    neighbours = jnp.minimum(system.graph.neighbours()[hosts], nodes - 1)
-    return jnp.concatenate([neighbours, hosts[:, None]], 1)
+def local_nodes(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array, "h m"]:
+    """Neighbours of each row, then its host; any node where a row has fewer neighbours."""
+    neighbours = jnp.minimum(system.neighbours()[rows], system.num_nodes - 1)
+    return jnp.concatenate([neighbours, system.graph.host_of_row[rows, None]], 1)
 
 
-def local_coordinates(system: ArrowSystem, hosts: Int[Array, " h"]) -> Int[Array, "h l"]:
-    """Which of the dense coordinates the local ones of each host are."""
-    block, inner = system.source_adjoint.shape[-1], len(system.graph.of_host) * system.source_adjoint.shape[-1]
-    nodes = local_nodes(system, hosts)[:, :, None] * block + jnp.arange(block)
-    shared = jnp.arange(inner, len(system.free))
-    return jnp.concatenate([nodes.reshape(len(hosts), -1), jnp.broadcast_to(shared, (len(hosts), len(shared)))], 1)
+def local_coordinates(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array, "h l"]:
+    """Which of the dense coordinates the local ones of each row are."""
+    block = system.source_adjoint.shape[-1]
+    nodes = local_nodes(system, rows)[:, :, None] * block + jnp.arange(block)
+    shared = jnp.arange(system.num_nodes * block, len(system.free))
+    return jnp.concatenate([nodes.reshape(len(rows), -1), jnp.broadcast_to(shared, (len(rows), len(shared)))], 1)
 
 
-def to_relative(system: ArrowSystem, hosts: Int[Array, " h"], local: Float[Array, "h l l"]) -> Float[Array, "h r r"]:
-    """`J C J'`: a covariance of the local coordinates carried to the rows of a host's cross terms, `(eta, shared)`."""
+def to_relative(system: ArrowSystem, rows: Int[Array, " h"], local: Float[Array, "h l l"]) -> Float[Array, "h r r"]:
+    """`J C J'`: a covariance of the local coordinates carried to the rows of cross terms, `(eta, shared)`."""
     degree, block = system.graph.of_host.shape[1], system.source_adjoint.shape[-1]
     wide, shared = degree * block, system.shared
     seen = seen_by_hosts(system)
     selected = jnp.eye(shared, dtype=local.dtype)
-    selected = selected if seen is None else selected[seen[hosts]]
-    present = system.graph.of_host[hosts] < len(system.graph.source)
-    carry = jnp.zeros((len(hosts), system.cross.shape[1] - 2, wide + block + shared), local.dtype)
+    selected = selected if seen is None else selected[seen[rows]]
+    present = system.graph.of_host[rows] < len(system.graph.source)
+    carry = jnp.zeros((len(rows), system.cross.shape[1] - 2, wide + block + shared), local.dtype)
     carry = carry.at[:, jnp.arange(wide), jnp.arange(wide)].set(jnp.repeat(present, block, 1).astype(local.dtype))
-    transports = padded_transports(system)[hosts].reshape(len(hosts), wide, block)
+    transports = padded_transports(system)[rows].reshape(len(rows), wide, block)
     carry = carry.at[:, :wide, wide : wide + block].set(-transports)
     carry = carry.at[:, wide:, wide + block :].set(selected)
     return jnp.einsum("nra,nab,ntb->nrt", carry, local, carry)

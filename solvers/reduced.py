@@ -57,8 +57,8 @@ class AbstractReducedSolver(eqx.Module, Generic[Prepared]):
         """
 
     @abc.abstractmethod
-    def inverse(self, system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
-        """The inverse around some hosts; the system must be positive semidefinite."""
+    def inverse(self, system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
+        """The inverse around some rows of landmarks; the system must be positive semidefinite."""
 
 
 class _Prepared(eqx.Module):
@@ -104,8 +104,8 @@ class DenseCholesky(AbstractReducedSolver[_Prepared]):
         both = system.free[:, None] & system.free[None, :]
         return LuFactor(jsp.linalg.lu_factor(jnp.where(both, matrix, jnp.eye(len(matrix), dtype=matrix.dtype))))
 
-    def inverse(self, system: ArrowSystem, hosts: Int[Array, " h"]) -> LocalInverse:
-        return dense_inverse(system, hosts)
+    def inverse(self, system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
+        return dense_inverse(system, rows)
 
 
 def damping_diagonal(diagonal: Float[Array, " c"], free: Bool[Array, " c"]) -> Float[Array, " c"]:

@@ -43,6 +43,7 @@ from vggtgeo.bundle.marginalisation import no_prior
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.figures.plot import plot
+from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.loop import simulate_loop
 
 KINDS = ("points", "lines", "depth", "intrinsics_prior")
@@ -351,7 +352,7 @@ def test_what_the_sparse_way_refuses(sparse: Observe, loop: tuple[Problem, State
         sparse(problem.with_term(no_prior(KEYFRAMES)), state)
     with pytest.raises(ValueError, match=r"a `state` in float32, whose rounding errors .* expected float64"):
         sparse(*packed(WELL, at_truth=True, dtype=np.float32))
-    with pytest.raises(ValueError, match=r"NaN or infinite; expected finite poses"):
+    with pytest.raises(InputError, match=r"`problem`.*`points`"):
         sparse(eqx.tree_at(lambda p: p.pixels, loop[0], jnp.full_like(loop[0].pixels, jnp.nan)), loop[1])
     with pytest.raises(ValueError, match=r"`state.intrinsics` has a NaN or an infinity"):
         sparse(loop[0], eqx.tree_at(lambda s: s.intrinsics, loop[1], jnp.full(4, jnp.nan)))

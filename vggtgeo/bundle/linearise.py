@@ -1,9 +1,9 @@
 """Normal equations, gradient and exact Hessian of any sum of terms, in the arrow's shape.
 
-One pass over the edges, sorted by host: every edge term gives columns `[6 + c + 2, m p]` (see `terms/edge.py`); their
-Gram matrix is kept in relative coordinates, and their products with the depth column are added into the host's cross
+One pass over the edges, sorted by row: every edge term gives columns `[6 + c + 2, m p]` (see `terms/edge.py`); their
+Gram matrix is kept in relative coordinates, and their products with the depth column are added into the row's cross
 terms in place: relative pose and target's camera in rows of the edge's own, the host's camera (or the one that all
-share) in rows that all edges of the host add to. Slot terms lie on the diagonal of the landmarks, terms on poses and
+share) in rows that all edges of the row add to. Slot terms lie on the diagonal of the landmarks, terms on poses and
 pairs become blocks, the cameras' and the dense ones one small matrix (layout chosen by measurement on CPU, see
 `benchmarks/solver.py`).
 """
@@ -19,7 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.objective import cameras_of, edge_data, hosts_of, motions_of, of_edge, relative_poses, view_of
+from vggtgeo.bundle.objective import (
+    Place,
+    cameras_of,
+    edge_data,
+    hosts_of,
+    motions_of,
+    of_edge,
+    places,
+    relative_poses,
+    view_of,
+)
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
@@ -52,25 +62,25 @@ def linearise(
     sizes = num_offsets(state) // 2, state.inverse_depth.shape[1]
 
     def body(carry: tuple[Array, Array | None], edge: Any) -> tuple[tuple[Array, Array | None], Array]:
-        (cross, blocks), (ends, index, motion, data) = carry, edge
-        host = ends[0]
-        seen = of_edge(problem, view_of(cameras, hosts, ends, motion), data)
+        (cross, blocks), (place, index, motion, data) = carry, edge
+        row = place.row
+        seen = of_edge(problem, view_of(cameras, hosts, place, motion), data)
         gram, coupled, own = (_exact if exact else _reweighted)(seen, correction, sizes)
-        zero = jnp.zeros_like(host)
+        zero = jnp.zeros_like(row)
         for first, part in coupled:
             column = zero + first
-            cross = jax.lax.dynamic_update_slice(cross, part[None, : lie.TANGENT], (host, lie.TANGENT * index, column))
+            cross = jax.lax.dynamic_update_slice(cross, part[None, : lie.TANGENT], (row, lie.TANGENT * index, column))
             if apart:
                 by_target = part[None, lie.TANGENT : lie.TANGENT + apart]
-                cross = jax.lax.dynamic_update_slice(cross, by_target, (host, wide + apart * index, column))
-            tail, place = part[None, lie.TANGENT + apart :], (host, zero + common, column)
-            shared = jax.lax.dynamic_slice(cross, place, (1, *tail.shape[1:]))
-            cross = jax.lax.dynamic_update_slice(cross, shared + tail, place)
-        return (cross, blocks if blocks is None or own is None else blocks.at[host].add(own)), gram
+                cross = jax.lax.dynamic_update_slice(cross, by_target, (row, wide + apart * index, column))
+            tail, start = part[None, lie.TANGENT + apart :], (row, zero + common, column)
+            shared = jax.lax.dynamic_slice(cross, start, (1, *tail.shape[1:]))
+            cross = jax.lax.dynamic_update_slice(cross, shared + tail, start)
+        return (cross, blocks if blocks is None or own is None else blocks.at[row].add(own)), gram
 
     cross, blocks = _landmark_terms(problem, state, common + cameras.size, correction, exact)
     if problem.edge_terms:
-        edges = (problem.edges.ends, problem.edges.index_at_host, motions_of(relative), edge_data(problem))
+        edges = (places(problem), problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
@@ -121,9 +131,9 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
 
     sizes = first // 2, state.inverse_depth.shape[1]
 
-    def edge(ends: tuple[Array, Array], motion: Any, data: Any) -> tuple[Array, Array]:
+    def edge(place: Place, motion: Any, data: Any) -> tuple[Array, Array]:
         local, own = jnp.zeros(lie.TANGENT + cameras.seen, landmarks.dtype), jnp.zeros_like(landmarks[0])
-        for term, seen in of_edge(problem, view_of(cameras, hosts, ends, motion), data):
+        for term, seen in of_edge(problem, view_of(cameras, hosts, place, motion), data):
             found = term.gradient(seen)
             local += found.shared
             parts = [found.depth] if found.pixel is None else [*found.pixel, found.depth]
@@ -131,7 +141,7 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
                 own = own.at[start : start + part.shape[1]].add(part[0])
         return local, own
 
-    local, by_depth = jax.vmap(edge)(problem.edges.ends, motions_of(relative), edge_data(problem))
+    local, by_depth = jax.vmap(edge)(places(problem), motions_of(relative), edge_data(problem))
     eta = local[:, : lie.TANGENT]
     nodes = jnp.zeros((problem.num_keyframes, lie.TANGENT), local.dtype).at[problem.edges.target].add(eta)
     nodes = nodes.at[problem.edges.source].add(-jnp.einsum("eba,eb->ea", lie.adjoint(relative), eta))
@@ -139,12 +149,13 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     seen = graph.seen(graph.ends(), cameras.size)
     shared = add_shared(local[:, lie.TANGENT :], seen, problem.num_parameters)
     dense += jnp.concatenate([nodes.reshape(-1), shared])
-    return ArrowVector(dense, landmarks.at[problem.edges.source].add(by_depth))
+    return ArrowVector(dense, landmarks.at[problem.edges.row].add(by_depth))
 
 
 def _graph(problem: Problem) -> EdgeGraph:
-    """The covisibility graph, with the camera of each keyframe where there are several."""
-    return EdgeGraph(problem.edges.source, problem.edges.target, problem.edges.of_host, problem.camera_of)
+    """The covisibility graph, with the camera of each keyframe where there are several, and the host of each row."""
+    edges = problem.edges
+    return EdgeGraph(edges.source, edges.target, edges.of_host, problem.camera_of, problem.host)
 
 
 def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
@@ -271,19 +282,19 @@ def _joined(parts: Columns, size: int) -> Columns:
 
 
 def _landmark_terms(
-    problem: Problem, state: State, rows: int, correction: Float[Array, ""] | None, exact: bool
-) -> tuple[Float[Array, "n r s"], Float[Array, "n 3 p"] | None]:
+    problem: Problem, state: State, height: int, correction: Float[Array, ""] | None, exact: bool
+) -> tuple[Float[Array, "h r s"], Float[Array, "h 3 p"] | None]:
     """Cross terms before any edge: gradient and curvature of the terms on landmarks in the last two rows; and the
     blocks of landmarks with free pixels.
     """
-    (keyframes, slots), first = state.inverse_depth.shape, num_offsets(state)
-    cross = jnp.zeros((keyframes, rows + 2, first + slots), state.inverse_depth.dtype)
+    (rows, slots), first = state.inverse_depth.shape, num_offsets(state)
+    cross = jnp.zeros((rows, height + 2, first + slots), state.inverse_depth.dtype)
     for term in problem.slot_terms:
         gradient, curvature = term.derivatives(state.inverse_depth, correction, exact)
         cross = cross.at[:, -2, first:].add(gradient).at[:, -1, first:].add(curvature)
     if state.pixel_offset is None:
         return cross, None
-    blocks = jnp.zeros((keyframes, 3, first // 2), cross.dtype)
+    blocks = jnp.zeros((rows, 3, first // 2), cross.dtype)
     for pixel in problem.pixel_terms:
         hessian, force = pixel.model(state.pixel_offset, correction, exact)
         cross = cross.at[:, -2, :first].add(_as_landmarks(force))
@@ -291,7 +302,7 @@ def _landmark_terms(
     return cross, blocks
 
 
-def _held(problem: Problem, state: State, gradient: Float[Array, "n s"]) -> Bool[Array, "n t"] | None:
+def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool[Array, "h t"] | None:
     """Landmarks on their bound that the energy presses against it; those of segments move as a whole and never are."""
     if not problem.positive_depth:
         return None

@@ -22,6 +22,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtgeo.bundle.diagnosis import refuse_not_finite
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observed import check_weights
@@ -38,6 +39,7 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.solvers.arrow import reduce
+from vggtgeo.solvers.finite import is_finite, unless
 
 _MOST_KEYFRAMES = 1000
 """Of a prior, whose matrix is dense: 0.3 GB."""
@@ -87,12 +89,13 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
         check_whole("leaving", given.item() if given.size == 1 else leaving, 0, problem.num_keyframes - 1)
     prior = _marginal_term(problem)
     point = _linearisation_point(prior, state)
-    quadratic, gradient = _quadratic(problem, point, leaving)
+    quadratic, gradient, finite = _quadratic(problem, point, leaving)
+    refuse_not_finite(problem, point, finite)
     leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
     leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
     held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics.reshape(-1)])
     quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
-    root, offset = square_root(quadratic, gradient)
+    root, offset = unless(finite, square_root(quadratic, gradient))
     return MarginalPrior(
         root=root, offset=offset, poses=point.poses, intrinsics=point.parameters, weight=jnp.ones_like(offset, shape=())
     )
@@ -152,11 +155,12 @@ def _linearisation_point(prior: MarginalPrior, state: State) -> State:
     )
 
 
-def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""] | int) -> _Quadratic:
-    """Hessian and gradient of the leaving terms over the dense coordinates, landmarks eliminated."""
+def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""] | int) -> tuple[Array, Array, Bool[Array, ""]]:
+    """Hessian and gradient of the leaving terms over the dense coordinates, landmarks eliminated; are they finite?"""
     leaving_terms = tuple(_leaving(term, problem, leaving) for term in problem.terms)
-    reduced = reduce(linearise(prepared(problem.with_terms(leaving_terms)), point))
-    return reduced.hessian - reduced.schur, reduced.gradient - reduced.schur_gradient
+    system = linearise(prepared(problem.with_terms(leaving_terms)), point)
+    reduced = reduce(system)
+    return reduced.hessian - reduced.schur, reduced.gradient - reduced.schur_gradient, is_finite(system)
 
 
 def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int) -> AbstractTerm:
@@ -165,7 +169,7 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
     if isinstance(term, EdgeTerm):
         goes = (problem.edges.source == leaving)[:, None]
     elif isinstance(term, SlotTerm | HostPixel):
-        goes = (jnp.arange(problem.num_keyframes) == leaving)[:, None]
+        goes = (problem.host_of_row == leaving)[:, None]
     elif isinstance(term, PoseTerm):
         goes = term.keyframe == leaving
     elif isinstance(term, PairTerm):

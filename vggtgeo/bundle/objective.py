@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.fast import pinhole
 from vggtgeo.bundle.pair_checks import check_pair
@@ -75,11 +75,11 @@ def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
     cameras, hosts = cameras_of(problem, state), hosts_of(problem, state)
 
     def body(sum_: Array, edge: Any) -> tuple[Array, None]:
-        ends, motion, data = edge
-        view = view_of(cameras, hosts, ends, motion)
+        place, motion, data = edge
+        view = view_of(cameras, hosts, place, motion)
         return sum_ + sum(term.energy(seen) for term, seen in of_edge(problem, view, data)), None
 
-    edges = (problem.edges.ends, motions_of(relative_poses(problem, state)), edge_data(problem))
+    edges = (places(problem), motions_of(relative_poses(problem, state)), edge_data(problem))
     total, _ = jax.lax.scan(body, total, edges)
     return total
 
@@ -112,12 +112,12 @@ def relative_poses(problem: Problem, state: State) -> jaxlie.SE3:
 
 
 class Hosts(NamedTuple):
-    """What the loops over edges read of each host, slots last; made once for all edges."""
+    """What the loops over edges read of each row of landmarks, slots last; made once for all edges."""
 
-    pixels: Float[Array, "n 2 s"]
-    rays: tuple[Float[Array, "n s"], Float[Array, "n s"]] | None
-    inverse_depth: Float[Array, "n s"]
-    offset: Float[Array, "n p 2"] | None
+    pixels: Float[Array, "h 2 s"]
+    rays: tuple[Float[Array, "h s"], Float[Array, "h s"]] | None
+    inverse_depth: Float[Array, "h s"]
+    offset: Float[Array, "h p 2"] | None
     """Of the pixels that are unknowns, which `pixels` and `rays` contain."""
 
 
@@ -130,7 +130,7 @@ class Motions(NamedTuple):
 
 
 def hosts_of(problem: Problem, state: State) -> Hosts:
-    """The slots of all hosts; with viewing rays where the hand-written derivatives know the camera."""
+    """The slots of all rows; with viewing rays where the hand-written derivatives know the camera."""
     pixels, rays = problem.pixels, None
     if state.pixel_offset is not None:
         pixels = pixels.at[:, : state.pixel_offset.shape[1]].add(state.pixel_offset)
@@ -146,16 +146,30 @@ def motions_of(relative: jaxlie.SE3) -> Motions:
     return Motions(relative, relative.rotation().as_matrix(), relative.translation())
 
 
-def view_of(cameras: Cameras, hosts: Hosts, ends: tuple[Array, Array], motion: Motions) -> EdgeView:
-    """All slots of keyframe i, along the edge `ends = (i, j)` with that relative pose."""
-    own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, ends[0], keepdims=False), hosts)
+class Place(NamedTuple):
+    """Where an edge lies in the graph, of one edge or with a leading axis of edges."""
+
+    ends: tuple[Int[Array, "*e"], Int[Array, "*e"]]
+    """Keyframes `(i, j)`."""
+    row: Int[Array, "*e"]
+    """Row of landmarks of keyframe i."""
+
+
+def places(problem: Problem) -> Place:
+    """Where all edges lie."""
+    return Place(problem.edges.ends, problem.edges.row)
+
+
+def view_of(cameras: Cameras, hosts: Hosts, place: Place, motion: Motions) -> EdgeView:
+    """The slots of a row, along the edge at `place` with that relative pose."""
+    own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, place.row, keepdims=False), hosts)
     fast, projection = None, None
     known = pinhole_parameters(cameras)
     if own.rays is not None and known is not None:
         fast = pinhole.OneEdge(known, motion.rotation, motion.translation)
         projection = pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, fast)
     free = 0 if hosts.offset is None else hosts.offset.shape[1]
-    return EdgeView(motion.relative, cameras, ends, own.pixels, own.inverse_depth, fast, projection, free)
+    return EdgeView(motion.relative, cameras, place.ends, own.pixels, own.inverse_depth, fast, projection, free)
 
 
 def edge_data(problem: Problem) -> EdgeData:

@@ -32,9 +32,19 @@ from vggtgeo.bundle.packing_checks import (
     check_size,
     warn_of_far,
 )
-from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex, assign_slots, pad_edges, sort_edges
+from vggtgeo.bundle.padding import (
+    GivenTerm,
+    PaddedSize,
+    SlotIndex,
+    count_slots,
+    needed_size,
+    pad_edges,
+    rows_of_keyframes,
+    sort_edges,
+)
 from vggtgeo.bundle.precision import check_precision, weight_of
 from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.resolution import check_resolution
 from vggtgeo.bundle.term_checks import check_terms
 from vggtgeo.bundle.term_padding import padded, placed
 from vggtgeo.bundle.terms.depth import DepthPrior
@@ -78,7 +88,8 @@ def pack(
             several cameras `[g, k]`.
         intrinsics_mean: the same, mean of their prior; None = `intrinsics`.
         inverse_depth: `[D]`, 1/m, positive.
-        size: padded shape; None takes the smallest that fits.
+        size: padded shape; None takes the cheapest that fits. A keyframe that hosts far more landmarks than others then
+            has several rows of them, see `Problem.host`.
         intrinsics_sigma: standard deviation of the intrinsics' prior in pixels; None = no prior.
         fixed_pose: bool `[n]`; None holds the first pose.
         fixed_intrinsics: intrinsics that are held: one bool for all, one for each of a camera, or of their own shape.
@@ -97,7 +108,8 @@ def pack(
             and lines, an observation between keyframes that its landmark is not hosted in, an inverse depth, focal
             length or standard deviation that is not positive, weights that are negative or NaN, lines that are not
             normalised, an edge twice or to itself, a kernel that is none, a size that is too small, or nothing that is
-            observed: all weights zero.
+            observed: all weights zero; or positions so far from the origin that this precision has no digits for most
+            of the matches.
 
     Example:
         >>> import vggtgeo as vg
@@ -123,7 +135,9 @@ def pack(
     terms = check_terms(terms, observations, len(poses))
     guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
     check_precision({**vars(observations), **guess, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
-    size, graph, index = _layout(observations, len(poses), size)
+    focal = np.atleast_2d(intrinsics)[np.zeros(len(poses), int) if camera_of is None else camera_of, 0]
+    check_resolution(observations, poses, focal, inverse_depth, dtype)
+    size, graph, host, index = _layout(observations, len(poses), size)
     padding = size.keyframes - len(poses)
     fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
     prior = _intrinsics_prior(mean, intrinsics_sigma, intrinsics.shape, dtype)
@@ -135,11 +149,12 @@ def pack(
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
         fixed_intrinsics=jnp.asarray(check_fixed("fixed_intrinsics", fixed_intrinsics, intrinsics.shape)),
         camera_of=None if camera_of is None else jnp.asarray(np.pad(camera_of, (0, padding)), jnp.int32),
+        host=host,
         camera=camera,
     )
     problem = _of_type(problem, dtype)
     check_observed(problem)
-    offset = jnp.zeros((size.keyframes, size.points, 2), dtype) if problem.pixel_terms else None
+    offset = jnp.zeros((index.shape[0], size.points, 2), dtype) if problem.pixel_terms else None
     depths = _per_slot(index, inverse_depth, 1.0, dtype)
     if observations.segment is not None:
         present = _per_slot(index, np.ones(len(observations.host)), 0.0, dtype)
@@ -164,19 +179,28 @@ def as_arrays(observations: Observations) -> Observations:
     return replace(observations, **arrays)
 
 
-def _layout(observations: Observations, keyframes: int, size: PaddedSize | None) -> tuple[PaddedSize, Edges, SlotIndex]:
-    """The padded size, the graph, and where each landmark and edge lies in them."""
+def _layout(
+    observations: Observations, keyframes: int, size: PaddedSize | None
+) -> tuple[PaddedSize, Edges, Array | None, SlotIndex]:
+    """The padded size, the graph, the host of each row, and where each landmark and edge lies in them."""
     check_kind("size", size, PaddedSize | None, "a `vggtgeo.PaddedSize`")
-    slots = assign_slots(observations, keyframes, size.samples if size else None)
-    edges, order, degree = sort_edges(observations.edges, keyframes)
-    needed = PaddedSize(keyframes, slots.points, slots.lines, degree, len(edges), slots.samples)
+    slots = count_slots(observations, keyframes, size.samples if size else None)
+    needed = needed_size(slots, observations.edges, size)
     size = size or needed
     check_size(size, needed)
-    graph, position = pad_edges(edges, size)
-    is_line = slots.where.slot >= slots.points
-    slot = np.where(is_line, slots.where.slot - slots.points + size.points, slots.where.slot)
-    shape = (size.keyframes, len(graph.source), size.points + size.lines)
-    return size, graph, SlotIndex(slots.where.host, slot, position[order], shape)
+    rows = rows_of_keyframes(slots, size)
+    edges, order = sort_edges(observations.edges)
+    stored = pad_edges(edges, size, rows)
+    length = np.where(slots.is_line, max(size.lines, 1), max(size.points, 1))
+    part, within = (np.zeros_like(slots.within), slots.within) if size.rows is None else np.divmod(slots.within, length)
+    slot = np.where(slots.is_line, size.points + within, within)
+    row = (np.cumsum(rows) - rows)[observations.host] + part
+    shape = (int(rows.sum()), len(stored.edges.source), size.points + size.lines)
+    place = stored.position[order]
+    if size.rows is None:
+        return size, stored.edges, None, SlotIndex(row, slot, place, shape)
+    host = jnp.asarray(np.repeat(np.arange(size.keyframes), rows), jnp.int32)
+    return size, stored.edges, host, SlotIndex(row, slot, place, shape, part, stored.step[order])
 
 
 def _seen(
@@ -225,8 +249,8 @@ def _depth_prior(observations: Observations, kernel: AbstractKernel, dtype: DTyp
 
 
 def _per_slot(index: SlotIndex, values: np.ndarray, empty: float, dtype: DTypeLike) -> Array:
-    keyframes, _, slots = index.shape
-    array = np.full((keyframes, slots, *np.shape(values)[1:]), empty, dtype)
+    rows, _, slots = index.shape
+    array = np.full((rows, slots, *np.shape(values)[1:]), empty, dtype)
     array[index.host, index.slot] = values
     return jnp.asarray(array)
 
@@ -234,11 +258,11 @@ def _per_slot(index: SlotIndex, values: np.ndarray, empty: float, dtype: DTypeLi
 def _with_segments(problem: Problem, depths: Array, present: Array, size: PaddedSize) -> tuple[Problem, Array]:
     """The problem with two-ends lines, and depths that are straight along them."""
     samples = max(size.samples or 1, 1)
-    shape = (size.keyframes, size.lines // samples, samples)
+    shape = (len(depths), size.lines // samples, samples)
     inside = lambda array: np.asarray(array[:, size.points :]).reshape(*shape, *array.shape[2:])
     here = inside(present) > 0
     fraction = fractions(inside(problem.pixels), here)
-    straight = straightened(inside(depths), fraction, here).reshape(size.keyframes, size.lines)
+    straight = straightened(inside(depths), fraction, here).reshape(len(depths), size.lines)
     dtype = depths.dtype
     return (
         replace(problem, fraction=jnp.asarray(fraction, dtype)),

@@ -270,12 +270,13 @@ def warn_of_far(inverse_depth: np.ndarray) -> None:
 
 def check_size(size: PaddedSize, needed: PaddedSize) -> None:
     """A padded size that is large enough, of whole numbers."""
-    for name in ("keyframes", "points", "lines", "degree", "edges", "samples"):
-        if getattr(size, name) is not None or name not in ("edges", "samples"):
+    for name in ("keyframes", "points", "lines", "degree", "edges", "samples", "rows"):
+        if getattr(size, name) is not None or name not in ("edges", "samples", "rows"):
             check_whole(f"size.{name}", getattr(size, name), 0, MOST_PADDED)
     if needed.samples is not None and size.lines % needed.samples:
         raise InputError(f"`size.lines` is {size.lines}; it must be a multiple of `size.samples`, {needed.samples}")
-    for name in ("keyframes", "points", "lines", "degree", "edges"):
+    for name in ("keyframes", "points", "lines", "degree", "rows", "edges"):
         have, need = getattr(size, name), getattr(needed, name)
-        if have is not None and (have < need or (name == "edges" and have != need)):
+        exact = name == "edges" or (name == "rows" and size.edges is not None)
+        if have is not None and (have < need or (exact and have != need)):
             raise InputError(f"`size.{name}` is {have}; this problem needs {need}")

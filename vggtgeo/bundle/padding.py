@@ -1,24 +1,28 @@
 """Static shapes: which slot a landmark takes, which row an edge, and how far each is padded.
 
-Slots of a host: landmarks of points first, then line samples (segment after segment where lines have two ends).
+Slots of a row: landmarks of points first, then line samples (segment after segment where lines have two ends). Each
+keyframe has a row. One that hosts many more landmarks than others has several, each with all edges of the keyframe, so
+that time and memory follow the number of landmarks and not the richest keyframe.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Int
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.problem import Edges
 from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry import lie
 from vggtgeo.geometry.line_segments import segment_slots
 from vggtgeo.io.errors import InputError
 
@@ -32,13 +36,15 @@ class PaddedSize:
 
     Fields:
         keyframes: Number of keyframes.
-        points: Slots for points a keyframe.
-        lines: Slots for line samples a keyframe.
+        points: Points in a row of landmarks (a keyframe has one row, unless `rows` is given).
+        lines: Line samples in a row.
         degree: Largest number of edges of one host.
-        edges: Number of edges stored; None = `keyframes * degree`, every host padded to `degree` edges.
+        edges: Number of edges stored; None: every row is padded to `degree` edges.
         samples: Samples of a segment, where observations have a `segment`; `lines` is a multiple of it.
         terms: Names of terms on poses, pairs and the camera, and how many observations of each there is room for;
             one that is not named here is not padded.
+        rows: Rows of landmarks; None: one a keyframe. With a number, a keyframe that hosts more than `points` or
+            `lines` takes several rows.
 
     Example:
         >>> import vggtgeo as vg
@@ -56,18 +62,17 @@ class PaddedSize:
     edges: int | None = None
     samples: int | None = None
     terms: tuple[tuple[str, int], ...] = ()
+    rows: int | None = None
 
     @staticmethod
     def of(observations: Observations, keyframes: int, terms: Sequence[GivenTerm] = ()) -> PaddedSize:
-        """The smallest that fits, every host padded to the same number of edges."""
-        slots = assign_slots(observations, keyframes)
-        _, _, degree = sort_edges(observations.edges, keyframes)
+        """The cheapest that fits, every row padded to the same number of edges."""
         counts = tuple((term.name, np.size(term.broadcast().weight)) for term in terms if isinstance(term, COUNTED))
-        return PaddedSize(keyframes, slots.points, slots.lines, degree, samples=slots.samples, terms=counts)
+        return replace(needed_size(count_slots(observations, keyframes), observations.edges), edges=None, terms=counts)
 
     @staticmethod
     def largest(sizes: Sequence[PaddedSize]) -> PaddedSize:
-        """The smallest that fits all of `sizes`, every host padded to the same number of edges."""
+        """The smallest that fits all of `sizes`, every row padded to the same number of edges."""
         most = lambda name: max(getattr(size, name) for size in sizes)
         counts: dict[str, int] = {}
         for name, count in (named for size in sizes for named in size.terms):
@@ -77,7 +82,10 @@ class PaddedSize:
             samples = most("samples")
             lines = samples * max(size.lines // max(size.samples or 1, 1) for size in sizes)
         shape = (most("keyframes"), most("points"), lines, most("degree"))
-        return PaddedSize(*shape, samples=samples, terms=tuple(counts.items()))
+        rows = None
+        if any(size.rows is not None for size in sizes):
+            rows = shape[0] + max((size.rows or size.keyframes) - size.keyframes for size in sizes)
+        return PaddedSize(*shape, samples=samples, terms=tuple(counts.items()), rows=rows)
 
 
 COUNTED = (PoseTerm, PairTerm, CameraTerm)
@@ -86,17 +94,20 @@ COUNTED = (PoseTerm, PairTerm, CameraTerm)
 
 @dataclass(frozen=True)
 class SlotIndex:
-    """Where `pack` put what was given as flat lists: landmark `i` at `[host[i], slot[i]]`, edge `e` in row `edge[e]`.
+    """Where `pack` put what was given as flat lists: landmark `i` at `[host[i], slot[i]]`; edges, see `stored_edge`.
 
     `gather` and `gather_points` read padded arrays in the order of `Observations`. `scatter`, `scatter_points` and
     `scatter_lines` write values of that order into padded arrays; these are traceable and differentiable, so they take
     what a network computes.
 
     Fields:
-        host: int [D], keyframe of each landmark.
+        host: int [D], row of the array that each landmark is in: the number of the host keyframe, unless some keyframe
+            has several rows (`Problem.host`).
         slot: int [D], its slot there.
-        edge: int [E], row of each edge in the arrays of the problem.
-        shape: keyframes, edges and slots of the problem.
+        edge: int [E], the stored edge at the first row of its host.
+        shape: rows, edges and slots of the problem.
+        part: int [D], which row of its host each landmark is in, from 0; None: each keyframe has one row.
+        step: int [E], stored edges from the one at a row of the host to that at its next row.
 
     Example: the energy of a problem by weights of a network, one a match.
         >>> import jax, jax.numpy as jnp, vggtgeo as vg
@@ -114,25 +125,35 @@ class SlotIndex:
     slot: np.ndarray
     edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     shape: tuple[int, int, int] = (0, 0, 0)
+    part: np.ndarray | None = None
+    step: np.ndarray | None = None
 
     def __repr__(self) -> str:
         return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
+
+    def stored_edge(self, edge: np.ndarray, landmark: np.ndarray) -> np.ndarray:
+        """Where the observations of landmarks along edges are, in arrays `[e, p, ...]`; both as `Observations` numbers
+        them.
+        """
+        if self.part is None or self.step is None:
+            return self.edge[edge]
+        return self.edge[edge] + self.part[landmark] * self.step[edge]
 
     @overload
     def gather(self, per_slot: np.ndarray) -> np.ndarray: ...
     @overload
     def gather(self, per_slot: Array) -> Any: ...
     def gather(self, per_slot: np.ndarray | Array) -> Any:
-        """Values of the landmarks, `[D, ...]`, from an array `[n, s, ...]`; InputError for one of another shape.
+        """Values of the landmarks, `[D, ...]`, from an array `[h, s, ...]`; InputError for one of another shape.
 
         NumPy; under `jit`, `vmap` and `grad`, where `per_slot` is traced, an array of JAX.
         """
         found = _values(per_slot)
-        keyframes, _, slots = self.shape
-        if found.ndim < 2 or (any(self.shape) and found.shape[:2] != (keyframes, slots)):
+        rows, _, slots = self.shape
+        if found.ndim < 2 or (any(self.shape) and found.shape[:2] != (rows, slots)):
             raise InputError(
-                f"`per_slot` has shape {found.shape}; expected ({keyframes}, {slots}, ...), a value for each slot of "
-                "each keyframe, such as `state.inverse_depth`"
+                f"`per_slot` has shape {found.shape}; expected ({rows}, {slots}, ...), a value for each slot of "
+                "each row, such as `state.inverse_depth`"
             )
         return found[self.host, self.slot]
 
@@ -151,7 +172,8 @@ class SlotIndex:
                 f"`per_match` has shape {found.shape}; expected ({edges}, at most {slots}, ...), a value for each "
                 "point of each edge, such as `problem.points.weight`"
             )
-        return found[self.edge[observations.point_edge], self.slot[observations.point_landmark]]
+        landmark = observations.point_landmark
+        return found[self.stored_edge(observations.point_edge, landmark), self.slot[landmark]]
 
     def scatter(self, values: ArrayLike, into: ArrayLike) -> Array:
         """Write values of the landmarks to their places in `into`: the counterpart of `gather`.
@@ -184,7 +206,8 @@ class SlotIndex:
             InputError: an array of another shape.
 
         """
-        where = (self.edge[observations.point_edge], self.slot[observations.point_landmark])
+        landmark = observations.point_landmark
+        where = (self.stored_edge(observations.point_edge, landmark), self.slot[landmark])
         return _scattered(values, into, where, self.shape[1])
 
     def scatter_lines(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
@@ -200,7 +223,8 @@ class SlotIndex:
 
         """
         first = self.shape[2] - (np.shape(into)[1] if np.ndim(into) > 1 else 0)  # the slots of lines come last
-        where = (self.edge[observations.line_edge], self.slot[observations.line_landmark] - first)
+        landmark = observations.line_landmark
+        where = (self.stored_edge(observations.line_edge, landmark), self.slot[landmark] - first)
         return _scattered(values, into, where, self.shape[1])
 
 
@@ -227,15 +251,21 @@ def _values(given: Any) -> Any:
 
 
 class Slots(NamedTuple):
-    """Slot of each landmark (lines after `points` of them), and the largest numbers of slots a host."""
+    """Position of each landmark among the slots of its host, if that had one row, and what each host needs."""
 
-    where: SlotIndex
-    points: int
-    lines: int
+    is_line: Bool[np.ndarray, " d"]
+    within: Int[np.ndarray, " d"]
+    """Points and lines counted apart."""
+    points: Int[np.ndarray, " n"]
+    lines: Int[np.ndarray, " n"]
     samples: int | None
 
+    def rows(self, points: int, lines: int) -> Int[np.ndarray, "*n"]:
+        """Rows of so many slots that each host needs, at least one."""
+        return np.maximum(1, np.maximum(-(-self.points // max(points, 1)), -(-self.lines // max(lines, 1))))
 
-def assign_slots(observations: Observations, keyframes: int, samples: int | None = None) -> Slots:
+
+def count_slots(observations: Observations, keyframes: int, samples: int | None = None) -> Slots:
     """Number the landmarks of each host: those with points first; segments take at least `samples` slots."""
     is_line = np.zeros(len(observations.host), bool)
     is_line[observations.line_landmark] = True
@@ -246,48 +276,112 @@ def assign_slots(observations: Observations, keyframes: int, samples: int | None
             "landmark is a point or a line sample; give the sample a landmark of its own"
         )
     host = np.asarray(observations.host)
-    slot = np.zeros(len(host), int)
-    slot[~is_line], points = _numbered(host[~is_line], keyframes)
+    within = np.zeros(len(host), int)
+    within[~is_line], points = _numbered(host[~is_line], keyframes)
     if observations.segment is None:
-        within, lines = _numbered(host[is_line], keyframes)
-        slot[is_line] = points + within
-        return Slots(SlotIndex(host, slot), points, lines, None)
+        within[is_line], lines = _numbered(host[is_line], keyframes)
+        return Slots(is_line, within, points, lines, None)
     found = segment_slots(host[is_line], np.asarray(observations.segment)[is_line])
     samples = max(samples or 0, found.samples, 1)
-    slot[is_line] = points + samples * found.rank + found.position
-    return Slots(SlotIndex(host, slot), points, samples * found.segments, samples)
+    within[is_line] = samples * found.rank + found.position
+    lines = np.zeros(keyframes, int)
+    np.maximum.at(lines, host[is_line], samples * (found.rank + 1))
+    return Slots(is_line, within, points, lines, samples)
 
 
-def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, int]:
-    """Position of each landmark among those of its host, and the largest count."""
+def needed_size(slots: Slots, edges: np.ndarray, size: PaddedSize | None = None) -> PaddedSize:
+    """The cheapest size that fits, or the least that one which was given must have."""
+    keyframes, need = len(slots.points), (int(slots.points.max(initial=0)), int(slots.lines.max(initial=0)))
+    degrees = np.bincount(edges[:, 0], minlength=keyframes)
+    degree = int(degrees.max(initial=0))
+    if size is None:
+        need = row_lengths(slots, degree)
+    elif size.rows is not None:  # rows of any length hold all, if there are enough of them
+        need = min(need[0], max(size.points, 1)), min(need[1], max(size.lines, slots.samples or 1))
+    rows = slots.rows(*need)
+    total = int(rows.sum())
+    if size is not None:
+        total += max(size.keyframes - keyframes, 0)
+    split = total > keyframes if size is None else size.rows is not None
+    return PaddedSize(keyframes, *need, degree, int(rows @ degrees), slots.samples, rows=total if split else None)
+
+
+def rows_of_keyframes(slots: Slots, size: PaddedSize) -> Int[np.ndarray, " n"]:
+    """Rows of landmarks of each keyframe; the last one has the spare ones."""
+    if size.rows is None:
+        return np.ones(size.keyframes, int)
+    rows = slots.rows(size.points, size.lines)
+    rows = np.concatenate([rows, np.ones(size.keyframes - len(rows), int)])
+    rows[-1] += size.rows - rows.sum()
+    return rows
+
+
+def row_lengths(slots: Slots, degree: int) -> tuple[int, int]:
+    """Points and line samples in a row, so that a problem stores the fewest numbers.
+
+    Of a row a solve stores the cross terms with its `s` slots, `[t, s]`, and their products, `[t, t]`, where `t` is six
+    for each of its edges (and a few). So `rows (s + t)` is to be least. Hosts of equal richness have one row each.
+    """
+    unit, wide = slots.samples or 1, lie.TANGENT * degree + 2
+    best, chosen = math.inf, (0, 0)
+    for segments in _shares(int(slots.lines.max(initial=0)) // unit):
+        for points in _shares(int(slots.points.max(initial=0))):
+            lines = unit * segments
+            cost = int(slots.rows(points, lines).sum()) * (points + lines + wide)
+            if cost < best:
+                best, chosen = cost, (points, lines)
+    return chosen
+
+
+def _shares(count: int) -> list[int]:
+    """`count` divided into 1, 2, ... equal parts, rounded up: each size once, the largest first."""
+    return np.unique(-(-count // np.arange(1, max(count, 1) + 1)))[::-1].tolist()
+
+
+def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Position of each landmark among those of its host, and how many each keyframe has."""
     order = np.argsort(host, kind="stable")
     starts = np.searchsorted(host[order], np.arange(keyframes))
     within = np.empty(len(host), int)
     within[order] = np.arange(len(host)) - starts[host[order]]
-    return within, int(np.bincount(host, minlength=keyframes).max(initial=0))
+    return within, np.bincount(host, minlength=keyframes)
 
 
-def sort_edges(edges: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Edges sorted by host, the new position of each given edge, and the largest out-degree."""
+def sort_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges sorted by host, and the new position of each given edge."""
     order = np.argsort(edges[:, 0], kind="stable")
     position = np.empty(len(edges), int)
     position[order] = np.arange(len(edges))
-    degrees = np.bincount(edges[:, 0], minlength=keyframes)
-    return edges[order], position, int(degrees.max(initial=0))
+    return edges[order], position
 
 
-def pad_edges(edges: np.ndarray, size: PaddedSize) -> tuple[Edges, np.ndarray]:
-    """The graph as arrays, and the stored position of each sorted edge."""
-    hosts, first = edges[:, 0], np.searchsorted(edges[:, 0], np.arange(size.keyframes))
-    index = np.arange(len(edges)) - first[hosts]
-    if size.edges == len(edges):
-        position, source, target = np.arange(len(edges)), hosts, edges[:, 1]
-    else:
-        position = hosts * size.degree + index
-        source, index = np.divmod(np.arange(size.keyframes * size.degree), size.degree)
-        target = source.copy()
-        target[position] = edges[:, 1]
-    of_host = np.full((size.keyframes, size.degree), len(source))
-    of_host[source, index] = np.arange(len(source))
-    arrays = (jnp.asarray(array, jnp.int32) for array in (source, target, index, of_host))
-    return Edges(*arrays), position
+class StoredEdges(NamedTuple):
+    """The graph, where each sorted edge is at the first row of its host, and how much further at the next."""
+
+    edges: Edges
+    position: np.ndarray
+    step: np.ndarray
+
+
+def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEdges:
+    """Sorted edges, once for each row of their hosts; `rows [n]` is how many each keyframe has."""
+    source, target = edges[:, 0], edges[:, 1]
+    host = np.repeat(np.arange(size.keyframes), rows)
+    rank = np.arange(len(edges)) - np.searchsorted(source, np.arange(size.keyframes))[source]
+    degree = np.bincount(source, minlength=size.keyframes)
+    if size.edges != np.sum(rows * degree):
+        degree = np.full(size.keyframes, size.degree)
+    of_row = degree[host]
+    start = np.cumsum(of_row) - of_row
+    row = np.repeat(np.arange(len(host)), of_row)
+    index = np.arange(len(row)) - start[row]
+    position, step = start[np.cumsum(rows) - rows][source] + rank, degree[source]
+    ends = host[row]  # padding goes from a keyframe to itself
+    for part in range(rows.max(initial=1)):
+        there = rows[source] > part
+        ends[(position + part * step)[there]] = target[there]
+    of_host = np.full((len(host), size.degree), len(row))
+    of_host[row, index] = np.arange(len(row))
+    arrays = (jnp.asarray(array, jnp.int32) for array in (host[row], ends, index, of_host))
+    own = None if size.rows is None else jnp.asarray(row, jnp.int32)
+    return StoredEdges(replace(Edges(*arrays), row_of=own), position, step)

@@ -34,16 +34,18 @@ def check_kinds(problem: Any, state: Any, name: str = "state") -> None:
 def check_pair(problem: Any, state: Any, name: str = "state") -> None:
     """A problem and a state of its size and precision: in another one JAX would round, or fail far below."""
     check_kinds(problem, state, name)
-    wanted = jnp.shape(problem.pixels)[:2]
+    rows, slots = jnp.shape(problem.pixels)[:2]
+    keyframes = problem.num_keyframes
     found = {
-        "inverse_depth": jnp.shape(state.inverse_depth),
-        "poses": (*jnp.shape(state.poses.wxyz_xyz)[:1], wanted[1]),
+        "inverse_depth": (jnp.shape(state.inverse_depth), (rows, slots)),
+        "poses": (jnp.shape(state.poses.wxyz_xyz)[:1], (keyframes,)),
     }
-    for field, shape in found.items():
+    for field, (shape, wanted) in found.items():
         if shape != wanted:
+            of = "" if rows == keyframes else f" in {rows} rows"
             raise InputError(
                 f"`{name}.{field}` has the shape {jnp.shape(jax.tree.leaves(getattr(state, field))[0])}; the problem "
-                f"has {wanted[0]} keyframes of {wanted[1]} slots: give the state that was packed with it"
+                f"has {keyframes} keyframes{of} of {slots} slots: give the state that was packed with it"
             )
     for term in problem.pixel_terms:
         if state.pixel_offset is None or jnp.shape(state.pixel_offset)[:2] != jnp.shape(term.weight):
@@ -59,7 +61,7 @@ def check_pair(problem: Any, state: Any, name: str = "state") -> None:
             "`dtype`"
         )
     for term in (*problem.node_terms, *problem.camera_terms):
-        _check_term(term, wanted[0])
+        _check_term(term, keyframes)
 
 
 def _check_term(term: PoseTerm | PairTerm | CameraTerm, keyframes: int) -> None:

@@ -1,7 +1,9 @@
 """The bundle-adjustment problem: a state, a graph, and a sum of terms. All shapes are static, absence is weight 0.
 
-Sizes: `n` keyframes, `s` inverse depths ("slots") a keyframe, `e` directed edges `(i, j)`: slots of keyframe i observed
-in keyframe j, `q` parameters of the camera that all keyframes share, or of all `g` cameras, `k` each.
+Sizes: `n` keyframes, `h` rows of `s` inverse depths ("slots"), `e` directed edges `(i, j)`: slots of a row of keyframe
+i observed in keyframe j. A keyframe has one row, so `h = n`; one that hosts far more landmarks than others has several
+(`Problem.host`), so that arrays are not padded to the richest. `q` parameters of the camera that all keyframes share,
+or of all `g` cameras, `k` each.
 """
 
 from __future__ import annotations
@@ -10,7 +12,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.terms.depth import DepthPrior
@@ -60,8 +64,8 @@ class State(eqx.Module):
 
     poses: jaxlie.SE3
     intrinsics: Float[Array, "*g k"]
-    inverse_depth: Float[Array, "n s"]
-    pixel_offset: Float[Array, "n p 2"] | None = None
+    inverse_depth: Float[Array, "h s"]
+    pixel_offset: Float[Array, "h p 2"] | None = None
 
     @property
     def parameters(self) -> Float[Array, " q"]:
@@ -72,10 +76,10 @@ class State(eqx.Module):
         """The state that a step leads to, in the coordinates of every Hessian and covariance of this package.
 
         step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), the cameras' parameters (pixels), the inverse
-        depths (1/m), keyframe by keyframe, then the pixel offsets, if there are any, in the order of their array. Pure;
+        depths (1/m), row by row, then the pixel offsets, if there are any, in the order of their array. Pure;
         the derivative at a zero step is the tangent map.
         """
-        poses = lie.TANGENT * len(self.inverse_depth)
+        poses = lie.TANGENT * len(self.poses.wxyz_xyz)
         dense = poses + self.intrinsics.size
         landmarks = dense + self.inverse_depth.size
         offset = self.pixel_offset
@@ -90,20 +94,27 @@ class State(eqx.Module):
     def num_unknowns(self) -> int:
         """Length of a step of `moved`."""
         offsets = 0 if self.pixel_offset is None else self.pixel_offset.size
-        return lie.TANGENT * len(self.inverse_depth) + self.intrinsics.size + self.inverse_depth.size + offsets
+        return lie.TANGENT * len(self.poses.wxyz_xyz) + self.intrinsics.size + self.inverse_depth.size + offsets
 
 
 class Edges(eqx.Module):
-    """The covisibility graph: directed edges sorted by host keyframe."""
+    """The covisibility graph: directed edges sorted by host keyframe, and by the row of its landmarks."""
 
     source: Int[Array, " e"]
     """Host keyframe i, ascending."""
     target: Int[Array, " e"]
     """Keyframe j in which the slots of i are observed."""
     index_at_host: Int[Array, " e"]
-    """Position of the edge among the edges of its host, from 0."""
-    of_host: Int[Array, "n k"]
-    """The edges of each host, in their order, and `e` where it has fewer than `k`: the inverse of `index_at_host`."""
+    """Position of the edge among the edges of its row, from 0."""
+    of_host: Int[Array, "h k"]
+    """The edges of each row, in their order, and `e` where it has fewer than `k`: the inverse of `index_at_host`."""
+    row_of: Int[Array, " e"] | None = None
+    """Row of landmarks that each edge observes, ascending; None: that of its host's number."""
+
+    @property
+    def row(self) -> Int[Array, " e"] | Int[np.ndarray, " e"]:
+        """Row of landmarks that each edge observes."""
+        return self.source if self.row_of is None else self.row_of
 
     @property
     def ends(self) -> tuple[Int[Array, " e"], Int[Array, " e"]]:
@@ -118,7 +129,7 @@ class Problem(eqx.Module):
     kind can be left out without another shape. A term is also an attribute by its name: `problem.points`.
 
     Fields:
-        pixels: Where slot s of keyframe i looks: point slots first, then line samples.
+        pixels: Where each slot looks in its host keyframe: point slots first, then line samples.
         edges: The covisibility graph.
         terms: What is minimised: the sum of their energies.
         fixed_pose: Keyframes whose pose is held (the gauge).
@@ -130,12 +141,13 @@ class Problem(eqx.Module):
         camera: Model of the cameras whose parameters the state holds.
         positive_depth: Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver
             without bounds.
+        host: Keyframe that hosts each row of landmarks, ascending; None: row i is that of keyframe i.
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
         >>> [term.name for term in problem.terms]
-        ['points', 'lines', 'depth', 'intrinsics_prior']
+        ['points', 'lines', 'depth', 'host_pixels', 'intrinsics_prior']
         >>> problem.points.target.shape, problem.lines.weight.shape
         ((6, 10, 2), (6, 4))
         >>> without = problem.with_term(problem.lines.reweighted(jnp.zeros((6, 4))))
@@ -144,15 +156,16 @@ class Problem(eqx.Module):
 
     """
 
-    pixels: Float[Array, "n s 2"]
+    pixels: Float[Array, "h s 2"]
     edges: Edges
     terms: tuple[AbstractTerm, ...]
     fixed_pose: Bool[Array, " n"]
     fixed_intrinsics: Bool[Array, "*g k"]
-    fraction: Float[Array, "n g m"] | None = None
+    fraction: Float[Array, "h g m"] | None = None
     camera_of: Int[Array, " n"] | None = None
     camera: type[AbstractCamera] = eqx.field(static=True, default=Pinhole)
     positive_depth: bool = eqx.field(static=True, default=True)
+    host: Int[Array, " h"] | None = None
 
     def __getattr__(self, name: str) -> Any:
         for term in vars(self).get("terms", ()):
@@ -259,7 +272,12 @@ class Problem(eqx.Module):
 
     @property
     def num_keyframes(self) -> int:
-        return self.pixels.shape[0]
+        return len(self.fixed_pose)
+
+    @property
+    def host_of_row(self) -> Int[Array, " h"]:
+        """Keyframe that hosts each row of landmarks."""
+        return jnp.arange(self.num_keyframes) if self.host is None else self.host
 
     @property
     def num_parameters(self) -> int:

@@ -48,6 +48,8 @@ LAYOUT: dict[str, tuple[str | int, ...]] = {
 OPTIONAL: dict[str, tuple[str | int, ...]] = {"var_segment": ("D",)}
 """Arrays that a problem may lack."""
 INDICES = ("edges", "var_kf", "pt_edge", "pt_var", "ln_edge", "ln_var", "var_segment")
+_OF_ROWS = ("part", "step")
+"""Arrays of the index of a problem in which a keyframe has several rows of landmarks."""
 _SAVED = ("problem/", "state/", "index/")
 """How the arrays of a saved problem begin."""
 
@@ -153,8 +155,9 @@ def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -
     parts = {"problem": problem, "state": state}
     description = {name: describe(part, name, arrays) for name, part in parts.items()}
     whole = {"version": VERSION, "index": list(index.shape), **description}
-    for name in ("host", "slot", "edge"):
-        arrays[f"index/{name}"] = getattr(index, name)
+    for name in ("host", "slot", "edge", *_OF_ROWS):
+        if getattr(index, name) is not None:
+            arrays[f"index/{name}"] = getattr(index, name)
     with atomic_open(path, "wb") as file:
         named: dict[str, Any] = {DESCRIPTION: np.array(json.dumps(whole)), **arrays}
         np.savez_compressed(file, **named)
@@ -202,8 +205,8 @@ def _restored(
             raise InputError(f"it has the version {whole['version']}; this program reads {VERSION}")
         problem, state = (restore(whole[name], arrays, terms, dtype, as_array) for name in ("problem", "state"))
         host, slot, edge = (arrays[f"index/{name}"] for name in ("host", "slot", "edge"))
-        keyframes, edges, slots = map(int, whole["index"])
-        index = SlotIndex(host, slot, edge, (keyframes, edges, slots))
+        rows, edges, slots = map(int, whole["index"])
+        index = SlotIndex(host, slot, edge, (rows, edges, slots), *(arrays.get(f"index/{name}") for name in _OF_ROWS))
         check_problem(problem, state, index)
     except InputError as error:
         raise InputError(f"`{path}` cannot be read as a problem: {error}") from error

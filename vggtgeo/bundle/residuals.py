@@ -5,16 +5,18 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.objective import (
     EdgeData,
     Motions,
+    Place,
     cameras_of,
     edge_data,
     hosts_of,
     motions_of,
     of_edge,
+    places,
     prepared,
     relative_poses,
     view_of,
@@ -72,7 +74,7 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
         >>> window = vg.simulate_window(noise=0.5)
         >>> problem, initial, _ = window.pack()
         >>> print(jax.jit(vg.residual_sizes)(problem.without_term("intrinsics_prior"), window.truth()))
-        points 0.65 px (240), lines 0.43 px (144), depth 0.71 sigma (128)
+        points 0.65 px (240), lines 0.43 px (144), depth 0.71 sigma (128), host_pixels 0.79 px (80)
 
     """
     check_pair(problem, state)
@@ -102,7 +104,7 @@ def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."
     """Every residual of `problem` at `state`, before weights and kernel, by the name of its term.
 
     The axes of the term's `weight` come first, then the entries of a residual where it has more than one: points
-    `[e, p, 2]`, lines `[e, l]`, depth `[n, s]`. Any finite number where an observation is absent. Pure: works under
+    `[e, p, 2]`, lines `[e, l]`, depth `[h, s]`. Any finite number where an observation is absent. Pure: works under
     `jit` and `vmap`.
 
     Example:
@@ -146,13 +148,13 @@ def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[
     if not alone.edge_terms:
         return jnp.zeros((1, *term.weight.shape), state.inverse_depth.dtype)
 
-    def edge(ends: tuple[Array, Array], motion: Motions, data: EdgeData) -> Array:
-        ((one, view),) = of_edge(alone, view_of(cameras, hosts, ends, motion), data)
+    def edge(place: Place, motion: Motions, data: EdgeData) -> Array:
+        ((one, view),) = of_edge(alone, view_of(cameras, hosts, place, motion), data)
         assert isinstance(one, EdgeTerm)
         return one.residuals(view)
 
     each = jax.vmap(edge, out_axes=1)
-    return each(problem.edges.ends, motions_of(relative_poses(problem, state)), edge_data(alone))
+    return each(places(problem), motions_of(relative_poses(problem, state)), edge_data(alone))
 
 
 def count_rows(problem: Problem, term: AbstractTerm, state: State) -> Int[Array, ""]:
@@ -167,3 +169,15 @@ def _size(term: AbstractTerm, residual: Float[Array, "m *b"]) -> tuple[Float[Arr
     squared = jnp.sum(residual**2, 0)
     trusted = term.weights * term.kernel.weight(term.weights * squared)
     return jnp.sqrt(jnp.sum(trusted * squared) / jnp.sum(trusted)), jnp.sum(term.present())
+
+
+def used_slots(problem: Problem) -> Bool[Array, "h s"]:
+    """Slots that any term has an observation of."""
+    used = jnp.zeros(problem.pixels.shape[:2], bool)
+    for slot in problem.slot_terms:
+        used = used | slot.present()
+    for term in problem.edge_terms:
+        present = term.present()
+        after = used.shape[1] - term.first_slot - present.shape[1]
+        used = used.at[problem.edges.row].max(jnp.pad(present, ((0, 0), (term.first_slot, after))))
+    return used

@@ -13,7 +13,7 @@ import numpy as np
 
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.pair_checks import check_pair
-from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
@@ -32,10 +32,10 @@ def check_problem(problem: Any, state: Any, index: SlotIndex) -> None:
     """
     if not (isinstance(problem, Problem) and isinstance(state, State)):
         raise InputError(f"it holds {type(problem).__name__} and {type(state).__name__}; expected Problem and State")
-    shape = problem.num_keyframes, len(problem.edges.source), problem.pixels.shape[1]
+    shape = problem.pixels.shape[0], len(problem.edges.source), problem.pixels.shape[1]
     _check_shapes(problem, state, *shape)
     _check_values(problem, state)
-    _check_edges(problem.edges, problem.num_keyframes)
+    _check_edges(problem)
     _check_index(index, shape)
     for term in problem.terms:
         if not isinstance(term, AbstractTerm):
@@ -45,22 +45,31 @@ def check_problem(problem: Any, state: Any, index: SlotIndex) -> None:
     check_pair(problem, state)
 
 
-def _check_shapes(problem: Problem, state: State, keyframes: int, edges: int, slots: int) -> None:
+def _check_shapes(problem: Problem, state: State, rows: int, edges: int, slots: int) -> None:
+    keyframes = rows if problem.host is None else problem.num_keyframes
     expected = {
-        "problem/pixels": (problem.pixels, (keyframes, slots, 2)),
+        "problem/pixels": (problem.pixels, (rows, slots, 2)),
         "state/poses": (state.poses.wxyz_xyz, (keyframes, 7)),
-        "state/inverse_depth": (state.inverse_depth, (keyframes, slots)),
+        "state/inverse_depth": (state.inverse_depth, (rows, slots)),
         "state/intrinsics": (state.intrinsics, problem.fixed_intrinsics.shape),
         "problem/fixed_pose": (problem.fixed_pose, (keyframes,)),
         "problem/edges/source": (problem.edges.source, (edges,)),
         "problem/edges/target": (problem.edges.target, (edges,)),
         "problem/edges/index_at_host": (problem.edges.index_at_host, (edges,)),
-        "problem/edges/of_host": (problem.edges.of_host, (keyframes, *np.shape(problem.edges.of_host)[1:2])),
+        "problem/edges/of_host": (problem.edges.of_host, (rows, *np.shape(problem.edges.of_host)[1:2])),
     }
+    if (problem.host is None) != (problem.edges.row_of is None):
+        raise InputError("it has one of the arrays `problem/host` and `problem/edges/row_of`, not both")
+    if problem.host is not None:
+        expected["problem/host"] = (problem.host, (rows,))
+        expected["problem/edges/row_of"] = (problem.edges.row, (edges,))
     if problem.camera_of is not None:
         expected["problem/camera_of"] = (problem.camera_of, (keyframes,))
     if problem.fraction is not None:
-        expected["problem/fraction"] = (problem.fraction, (keyframes, *np.shape(problem.fraction)[1:3]))
+        expected["problem/fraction"] = (problem.fraction, (rows, *np.shape(problem.fraction)[1:3]))
+    if state.pixel_offset is not None:
+        offsets = min(np.shape(state.pixel_offset)[1], slots) if np.ndim(state.pixel_offset) == 3 else slots
+        expected["state/pixel_offset"] = (state.pixel_offset, (rows, offsets, 2))
     for name, (array, shape) in expected.items():
         _check_shape(name, array, shape)
     if problem.first_segment < 0:
@@ -99,18 +108,27 @@ def _check_numbers(name: str, values: Any, count: int, what: str) -> None:
         raise InputError(f"array `{name}` has the number {wrong}; there are {count} {what}")
 
 
-def _check_edges(edges: Edges, keyframes: int) -> None:
-    """Sorted by host; their places are those that follow from that."""
-    source = np.asarray(edges.source)
+def _check_edges(problem: Problem) -> None:
+    """Sorted by host and row; their places are those that follow from that."""
+    edges, rows = problem.edges, len(problem.pixels)
+    source, row = np.asarray(edges.source), np.asarray(edges.row)
     for name, values in (("source", source), ("target", edges.target)):
-        _check_numbers(f"problem/edges/{name}", values, keyframes, "keyframes")
+        _check_numbers(f"problem/edges/{name}", values, problem.num_keyframes, "keyframes")
     if np.any(np.diff(source) < 0):
         raise InputError("array `problem/edges/source` is not ascending; edges are sorted by their first keyframe")
-    place = np.arange(len(source)) - np.searchsorted(source, np.arange(keyframes))[source]
+    if problem.host is not None:
+        host = np.asarray(problem.host)
+        _check_numbers("problem/host", host, problem.num_keyframes, "keyframes")
+        _check_numbers("problem/edges/row_of", row, rows, "rows")
+        if not np.array_equal(np.unique(host), np.arange(problem.num_keyframes)) or np.any(np.diff(host) < 0):
+            raise InputError("array `problem/host` is not ascending, or lacks a keyframe")
+        if np.any(np.diff(row) < 0) or not np.array_equal(host[row], source):
+            raise InputError("array `problem/edges/row_of` is not ascending, or names rows of other hosts")
+    place = np.arange(len(row)) - np.searchsorted(row, np.arange(rows))[row]
     found = np.asarray(edges.of_host)
     if place.max(initial=-1) < found.shape[1]:
         of_host = np.full(found.shape, len(source))
-        of_host[source, place] = np.arange(len(source))
+        of_host[row, place] = np.arange(len(source))
         if np.array_equal(found, of_host) and np.array_equal(edges.index_at_host, place):
             return
     raise InputError(
@@ -122,12 +140,17 @@ def _check_edges(edges: Edges, keyframes: int) -> None:
 def _check_index(index: SlotIndex, shape: tuple[int, int, int]) -> None:
     """Each landmark at a place of its own, each edge at a row of its own."""
     if index.shape != shape:
-        raise InputError(f"its index is of {index.shape} keyframes, edges, slots; expected {shape}")
-    keyframes, edges, slots = shape
+        raise InputError(f"its index is of {index.shape} rows, edges, slots; expected {shape}")
+    count, edges, slots = shape
     _check_shape("index/slot", index.slot, np.shape(index.host))
-    _check_numbers("index/host", index.host, keyframes, "keyframes")
+    _check_numbers("index/host", index.host, count, "rows")
     _check_numbers("index/slot", index.slot, slots, "slots")
     _check_numbers("index/edge", index.edge, edges, "edges")
+    if index.part is not None and index.step is not None:
+        _check_shape("index/part", index.part, np.shape(index.host))
+        _check_shape("index/step", index.step, np.shape(index.edge))
+        _check_numbers("index/part", index.part, count, "rows")
+        _check_numbers("index/step", index.step, edges + 1, "edges")
     for name, rows in (("slot", np.stack([index.host, index.slot], -1)), ("edge", np.asarray(index.edge)[:, None])):
         if len(np.unique(rows, axis=0)) < len(rows):
             raise InputError(f"array `index/{name}` has the same place twice")
@@ -150,7 +173,7 @@ def _check_term(term: AbstractTerm, name: str) -> None:
 
 def _check_place(term: AbstractTerm, name: str, problem: Problem) -> None:
     """What a term is about is in the problem."""
-    keyframes, slots = problem.pixels.shape[:2]
+    (rows, slots), keyframes = problem.pixels.shape[:2], problem.num_keyframes
     weight = np.asarray(term.weight)
     if isinstance(term, EdgeTerm):
         seen = weight.shape[1] if weight.ndim > 1 else 0
@@ -162,7 +185,7 @@ def _check_place(term: AbstractTerm, name: str, problem: Problem) -> None:
         if np.any(weight[itself] > 0):
             raise InputError(f"`{term.name}` has observations along an edge from a keyframe to itself")
     elif isinstance(term, SlotTerm):
-        _check_shape(f"{name}/weight", weight, (keyframes, slots))
+        _check_shape(f"{name}/weight", weight, (rows, slots))
         if isinstance(term, DepthPrior) and not np.all(np.asarray(term.sigma)[weight > 0] > 0):
             raise InputError(f"array `{name}/sigma` has values that are not positive, of observations that are there")
     elif isinstance(term, MarginalPrior):

@@ -127,6 +127,9 @@ def find_class(path: str, own: Sequence[type]) -> type:
 
 def _filled(kind: type, values: Mapping[str, Any]) -> Any:
     names = {field.name for field in dataclasses.fields(kind)}
+    # A field that came later and may be absent: files that were written before it do not name it.
+    later = {field.name: None for field in dataclasses.fields(kind) if field.default is None}
+    values = {**later, **values}
     if names != values.keys():
         raise InputError(
             f"`{path_of(kind)}` has the fields {sorted(names)}; the file gives {sorted(values)}: it was written by "

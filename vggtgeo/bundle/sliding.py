@@ -41,8 +41,9 @@ def slide(
         state: its solution.
         next_problem: what the next window observes, of the same shapes. It gets the prior, and poses that are held stay
             so; its own `fixed_pose` counts for the new keyframe alone.
-        next_initial: where it starts: of it come the inverse depths (1/m), the pixel offsets if there are any, and the new keyframe's pose (world ->
-            camera, the last). The other poses and the cameras' parameters are those of `state`.
+        next_initial: where it starts: of it come the inverse depths (1/m), the pixel offsets if there are any, and the
+            new keyframe's pose (world -> camera, the last). The other poses and the cameras' parameters are those of
+            `state`.
         leaving: which keyframe leaves; 0 is the oldest. May be traced.
         constant_velocity: start the new pose where the motion between the last two keyframes of `state` leads, if it
             went on; `next_initial` then counts for inverse depths alone.

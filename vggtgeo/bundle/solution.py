@@ -12,10 +12,13 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.diagnosis import Diagnosis, diagnose, diagnosis_like
 from vggtgeo.bundle.graduation import Graduation
+from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
+from vggtgeo.bundle.resolution import MAJORITY
 from vggtgeo.bundle.solver_choice import default_solver
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
@@ -60,6 +63,8 @@ class Solution(Readable):
     not those of an optimum."""
     at_bound: Int[Array, ""]
     """Landmarks that rest on the bound of positive inverse depths: they want to lie behind infinity."""
+    diagnosis: Diagnosis
+    """Observations at fault, term by term; `message` has them in words."""
     record: IterationRecord | None = None
     """What each iteration did, with `SchurLevenbergMarquardt(record_iterations=True)`."""
 
@@ -95,8 +100,14 @@ class Solution(Readable):
 
     @property
     def message(self) -> str:
-        """Why the iteration ended and what to do (outside `jit`, for one solution)."""
-        return termination_message(self.termination)
+        """Why the iteration ended and what to do, and which terms are at fault: residuals that are not finite, kernels
+        that reject most of a term, held poses that contradict one (outside `jit`, for one solution).
+        """
+        ended = termination_message(self.termination)
+        found = self.diagnosis.sentences(failed=not bool(self.converged) and self.result != "max_iterations")
+        if self.result == "nonfinite_step" and not found:
+            found = ["Look for weights or standard deviations that are far too large or too small."]
+        return " ".join([ended, *found])
 
 
 def solve(
@@ -184,6 +195,10 @@ def _solve_jit(
     )
     last = jax.lax.stop_gradient(eqx.filter(found.state, eqx.is_array))
     last = eqx.combine(last, found.state)
+    fixed = jax.lax.stop_gradient((problem, initial, found.value))
+    diagnosis = diagnose(prepared(fixed[0]), *fixed[1:])
+    codes: Any = Termination
+    beyond = jnp.any(diagnosis.unresolved > MAJORITY)
     return Solution(
         state=found.value,
         energy=_energy_at(last.energy, BundleAdjustment(problem), found.value),
@@ -191,10 +206,11 @@ def _solve_jit(
         iterations=last.iterations,
         linearisations=last.linearisations,
         gradient_norm=last.gradient_norm,
-        termination=last.termination,
+        termination=codes.where(beyond, codes.beyond_precision, last.termination),
         polished=last.polished,
         gradient_residual=last.gradient_residual,
-        at_bound=_at_bound(problem, jax.lax.stop_gradient(found.value)),
+        at_bound=_at_bound(problem, fixed[2]),
+        diagnosis=diagnosis,
         record=last.record,
     )
 
@@ -238,6 +254,7 @@ def solution_like(problem: Problem, initial: State, solver: SchurLevenbergMarqua
         polished=jnp.asarray(False),
         gradient_residual=number,
         at_bound=count,
+        diagnosis=diagnosis_like(problem),
         record=IterationRecord(tries, tries, tries, moved) if solver.record_iterations else None,
     )
 

@@ -36,17 +36,19 @@ def padded(term: GivenTerm, index: SlotIndex, size: PaddedSize, dtype: DTypeLike
         return term.padded(size.keyframes)
     if isinstance(term, COUNTED):
         return _lengthened(term, dict(size.terms).get(term.name, len(term.weight)))
-    keyframes, edges, slots = index.shape
-    check_padded(term, (keyframes if isinstance(term, SlotTerm) else edges,), slots)
+    rows, edges, slots = index.shape
+    check_padded(term, (rows if isinstance(term, SlotTerm) else edges,), slots)
     return term
 
 
 def placed(term: FlatTerm, index: SlotIndex, slots: tuple[int, int], dtype: DTypeLike) -> AbstractTerm:
-    """A flat term with each row at its landmark's slot, over the slots `[first, end)` of every host."""
+    """A flat term with each row at its landmark's slot, over the slots `[first, end)` of every row."""
     first, end = slots
-    keyframes, edges, _ = index.shape
+    rows, edges, _ = index.shape
     on_edges = issubclass(term.kind, EdgeTerm)
-    outer, where = (edges, index.edge[term.edge]) if on_edges else (keyframes, index.host[term.landmark])
+    outer, where = rows, index.host[term.landmark]
+    if on_edges and term.edge is not None:
+        outer, where = edges, index.stored_edge(term.edge, term.landmark)
     at = (where, index.slot[term.landmark] - first)
 
     def scatter(values: np.ndarray, empty: float = 1.0) -> Array:
@@ -55,9 +57,9 @@ def placed(term: FlatTerm, index: SlotIndex, slots: tuple[int, int], dtype: DTyp
         whole[at] = values
         return jnp.asarray(whole)
 
-    rows = term.rows()
-    weight = scatter(np.asarray(rows.pop("weight"), float), 0.0)
-    data: dict[str, Any] = {name: jax.tree.map(scatter, values) for name, values in rows.items()}
+    given = term.rows()
+    weight = scatter(np.asarray(given.pop("weight"), float), 0.0)
+    data: dict[str, Any] = {name: jax.tree.map(scatter, values) for name, values in given.items()}
     if on_edges:
         data["first_slot"] = first
     return term.kind(**data, **term.shared(), weight=weight)

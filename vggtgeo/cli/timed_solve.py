@@ -7,7 +7,6 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 
 from vggtgeo.bundle.objective import energy
@@ -104,8 +103,5 @@ def timed_solve(problem: Problem, start: State, max_steps: int, repeat: int) -> 
 
 def _widen(state: State) -> State:
     """The state in float64, its quaternions of unit length again."""
-    return State(
-        jaxlie.SE3(state.poses.wxyz_xyz.astype(jnp.float64)).normalize(),
-        state.intrinsics.astype(jnp.float64),
-        state.inverse_depth.astype(jnp.float64),
-    )
+    wide: State = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), state)
+    return replace(wide, poses=wide.poses.normalize())

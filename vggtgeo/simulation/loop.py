@@ -90,7 +90,9 @@ def simulate_loop(
         alpha=2.0,
     )
     start = _drifted(poses, drift, start_error, rng)
-    window = SimulatedWindow(observations, poses, 1 / depth, start, np.zeros(len(target), bool), noise)
+    window = SimulatedWindow(
+        observations, poses, 1 / depth, start, np.zeros(len(target), bool), noise, observations.pixel
+    )
     return window, _surfaces(poses, max(reach // 2, 1), rng)
 
 

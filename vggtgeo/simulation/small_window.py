@@ -6,10 +6,11 @@ For examples, notebooks and tests: it is made in milliseconds, and every number 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
@@ -43,7 +44,8 @@ class SimulatedWindow:
         inverse_depth: float [D], true, 1/m.
         start: float [n, 7], poses some centimetres off; the first is right.
         outlier: bool [A], the point observations that are wrong.
-        sigma: pixels of noise on every match.
+        sigma: pixels of noise on every match, and on the hosts' pixels of points.
+        pixel: float [D, 2], true pixel of each landmark in its host.
 
     Example:
         >>> import vggtgeo as vg
@@ -60,6 +62,7 @@ class SimulatedWindow:
     start: Float[np.ndarray, "n 7"]
     outlier: Bool[np.ndarray, " a"]
     sigma: float
+    pixel: Float[np.ndarray, "d 2"]
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "4"]:
@@ -82,7 +85,13 @@ class SimulatedWindow:
     def truth(self, **options: Any) -> State:
         """The true state, as the problem of `pack(**options)` stores it."""
         options = {"fixed_intrinsics": True, **options}
-        return pack(self.observations, self.poses, self.intrinsics, self.inverse_depth, **options)[1]
+        _, state, index = pack(self.observations, self.poses, self.intrinsics, self.inverse_depth, **options)
+        if state.pixel_offset is None:
+            return state
+        points = index.slot < state.pixel_offset.shape[1]
+        offset = np.zeros(state.pixel_offset.shape)
+        offset[index.host[points], index.slot[points]] = (self.pixel - self.observations.pixel)[points]
+        return replace(state, pixel_offset=jnp.asarray(offset, state.pixel_offset.dtype))
 
     def errors(self, state: State) -> Float[np.ndarray, " n"]:
         """Distance of each camera centre of `state` from the truth, metres."""
@@ -189,7 +198,8 @@ def simulate_window(
         alpha=2.0,
         pixel_sigma=1.0 if host_noise else None,
     )
-    return SimulatedWindow(observations, poses, inverse, start, outlier, noise)
+    true = np.concatenate([pixel, line_pixel])
+    return SimulatedWindow(observations, poses, inverse, start, outlier, noise, true)
 
 
 def centres_of(poses: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 3"]:

@@ -69,7 +69,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 12
+VERSION = 13
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -140,6 +140,14 @@ def _with_seen_points(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
+def _with_rows(header: Header) -> Header:
+    """Version 12 had one row of landmarks a keyframe."""
+    tree, classes = header["tree"], header["classes"]
+    for kind, field in (("Problem", "host"), ("Edges", "row_of"), ("SlotIndex", "part"), ("SlotIndex", "step")):
+        tree, classes = with_field(tree, classes, kind, field)
+    return {**header, "tree": tree, "classes": classes}
+
+
 UPGRADES = {
     1: _with_recorded_times,
     2: _with_lens,
@@ -152,6 +160,7 @@ UPGRADES = {
     9: _with_focal_with_lens,
     10: _with_fisheyes,
     11: _with_seen_points,
+    12: _with_rows,
 }
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.analysis.redundancy import changing
+from vggtgeo.bundle.diagnosis import refuse_not_finite
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.observed import check_weights
@@ -32,6 +33,7 @@ from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import covariance
+from vggtgeo.solvers.finite import is_finite, unless
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600
@@ -41,17 +43,22 @@ ITERATIVE_KEYFRAMES = 32
 
 
 class Covariances(Readable):
-    """Marginal covariances at a solution; no entry is NaN.
+    """Marginal covariances at a solution, by the stated weights; they are not scaled by the variance factor.
 
     What nothing determines has infinite variance (and zero covariance with the rest); what is held has zero. Without
-    metric depth the scale is free: the covariances are then those of the solution with the scale held where it is.
+    metric depth the scale is free: the covariances are then those of the solution with the scale held where it is. All
+    are NaN only where the linearisation is not finite, which outside `jit` is an error.
+
+    They are as right as the weights. A variance factor far above 1 says that residuals are larger than the weights
+    state: wrong weights, wrong matches, or data that contradict each other or the poses that are held. `scaled()` gives
+    the covariances times that factor; the printed line has both.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.eval_shape(vg.covariances, problem, solution.state)
         >>> found.poses.shape, found.intrinsics.shape
         ((4, 6, 6), (4, 4))
         >>> vg.covariances(problem, solution.state)
-        Covariances(4 keyframes, centres known to 5.5 mm at worst, variance factor 0.27)
+        Covariances(4 keyframes, centres known to 6.0 mm at worst, 3.2 mm by the residuals, variance factor 0.28)
 
     """
 
@@ -59,10 +66,11 @@ class Covariances(Readable):
     """Of the left tangent `log(T T_true^-1)`, translation first: m^2, m rad, rad^2, in the camera's own frame."""
     intrinsics: Float[Array, "q q"]
     """Of the parameters of all cameras, `Problem.parameter_names`: pixels^2 (distortion: no unit)."""
-    inverse_depth: Float[Array, "h s"]
-    """Variances, 1/m^2; infinite for slots that hold nothing."""
-    neighbours: Float[Array, "h k 6 6"]
-    """Of each pose (rows) with that of the keyframe at the other end of each edge that leaves it, `edges.of_host`."""
+    inverse_depth: Float[Array, "r s"]
+    """Variances, 1/m^2; infinite for slots that hold nothing. Of the rows of these keyframes (`Problem.host`): `r = h`
+    unless one has several."""
+    neighbours: Float[Array, "r k 6 6"]
+    """Of the pose that hosts each row with that at the other end of each edge of the row, `edges.of_host`."""
     variance_factor: Float[Array, ""]
     """Estimated variance of a residual of weight 1: `2 energy / (rows - unknowns)`, 1 without redundancy. About 1 if
     the weights are right; 4 to 7 % low under Huber with delta 1.5, which caps large residuals."""
@@ -100,13 +108,13 @@ class Covariances(Readable):
         blocks = np.asarray(self.poses, np.float64)[:, :3, :3]
         known = np.isfinite(blocks).all((1, 2))
         moving = blocks[known][np.any(blocks[known] != 0, (1, 2))]  # those that are held have no covariance
-        worst = f"{1e3 * np.sqrt(np.linalg.eigvalsh(moving).max(initial=0.0)):.1f} mm at worst"
+        worst, factor = 1e3 * np.sqrt(np.linalg.eigvalsh(moving).max(initial=0.0)), float(self.variance_factor)
         if known.all():
-            centres = f"centres known to {worst}"
+            centres = f"centres known to {worst:.1f} mm at worst, {worst * factor**0.5:.1f} mm by the residuals"
         else:
             centres = f"centres of {(~known).sum()} undetermined"
-            centres += f", of {len(moving)} known to {worst}" if len(moving) else ""
-        return f"Covariances({len(blocks)} keyframes, {centres}, variance factor {float(self.variance_factor):.2f})"
+            centres += f", of {len(moving)} known to {worst:.1f} mm at worst" if len(moving) else ""
+        return f"Covariances({len(blocks)} keyframes, {centres}, variance factor {factor:.2f})"
 
 
 def covariances(
@@ -147,9 +155,29 @@ def covariances(
     expected = "what `vggtgeo.choose_reduced_solver` gives"
     check_kind("reduced_solver", reduced_solver, AbstractReducedSolver | None, expected)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
-    asked = jnp.arange(problem.num_keyframes) if keyframes is None else _numbers_of(keyframes, problem.num_keyframes)
-    _check_size(solver, problem.num_keyframes, len(asked))
-    return _covariances_jit(problem, state, solver, asked)
+    rows, first = _rows(problem, keyframes)
+    _check_size(solver, problem.num_keyframes, len(rows))
+    found = _covariances_jit(problem, state, solver, rows, first)
+    refuse_not_finite(problem, state, jnp.isfinite(found.variance_factor))
+    return found
+
+
+def _rows(problem: Problem, keyframes: Any) -> tuple[Int[Array, " r"], Int[Array, " h"] | None]:
+    """The rows of landmarks of the keyframes asked for, and which of them is the first of each keyframe; None: all."""
+    asked = None if keyframes is None else _numbers_of(keyframes, problem.num_keyframes)
+    if problem.host is None:
+        return jnp.arange(problem.num_keyframes) if asked is None else asked, None
+    if asked is None:
+        return jnp.arange(len(problem.host)), jnp.searchsorted(problem.host, jnp.arange(problem.num_keyframes))
+    if isinstance(problem.host, jax.core.Tracer) or isinstance(asked, jax.core.Tracer):
+        raise InputError(
+            "`keyframes` of a problem in which one has several rows of landmarks; expected arrays with values: call "
+            "`covariances` outside `jit`, ask for all, or give `pack` a `size`"
+        )
+    with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
+        each = [np.flatnonzero(np.asarray(problem.host) == keyframe) for keyframe in np.asarray(asked)]
+    first = np.cumsum([0, *(len(own) for own in each[:-1])])
+    return jnp.asarray(np.concatenate(each)), jnp.asarray(first)
 
 
 def _numbers_of(keyframes: Any, count: int) -> Int[Array, " h"]:
@@ -167,18 +195,24 @@ def _numbers_of(keyframes: Any, count: int) -> Int[Array, " h"]:
 
 @eqx.filter_jit  # one operation after the other, as outside `jit`, would be compiled one by one: for most of a minute
 def _covariances_jit(
-    problem: Problem, state: State, solver: AbstractReducedSolver, asked: Int[Array, " h"]
+    problem: Problem,
+    state: State,
+    solver: AbstractReducedSolver,
+    rows: Int[Array, " r"],
+    first: Int[Array, " h"] | None,
 ) -> Covariances:
     ready = prepared(problem)
-    found = covariance(linearise(ready, state), solver, asked)
-    return Covariances(
-        poses=found.nodes,
+    system = linearise(ready, state)
+    found = covariance(system, solver, rows)
+    known = Covariances(
+        poses=found.nodes if first is None else found.nodes[first],
         intrinsics=found.shared,
         inverse_depth=found.landmarks[:, num_offsets(state) :],
         neighbours=found.neighbours,
         variance_factor=variance_factor(ready, state, found.rank),
         parameters=problem.parameter_names,
     )
+    return unless(is_finite(system), known)
 
 
 def _check_size(solver: AbstractReducedSolver, keyframes: int, asked: int) -> None:

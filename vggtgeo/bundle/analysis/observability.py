@@ -34,13 +34,13 @@ from jaxtyping import Array, Bool, Float
 from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import SHOWN, Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
+from vggtgeo.bundle.diagnosis import refuse_not_finite
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.residuals import term_residuals
-from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.residuals import term_residuals, used_slots
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
@@ -53,6 +53,7 @@ from vggtgeo.solvers.arrow import (
     reduce,
 )
 from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
+from vggtgeo.solvers.finite import is_finite, unless
 from vggtgeo.solvers.landmark_basis import expand, join_landmarks
 from vggtgeo.solvers.local_inverse import balance
 from vggtgeo.solvers.symmetric_eigen import symmetric_eigen
@@ -93,9 +94,12 @@ def observability(problem: Problem, state: State) -> Observability:
     check_finite(state)
     check_weights(problem)
     if problem.num_keyframes <= DENSE_KEYFRAMES:
-        return _observability_jit(problem, state)
+        known = _observability_jit(problem, state)
+        refuse_not_finite(problem, state, jnp.all(jnp.isfinite(known.landmark_information)))
+        return known
     _check_large(problem, state)
     systems, everything, coordinates = _linearise_jit(problem, state)
+    refuse_not_finite(problem, state, is_finite(everything))
     layout = sparse_layout(everything)
     blocks = (_blocks_jit(systems, keep, problem.fraction, layout) for keep in _selections(len(systems), state))
     found = [_sparse_spectrum(own, layout, coordinates) for own in blocks]
@@ -108,7 +112,8 @@ def _observability_jit(problem: Problem, state: State) -> Observability:
     systems, everything, coordinates = _linearise_each(problem, state)
     combined = lambda keep: reduce(_combine(systems, keep, problem.fraction))
     spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), _selections(len(systems), state))
-    return _found(problem, state, systems, everything, coordinates, spectra)
+    found = _found(problem, state, systems, everything, coordinates, spectra)
+    return unless(is_finite(everything), found)
 
 
 def _selections(count: int, state: State) -> Float[Array, "m k"]:
@@ -136,7 +141,7 @@ def _found(
         common=balanced / jnp.where(size > 0, size, 1.0),
         free=coordinates.free,
         landmark_information=sum(system.landmark_hessian[:, first:] for system in systems) * state.inverse_depth**2,
-        landmark_used=_used(problem),
+        landmark_used=used_slots(problem),
         scale=coordinates.scale,
         depth_change=_depth_change(
             everything, spectra.vectors[0, :, :SHOWN] / coordinates.scale[:, None], problem, state
@@ -156,7 +161,7 @@ def _depth_change(
     system: ArrowSystem, directions: Float[Array, "c w"], problem: Problem, state: State
 ) -> Float[Array, " w"]:
     """Relative change of the inverse depths that follow each direction, root mean square over those in use."""
-    used = _used(problem)
+    used = used_slots(problem)
 
     def following(direction: Float[Array, " c"]) -> Float[Array, ""]:
         moved = -inverse_landmark_hessian(system) * couple(system, jnp.where(system.free, direction, 0.0), 0.0)
@@ -174,7 +179,7 @@ def _edge_parallax(problem: Problem, state: State) -> Float[Array, " e"]:
         residuals = lambda depth, term=term: term_residuals(ready, term, replace(state, inverse_depth=depth))
         residual, slope = jax.jvp(residuals, (depth,), (jnp.ones_like(depth),))  # each sees one depth
         pull = term.weights * term.kernel.weight(term.weights * jnp.sum(residual**2, 0))
-        own = depth[problem.edges.source, term.first_slot : term.first_slot + pull.shape[1]]
+        own = depth[problem.edges.row, term.first_slot : term.first_slot + pull.shape[1]]
         largest = jnp.maximum(largest, jnp.max(pull * jnp.sum(slope**2, 0) * own**2, 1, initial=0.0))
         seen = seen | jnp.any(term.present(), 1)
     return jnp.where(seen, largest, jnp.inf)
@@ -303,19 +308,3 @@ def _along_all(
     """`d' S d` of all named directions: a coordinate of a keyframe has its entry of the diagonal."""
     single = jnp.where(coordinates.free, diagonal, 0.0)[: coordinates.poses]
     return jnp.maximum(jnp.concatenate([common, single]), 0.0)
-
-
-def _used(problem: Problem) -> Bool[Array, "n s"]:
-    """Slots that any term speaks of."""
-    used = jnp.zeros(problem.pixels.shape[:2], bool)
-    for slot in problem.slot_terms:
-        used = used | slot.present()
-    for term in problem.edge_terms:
-        seen = _at_slots(term, used.shape[1])
-        used = used.at[problem.edges.source].max(seen)
-    return used
-
-
-def _at_slots(term: EdgeTerm, slots: int) -> Bool[Array, "e s"]:
-    present = term.present()
-    return jnp.pad(present, ((0, 0), (term.first_slot, slots - term.first_slot - present.shape[1])))

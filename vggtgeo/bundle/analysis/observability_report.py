@@ -49,8 +49,8 @@ class Observability(eqx.Module):
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.eval_shape(vg.observability, problem, solution.state)
-        >>> found.without.values.shape  # one row a term: points, lines, depth, intrinsics_prior
-        (4, 28)
+        >>> found.without.values.shape  # a row a term: points, lines, depth, host_pixels, intrinsics_prior
+        (5, 28)
         >>> vg.observability(problem, solution.state)
         Observability(18 coordinates free, 10 held, weak: none)
 
@@ -109,6 +109,8 @@ class Observability(eqx.Module):
             known = self.to_dict()
         except TypeError:  # inside `jit`, or of a batch
             return eqx.Module.__repr__(self)
+        if not np.isfinite(np.asarray(self.landmark_information)).all():
+            return "Observability(unknown: the linearisation is not finite)"
         weak = "; ".join(known["weak"][:3]) + f" and {len(known['weak']) - 3} more" * (len(known["weak"]) > 3)
         lost, used = known["inverse_depths_undetermined"], known["inverse_depths"]
         weak = "; ".join([weak or "none", *(["pure rotation"] if known["pure_rotation"] else [])])

@@ -24,20 +24,20 @@ class DepthPrior(SlotTerm):
         kernel: robust kernel of each observation.
 
     Example:
-        >>> problem.depth.mean.shape  # keyframes, slots
+        >>> problem.depth.mean.shape  # rows of landmarks (one a keyframe), slots
         (4, 32)
 
     """
 
-    mean: Float[Array, "n s"]
-    sigma: Float[Array, "n s"]
+    mean: Float[Array, "h s"]
+    sigma: Float[Array, "h s"]
     alpha: Float[Array, ""] = shared_field(converter=jnp.asarray, default=1.0)
 
     name = "depth"
     unit = "sigma"
 
     @property
-    def weights(self) -> Float[Array, "n s"]:
+    def weights(self) -> Float[Array, "h s"]:
         return self.alpha * self.weight
 
     def residual(self, inverse_depth: Float[Array, ""]) -> Float[Array, ""]:

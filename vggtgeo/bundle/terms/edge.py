@@ -115,7 +115,7 @@ class PixelModel(NamedTuple):
 
 
 class EdgeTerm(AbstractTerm):
-    """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its host.
+    """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its row.
 
     Fields:
         first_slot: Slot of the host that the first column is about.
@@ -152,6 +152,11 @@ class EdgeTerm(AbstractTerm):
     def residuals(self, view: EdgeView) -> Float[Array, "m p"]:
         """Of all slots of one edge; `self` holds the prepared data of that edge."""
         return self._moved(view, jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth)
+
+    def along_all(self, view: EdgeView) -> tuple[Float[Array, "m p"], Float[Array, "m p"]]:
+        """Residuals of one edge, and their derivative along all coordinates together: not finite if one is not."""
+        at = jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth
+        return jax.jvp(lambda x, d: self._moved(view, x, d), at, jax.tree.map(jnp.ones_like, at))
 
     def energy(self, view: EdgeView) -> Float[Array, ""]:
         """Of one edge."""

@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighted_rows
 
-Derivatives = tuple[Float[Array, "n s"], Float[Array, "n s"]]
+Derivatives = tuple[Float[Array, "h s"], Float[Array, "h s"]]
 
 
 class SlotTerm(AbstractTerm):
-    """Observations of inverse depths: `weight` and data have the axes `[n, s]`, keyframe and slot.
+    """Observations of inverse depths: `weight` and data have the axes `[h, s]`, row of landmarks and slot.
 
     Fields:
         weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
@@ -33,13 +33,13 @@ class SlotTerm(AbstractTerm):
     def residual(self, inverse_depth: Float[Array, ""]) -> Float[Array, "*m"]:
         """Of one landmark, 1/m."""
 
-    def residuals(self, inverse_depth: Float[Array, "n s"]) -> Float[Array, "m n s"]:
+    def residuals(self, inverse_depth: Float[Array, "h s"]) -> Float[Array, "m h s"]:
         """Of all of them, the residual's own axis first."""
         each = lambda data, depth: check_residual(self, self.holding(data).residual(depth))
         return jax.vmap(jax.vmap(each, out_axes=-1), out_axes=1)(self.data(), inverse_depth)
 
     def derivatives(
-        self, inverse_depth: Float[Array, "n s"], correction: Float[Array, ""] | None, exact: bool
+        self, inverse_depth: Float[Array, "h s"], correction: Float[Array, ""] | None, exact: bool
     ) -> Derivatives:
         """First and second derivatives of the energy; of a prepared term."""
         ones = jnp.ones_like(inverse_depth)
@@ -49,11 +49,11 @@ class SlotTerm(AbstractTerm):
         rows, pull = reweighted_rows(self.kernel, self.weights, residual, slope[None], correction)
         return jnp.sum(rows[0] * pull, 0), jnp.sum(rows[0] * rows[0], 0)
 
-    def gradient(self, inverse_depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
+    def gradient(self, inverse_depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
         """First derivative of the energy, differentiable once more."""
         return self._gradient(inverse_depth)
 
-    def _gradient(self, inverse_depth: Float[Array, "n s"]) -> Float[Array, "n s"]:
+    def _gradient(self, inverse_depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
         residual, slope = jax.jvp(self.residuals, (inverse_depth,), (jnp.ones_like(inverse_depth),))
         pull = self.weights * self.kernel.weight(self.weights * jnp.sum(residual**2, 0))
         return pull * jnp.sum(residual * slope, 0)

@@ -1,0 +1,309 @@
+"""What a solve reports beside why it ended: the observations that are at fault, term by term.
+
+Four faults that an energy does not show. A residual or a derivative that is not finite. A term most of whose
+observations its kernel rejects: with more than half of them gone, the breakdown point of any robust estimate, what is
+left says nothing about the term. A held pose that contradicts terms in a frame of their own (position fixes): moving
+all poses together as one rigid body, which no image can notice, would lower the energy of the term. And positions that
+the precision cannot hold as finely as the observations are stated.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy import stats
+
+from vggtgeo.bundle.linearise import free_coordinates
+from vggtgeo.bundle.objective import (
+    EdgeData,
+    Motions,
+    Place,
+    cameras_of,
+    edge_data,
+    hosts_of,
+    motions_of,
+    of_edge,
+    places,
+    prepared,
+    prepared_energy,
+    relative_poses,
+    view_of,
+)
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.residuals import count_rows, term_residuals, used_slots
+from vggtgeo.bundle.resolution import MAJORITY, finer_than_precision
+from vggtgeo.bundle.terms.edge import EdgeTerm, ImageTerm
+from vggtgeo.bundle.terms.node import PairTerm, PoseTerm, node_jacobians, node_residuals
+from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry import lie
+from vggtgeo.io.errors import InputError
+
+SIGNIFICANCE = 1e-3
+"""Probability that Gaussian noise of the stated weights makes an observation count as rejected, or a held pose as
+contradicted."""
+
+
+class Diagnosis(eqx.Module):
+    """Faults of a problem at a state, an entry a term; a pytree of arrays, for one problem or a batch.
+
+    Example (of `solve`'s):
+        >>> solution.diagnosis.names
+        ('points', 'lines', 'depth', 'host_pixels', 'intrinsics_prior')
+        >>> solution.diagnosis.sentences(failed=False)
+        []
+
+    """
+
+    value: Int[Array, " k"]
+    """First observation, counted through the axes of the term's weight, whose residual is not finite; -1 = none."""
+    derivative: Int[Array, " k"]
+    """First one whose residual has a derivative that is not finite; -1 = none."""
+    rejected: Float[Array, " k"]
+    """Share of the observations beyond the noise that their weights state (`SIGNIFICANCE`) where the kernel's pull
+    falls with the distance."""
+    unresolved: Float[Array, " k"]
+    """Share of the observations that the last digit of a pose's position moves by more than a standard deviation."""
+    saved: Float[Array, " k"]
+    """Of a term on poses: by how much its `sum w rho' |r|^2` would fall if all poses moved as one rigid body."""
+    motion: Float[Array, "k 6"]
+    """That motion, in the axes of the first held camera: metres, then radians."""
+    energy: Float[Array, ""]
+    """`sum rho`, of all terms."""
+    redundancy: Int[Array, ""]
+    """Rows of residuals less free unknowns."""
+    names: tuple[str, ...] = eqx.field(static=True)
+    shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    """Of the terms' weights."""
+
+    def sentences(self, failed: bool) -> list[str]:
+        """What is wrong, in words (outside `jit`, for one problem). failed: the solve ended in no optimum."""
+        found = [self._not_finite(k) for k in range(len(self.names))] if failed else []
+        found += [self._unresolved(k) for k in range(len(self.names))]
+        found += [] if failed else [self._rejected(k) for k in range(len(self.names))]
+        found += [] if failed else [self._contradicted(k) for k in range(len(self.names))]
+        return [sentence for sentence in found if sentence]
+
+    def _not_finite(self, k: int) -> str:
+        value, derivative = int(self.value[k]), int(self.derivative[k])
+        if value >= 0:
+            return f"The residual of `{self.names[k]}` is not finite, first of {self._place(k, value)}."
+        if derivative >= 0:
+            return (
+                f"The residual of `{self.names[k]}` is finite, but its derivative is not, first of "
+                f"{self._place(k, derivative)}: the norm of a vector or a root has no derivative at zero."
+            )
+        return ""
+
+    def _place(self, k: int, number: int) -> str:
+        at = tuple(map(int, np.unravel_index(number, self.shapes[k])))
+        return f"observation {at[0] if len(at) == 1 else at}"
+
+    def _unresolved(self, k: int) -> str:
+        share = float(self.unresolved[k])
+        if not share > MAJORITY:
+            return ""
+        return (
+            f"The last digit of a camera's position is more than a standard deviation of {share:.0%} of the "
+            f"observations of `{self.names[k]}`."
+        )
+
+    def _rejected(self, k: int) -> str:
+        share = float(self.rejected[k])
+        if not share > MAJORITY:
+            return ""
+        return (
+            f"The kernel of `{self.names[k]}` rejects {share:.0%} of its observations, which have no part in the "
+            "result: look for another frame, unit or weight of them, or start with `Graduation`."
+        )
+
+    def _contradicted(self, k: int) -> str:
+        saved, redundancy = float(self.saved[k]), int(self.redundancy)
+        rest = (float(self.energy) - saved) / max(redundancy - lie.TANGENT, 1)
+        limit = float(stats.f.isf(SIGNIFICANCE, lie.TANGENT, max(redundancy - lie.TANGENT, 1)))
+        if not saved > limit * lie.TANGENT * max(rest, 0.0) or not saved > stats.chi2.isf(SIGNIFICANCE, lie.TANGENT):
+            return ""
+        metres, radians = (float(np.linalg.norm(half)) for half in np.split(np.asarray(self.motion[k]), 2))
+        return (
+            f"The poses that are held contradict `{self.names[k]}`: {saved / float(self.energy):.0%} of all squared "
+            f"residuals would go if all poses moved together by {metres:.3g} m and {np.degrees(radians):.3g} degrees. "
+            "Bring the start into the frame of the term, or hold no pose (`fixed_pose`)."
+        )
+
+
+def diagnose(problem: Problem, start: State, state: State) -> Diagnosis:
+    """The faults of a prepared problem at `state`; positions are looked at where the iteration starts."""
+    terms = problem.terms
+    found = [_observed(problem, term, state) for term in terms]
+    rigid = [_rigid(problem, term, state) for term in terms]
+    rows = sum((count_rows(problem, term, state) for term in terms), jnp.asarray(0))
+    unknowns = jnp.sum(free_coordinates(problem)) + jnp.sum(used_slots(problem))
+    unknowns += sum((2 * jnp.sum(pixel.present()) for pixel in problem.pixel_terms), jnp.asarray(0))
+    dtype = state.inverse_depth.dtype
+    return Diagnosis(
+        value=jnp.stack([_first(own.present & ~own.value) for own in found]),
+        derivative=jnp.stack([_first(own.present & ~own.derivative) for own in found]),
+        rejected=jnp.stack([_rejected(term, own) for term, own in zip(terms, found, strict=True)]).astype(dtype),
+        unresolved=jnp.stack([_unresolved(problem, term, start) for term in terms]).astype(dtype),
+        saved=jnp.stack([saved for saved, _ in rigid]).astype(dtype),
+        motion=jnp.stack([motion for _, motion in rigid]).astype(dtype),
+        energy=2 * prepared_energy(problem, state),
+        redundancy=rows - unknowns,
+        names=tuple(term.name for term in terms),
+        shapes=tuple(jnp.shape(term.weight) for term in terms),
+    )
+
+
+def diagnosis_like(problem: Problem) -> Diagnosis:
+    """A diagnosis of the structure of that of `problem`, without its numbers."""
+    count, dtype = len(problem.terms), problem.pixels.dtype
+    whole, share = jnp.zeros(count, int), jnp.zeros(count, dtype)
+    names, shapes = (
+        tuple(term.name for term in problem.terms),
+        tuple(jnp.shape(term.weight) for term in problem.terms),
+    )
+    motion, number = jnp.zeros((count, lie.TANGENT), dtype), jnp.zeros((), dtype)
+    return Diagnosis(whole, whole, share, share, share, motion, number, jnp.asarray(0), names, shapes)
+
+
+@eqx.filter_jit
+def _diagnose_jit(problem: Problem, state: State) -> Diagnosis:
+    return diagnose(prepared(problem), state, state)
+
+
+def refuse_not_finite(problem: Problem, state: State, finite: Any) -> None:
+    """InputError where numbers of a linearisation at `state` are not finite, with the term and the observation that
+    are why; inside `jit` nothing, for there results are NaN.
+    """
+    if isinstance(finite, jax.core.Tracer) or np.all(finite):
+        return
+    found = _diagnose_jit(problem, state).sentences(failed=True)
+    why = " ".join(found) or "Look for weights or standard deviations that are far too large or too small."
+    raise InputError(f"`problem` has no finite linearisation at `state`. {why}")
+
+
+class Observed(NamedTuple):
+    """Of each observation of a term, in the axes of its weight."""
+
+    present: Bool[Array, "*b"]
+    squared: Float[Array, "*b"]
+    """`w |r|^2`."""
+    value: Bool[Array, "*b"]
+    """Whether its residual is finite."""
+    derivative: Bool[Array, "*b"]
+    """Whether all derivatives of that are."""
+    entries: int
+    """Of one residual."""
+
+
+def _observed(problem: Problem, term: AbstractTerm, state: State) -> Observed:
+    if isinstance(term, EdgeTerm):
+        return _observed_on_edges(problem, term, state)
+    zero = jnp.zeros(state.num_unknowns, state.inverse_depth.dtype)
+    # One derivative along all coordinates together is not finite if any is not.
+    residuals = lambda step: term_residuals(problem, term, state.moved(step))
+    residual, slope = jax.jvp(residuals, (zero,), (jnp.ones_like(zero),))
+    if jnp.ndim(term.weight) == 0:  # one observation, whose residual is a vector
+        residual, slope = residual[:, None], slope[:, None]
+    shape = jnp.shape(term.weight)
+    return Observed(
+        present=term.weights != 0,
+        squared=term.weights * jnp.sum(residual**2, 0).reshape(shape),
+        value=jnp.all(jnp.isfinite(residual), 0).reshape(shape),
+        derivative=jnp.all(jnp.isfinite(slope), 0).reshape(shape),
+        entries=len(residual),
+    )
+
+
+def _observed_on_edges(problem: Problem, term: EdgeTerm, state: State) -> Observed:
+    alone, cameras, hosts = problem.with_terms((term,)), cameras_of(problem, state), hosts_of(problem, state)
+    nothing = jnp.zeros(term.weight.shape, bool)
+    if not alone.edge_terms or not len(problem.edges.source):
+        return Observed(nothing, jnp.zeros(nothing.shape, term.weight.dtype), ~nothing, ~nothing, 1)
+    entries = jax.eval_shape(lambda: term_residuals(problem, term, state)).shape[0]
+
+    def edge(inside: tuple[Place, Motions, EdgeData]) -> tuple[Array, Array, Array]:
+        place, motion, data = inside
+        ((one, view),) = of_edge(alone, view_of(cameras, hosts, place, motion), data)
+        residual, slope = one.along_all(view)
+        squared = one.weights * jnp.sum(residual**2, 0)
+        return squared, jnp.all(jnp.isfinite(residual), 0), jnp.all(jnp.isfinite(slope), 0)
+
+    # A loop: of all edges at once the projections would fill the memory.
+    squared, value, derivative = jax.lax.map(
+        edge, (places(problem), motions_of(relative_poses(problem, state)), edge_data(alone))
+    )
+    return Observed(term.weights != 0, squared, value, derivative, entries)
+
+
+def _first(wrong: Bool[Array, "*b"]) -> Int[Array, ""]:
+    flat = wrong.reshape(-1)
+    return jnp.where(jnp.any(flat), jnp.argmax(flat), -1) if flat.size else jnp.asarray(-1)
+
+
+def _share(which: Bool[Array, "*b"], present: Bool[Array, "*b"]) -> Float[Array, ""]:
+    return jnp.sum(which & present) / jnp.maximum(jnp.sum(present), 1)
+
+
+def _rejected(term: AbstractTerm, own: Observed) -> Float[Array, ""]:
+    level = float(stats.chi2.isf(SIGNIFICANCE, own.entries))
+    # The derivative of the pull `rho'(s) r` along the residual: below zero it falls with the distance.
+    weight = term.kernel.weight(own.squared)
+    rises = weight + 2 * own.squared * term.kernel.curvature(own.squared)
+    rounding = 10 * jnp.finfo(weight.dtype).eps * weight  # Huber's pull is constant
+    return _share((own.squared > level) & (rises < -rounding), own.present)
+
+
+def _unresolved(problem: Problem, term: AbstractTerm, state: State) -> Float[Array, ""]:
+    eps = float(jnp.finfo(state.inverse_depth.dtype).eps)
+    away = jnp.sum(state.poses.translation() ** 2, -1)
+    if isinstance(term, ImageTerm) and term.weight.size:
+        source, target, row = *problem.edges.ends, problem.edges.row
+        focal = cameras_of(problem, state).parameters[..., :1]
+        if problem.camera_of is not None:
+            focal = focal[problem.camera_of[target]]
+        depth = state.inverse_depth[row, term.first_slot : term.first_slot + term.weight.shape[1]]
+        farther = jnp.maximum(away[source], away[target])[:, None]
+        return _share(finer_than_precision(term.weights, (focal * depth) ** 2, farther, eps), term.weights != 0)
+    if isinstance(term, PoseTerm | PairTerm) and len(term.weight):
+        slopes = node_jacobians(term, state.poses.wxyz_xyz, cameras_of(problem, state))
+        moved: Array = jnp.zeros(len(term.weight), slopes.dtype)
+        for place, index in enumerate(term.touched()):
+            by_position = slopes[:, :, lie.TANGENT * place : lie.TANGENT * place + 3]
+            moved = jnp.maximum(moved, jnp.sum(by_position**2, (1, 2)) * away[index])
+        return _share(finer_than_precision(term.weights, moved / slopes.shape[1], 1.0, eps), term.weights != 0)
+    return jnp.zeros(())
+
+
+def _rigid(problem: Problem, term: AbstractTerm, state: State) -> tuple[Float[Array, ""], Float[Array, "6"]]:
+    """`g' K^+ g` and `-K^+ g` of the gradient and Hessian of a term by a rigid motion of all poses together."""
+    if not isinstance(term, PoseTerm | PairTerm) or not len(term.weight):
+        return jnp.zeros(()), jnp.zeros(lie.TANGENT)
+    poses, cameras = state.poses.wxyz_xyz, cameras_of(problem, state)
+    anchor = jaxlie.SE3(poses[jnp.argmax(problem.fixed_pose)].astype(poses.dtype))
+    carry = jax.vmap(lambda pose: lie.adjoint(lie.relative(anchor, jaxlie.SE3(pose))))(poses)
+    slopes, residual = node_jacobians(term, poses, cameras), node_residuals(term, poses, cameras).T
+    pull = term.weights * term.kernel.weight(term.weights * jnp.sum(residual**2, 1))
+    parts = [
+        jnp.einsum("mka,mab->mkb", slopes[:, :, lie.TANGENT * place : lie.TANGENT * (place + 1)], carry[index])
+        for place, index in enumerate(term.touched())
+    ]
+    along = sum(parts[1:], parts[0])
+    gradient = jnp.einsum("m,mka,mk->a", pull, along, residual)
+    hessian = jnp.einsum("m,mka,mkb->ab", pull, along, along)
+    # Balanced by what the poses feel one by one: a relative term feels no common motion but by rounding.
+    size = sum(jnp.einsum("m,mka->a", pull, part**2) for part in parts)
+    scale = jnp.sqrt(jnp.where(size > 0, size, 1.0))
+    balanced = hessian / scale[:, None] / scale[None, :]
+    finite = jnp.all(jnp.isfinite(balanced)) & jnp.all(jnp.isfinite(gradient))
+    values, vectors = jnp.linalg.eigh(jnp.where(finite, balanced, jnp.eye(lie.TANGENT, dtype=balanced.dtype)))
+    kept = values > 100 * lie.TANGENT * jnp.finfo(values.dtype).eps
+    forces = vectors.T @ (jnp.where(finite, gradient, 0.0) / scale)
+    step = vectors @ jnp.where(kept, forces / jnp.where(kept, values, 1.0), 0.0) / scale
+    held = jnp.any(problem.fixed_pose)
+    return jnp.where(held, gradient @ step, 0.0), -step
