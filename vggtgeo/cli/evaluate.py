@@ -76,7 +76,7 @@ def evaluate(
             left = comparability(found, true, max_dt, metric)
         for text in (*verdict.reasons, *verdict.doubts):
             warnings.warn(text, InputWarning, stacklevel=2)
-        if offsets is not None and offsets.explains and not left.reasons:
+        if offsets is not None and offsets.explains:
             warnings.warn(offsets.message, InputWarning, stacklevel=2)
         rest = None
         if estimate_offset and offsets is not None:

@@ -10,7 +10,7 @@ from vggtgeo.evaluation.depth import DepthError, depth_error, depth_of_cloud
 from vggtgeo.evaluation.meshes import Mesh, mesh_error, surface_points
 from vggtgeo.evaluation.offsets import Offsets, estimate_offsets, shifted
 from vggtgeo.evaluation.relative import UNITS, RelativeError, Unit, relative_error, rotation_angle
-from vggtgeo.evaluation.report import TrajectoryReport, coverage, evaluate_trajectory
+from vggtgeo.evaluation.report import TrajectoryReport, coverage, evaluate_trajectory, followed
 from vggtgeo.evaluation.resemblance import Comparability, comparability
 from vggtgeo.evaluation.statistics import ErrorStatistics
 
@@ -43,6 +43,7 @@ __all__ = [
     "estimate_offsets",
     "evaluate_trajectory",
     "focal_error",
+    "followed",
     "heading",
     "mesh_error",
     "nearest_in_time",

@@ -41,7 +41,7 @@ carried moves much the same within."""
 _REACH = _LEAST_STEP
 _LEAST_SPREAD = 1e-6
 """Of a path: that of a still camera in a file of six decimals."""
-_WEAK, _TELLS = 100.0, 4.0
+_WEAK, _TELLS = 10.0, 4.0
 _MOST_POSES, _MOST_TRIED = 400, 100
 """Of a fit, and of a start of the search: with more it takes longer and knows little more, as errors are alike."""
 
@@ -104,7 +104,9 @@ class OffsetModel:
         before = np.searchsorted(times, times[rows] - _REACH, side="right") - 1
         after = np.searchsorted(times, times[rows] + _REACH)
         # Of each row the poses on both sides, too, whose differences are its velocity.
-        self._sides = np.stack([np.clip(np.minimum(before, rows - 1), 0, None), np.clip(np.maximum(after, rows + 1), None, len(times) - 1)])
+        self._sides = np.stack(
+            [np.clip(np.minimum(before, rows - 1), 0, None), np.clip(np.maximum(after, rows + 1), None, len(times) - 1)]
+        )
         self._all, self._rows, self._times = estimate, rows, times[rows]
         self._every = -(-len(rows) // _MOST_TRIED)
         true = truth.poses(self._times[self._seen(0.0)])[:, :3, 3]
@@ -113,7 +115,7 @@ class OffsetModel:
         # Deviations of what is known without any pose: nothing of the alignment, and of an offset that it is no longer
         # than the search, no farther than the path extends, no more than a radian. The data must tell more than that.
         self._prior = np.array([_WEAK * spread] * 3 + [_WEAK] * 4 + [LONGEST] + [spread] * 3 + [1.0] * 3)
-        self._least = 1e-9 * spread, 1e-9
+        self._least = 1e-6 * spread, 1e-6  # files of poses have six decimals or more
 
     def matched(self, time: float) -> int:
         """How many poses have a true one with this time offset."""
@@ -213,11 +215,14 @@ class OffsetModel:
         for _ in range(_STEPS):
             jacobian = self._whitened(self._jacobian(unknowns), noise) * (self._prior * free)
             # The identity keeps directions that nothing determines where they are.
-            step = np.linalg.solve(jacobian.T @ jacobian + np.eye(UNKNOWNS), -jacobian.T @ residuals)
-            now, size = np.mean(residuals**2), 1.0
+            normal = jacobian.T @ jacobian + np.eye(UNKNOWNS)
+            size = 1.0 / np.sqrt(np.diag(normal))
+            inverse = np.linalg.pinv(normal * np.outer(size, size), rcond=1e-13, hermitian=True)
+            step = -size * (inverse @ (size * (jacobian.T @ residuals)))
+            now, share = np.mean(residuals**2), 1.0
             for _ in range(_HALVINGS):
-                moved = unknowns.moved(size * step * self._prior * free, self._middle)
-                size /= 2
+                moved = unknowns.moved(share * step * self._prior * free, self._middle)
+                share /= 2
                 if self.matched(moved.time) < 2:
                     continue
                 residuals = self._whitened(self._residuals(moved), noise)
@@ -329,7 +334,7 @@ class OffsetModel:
         """
         own, other, basis = self._scaled(unknowns, free, noise)
         own, other = own @ basis, other @ basis
-        gain = basis @ np.linalg.pinv(other.T @ own)
+        gain = basis @ np.linalg.pinv(other.T @ own, rcond=1e-18)
         covariance = gain @ (other.T @ other) @ gain.T + np.eye(UNKNOWNS) - basis @ basis.T
         return covariance * np.outer(self._prior, self._prior), free & (np.diag(covariance) < 1.0 / _TELLS)
 

@@ -5,6 +5,7 @@ and the error is no error of the estimate. `estimate_offsets` fits such offsets 
 not significant one by one, and compares the error with and without the rest.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check
 from vggtgeo.evaluation.interpolation import ContinuousTrajectory
 from vggtgeo.evaluation.offset_model import LEVEL, LEVER, LONGEST, SCALE, TIME, TURN, UNKNOWNS, Fit, OffsetModel
 from vggtgeo.evaluation.report import FEW_MATCHES
-from vggtgeo.evaluation.resemblance import MOST
+from vggtgeo.evaluation.resemblance import MOST, comparability
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.given import check_real
@@ -42,6 +43,8 @@ class Offsets:
             what is left of it without the significant offsets.
         rotation_error, rotation_error_left: RMS, radians, of both the same.
         with_scale: of the alignment.
+        explains: whether they are most of the error: without them less than half of that of positions or rotations is
+            left, and the two are comparable.
     """
 
     time: float
@@ -56,12 +59,7 @@ class Offsets:
     rotation_error: float
     rotation_error_left: float
     with_scale: bool
-
-    @property
-    def explains(self) -> bool:
-        """Whether less than half of the error, of positions or of rotations, is left without the offsets."""
-        left = self.ate_left < MOST * self.ate or self.rotation_error_left < MOST * self.rotation_error
-        return bool(self.significant) and left
+    explains: bool = False
 
     def removed(self, estimate: Trajectory, truth: Trajectory) -> Trajectory:
         """The truth of the camera itself, by the clock of the estimate: without the significant offsets."""
@@ -84,26 +82,32 @@ class Offsets:
         found |= {"significant": list(self.significant), "explains_most": self.explains}
         found |= {"alignment": "sim3" if self.with_scale else "se3", "ate_m": self.ate, "ate_left_m": self.ate_left}
         angles = self.rotation_error, self.rotation_error_left
-        return found | dict(zip(("rotation_error_deg", "rotation_error_left_deg"), np.degrees(angles).tolist(), strict=True))
+        return found | dict(
+            zip(("rotation_error_deg", "rotation_error_left_deg"), np.degrees(angles).tolist(), strict=True)
+        )
 
     @property
     def _turned(self) -> np.ndarray:
         return np.asarray(Rotation.from_matrix(self.turn).as_rotvec())
 
     def __str__(self) -> str:
-        values = {"time offset": f"time offset of the truth {_numbers([self.time], [self.time_sd])} s"}
-        values["lever arm"] = f"lever arm of the truth's point in the camera's frame {_numbers(self.lever, self.lever_sd)}"
+        return "; ".join(self._texts.values())
+
+    @property
+    def _texts(self) -> dict[str, str]:
         turned, sds = np.degrees(self._turned), np.degrees(self.turn_sd)
-        values["rotation"] = f"axes of the truth's body turned by {_numbers(turned, sds)} deg"
-        return "; ".join(values.values())
+        return {
+            "time offset": f"time offset of the truth {_numbers([self.time], [self.time_sd], ' s')}",
+            "lever arm": f"lever arm of the truth's point in the camera's frame {_numbers(self.lever, self.lever_sd)}",
+            "rotation": f"rotation of the truth's axes in the camera's frame {_numbers(turned, sds, ' deg')}",
+        }
 
     @property
     def message(self) -> str:
         """What explains most of the error, and by how much; empty where nothing does."""
         if not self.explains:
             return ""
-        found = dict(zip(_PARTS, str(self).split("; "), strict=True))
-        names = "; ".join(found[name] for name in self.significant)
+        names = "; ".join(self._texts[name] for name in self.significant)
         angles = np.degrees([self.rotation_error, self.rotation_error_left])
         return (
             f"most of the error is a constant offset ({names}): without it ATE after "
@@ -161,8 +165,12 @@ def estimate_offsets(
         rotation_error_left=kept.rotation_error,
         with_scale=with_scale,
     )
-    left = absolute_error(*associate(estimate, found.removed(estimate, truth), max_dt), kind).statistics.rmse
-    return replace(found, ate_left=left)
+    rest = found.removed(estimate, truth)
+    left = absolute_error(*associate(estimate, rest, max_dt), kind).statistics.rmse
+    most = left < MOST * plain or kept.rotation_error < MOST * alone.rotation_error
+    verdict = comparability(estimate, rest, max_dt, not with_scale)
+    doubts = set(verdict.doubts) - set(comparability(estimate, truth, max_dt, not with_scale).doubts)
+    return replace(found, ate_left=left, explains=bool(names) and most and not (verdict.reasons or doubts))
 
 
 def shifted(estimate: Trajectory, truth: Trajectory, seconds: float) -> Trajectory:
@@ -213,7 +221,7 @@ def _chance(fit: Fit, part: slice) -> float:
 
 
 def _deviations(fit: Fit) -> np.ndarray:
-    return np.where(fit.determined, np.sqrt(np.diag(fit.covariance)), np.inf)
+    return np.where(fit.determined, np.sqrt(np.maximum(np.diag(fit.covariance), 0.0)), np.inf)
 
 
 def _pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -222,10 +230,12 @@ def _pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _numbers(values: np.ndarray, sds: np.ndarray) -> str:
+def _numbers(values: Iterable[float], sds: Iterable[float], unit: str = "") -> str:
     """Each with its standard deviation, and as many digits as that has."""
     shown = []
     for value, sd in zip(values, sds, strict=True):
         digits = int(np.clip(1 - np.floor(np.log10(max(sd, 1e-6))), 0, 6)) if np.isfinite(sd) else 0
         shown.append(f"{value:.{digits}f} ± {sd:.{digits}f}" if np.isfinite(sd) else "not determined")
-    return shown[0] if len(shown) == 1 or len(set(shown)) == 1 else f"({', '.join(shown)})"
+    if set(shown) == {"not determined"}:
+        return shown[0]
+    return (shown[0] if len(shown) == 1 else f"({', '.join(shown)})") + unit
