@@ -33,10 +33,9 @@ def less_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row]:
         if base is None or base is row or row["status"] != "ok":
             found.append(row)
             continue
-        whole = {} if is_covered([row, base]) else {column.name: None for column in COMPARED}
-        found.append(
-            {**row, **{f"{name}{LESS_BASELINE}": value for name, value in (whole | _poses(row, base, runs)).items()}}
-        )
+        whole: dict[str, Any] = {} if is_covered([row, base]) else {column.name: None for column in COMPARED}
+        less = whole | _poses(row, base, runs)
+        found.append({**row, **{f"{name}{LESS_BASELINE}": value for name, value in less.items()}})
     return found
 
 

@@ -33,10 +33,13 @@ def page(suite: Suite, rows: Sequence[Row]) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-_COVERED = f", at the share of the truth's duration that is covered: below {100 * cells.LEAST_COVERAGE:.0f} % an error is not ranked."
+_COVERED = (
+    f", at the share of the truth's duration that is covered: below {100 * cells.LEAST_COVERAGE:.0f} % an error is not "
+    "ranked."
+)
 _DIFFERENCES = (
-    "On the same sequence and seed, over the time that both cover: mean difference and its 95 % interval (Student), negative is less. Bold where the "
-    "interval leaves zero out."
+    "On the same sequence and seed, over the time that both cover: mean difference and its 95 % interval (Student), "
+    "negative is less. Bold where the interval leaves zero out."
 )
 
 

@@ -123,11 +123,8 @@ def trajectory_errors(
         "warnings": "; ".join([*report.warnings, *verdict.doubts, *explained]),
     }
     if offsets is not None:
-        known = np.isfinite(offsets.time_sd)
-        row |= {
-            "time_offset_s": offsets.time if known else None,
-            "time_offset_sd_s": offsets.time_sd if known else None,
-        }
+        known = offsets.as_dict()
+        row |= {"time_offset_s": known["time_offset_s"], "time_offset_sd_s": known["time_offset_s_sd"]}
         row |= {"offsets": ", ".join(offsets.significant), "ate_without_offsets_m": offsets.ate_left}
     if verdict.reasons:
         row |= {"status": NOT_COMPARABLE, "message": "; ".join([*verdict.reasons, *verdict.doubts, *explained])}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -82,7 +82,7 @@ def evaluate(
         if estimate_offset and offsets is not None:
             rest = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
     if as_json:
-        known = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
+        known: dict[str, Any] = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
         known["offsets"] = None if offsets is None else offsets.as_dict()
         if rest is not None:
             known["without_offsets"] = {**rest.as_dict(), "comparable": not left.reasons}

@@ -1,10 +1,10 @@
 """Errors of a trajectory as white noise upon a drift: the covariance that fits them, and what it makes white.
 
-The error of pose i is `d_i + v_i`, the drift `d_i = c d_(i-1) + w_i` stationary, `var v = share var w`. With the bidiagonal
-D that makes the drift white (its first row `sqrt(1 - c^2)`), `cov(D x) = var w (I + share D D^T)` is tridiagonal, and the
-Cholesky factor of that makes white what D left: O(n) for any c and share. Both are chosen by restricted maximum
-likelihood (H. D. Patterson, R. Thompson, Biometrika 58(3), 1971), which knows that a fit of k numbers takes a part of the
-drift out of the residuals.
+The error of pose i is `d_i + v_i`, the drift `d_i = c d_(i-1) + w_i` stationary, `var v = share var w`. The bidiagonal
+D with the first row `sqrt(1 - c^2)` makes the drift white; `cov(D x) = var w (I + share D D^T)` is tridiagonal, and its
+Cholesky factor makes white what D left: O(n) for any c and share. Both are chosen by restricted maximum likelihood
+(H. D. Patterson, R. Thompson, Biometrika 58(3), 1971), as a fit of k numbers takes a part of the drift out of the
+residuals.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _SHARES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 
 @dataclass(frozen=True)
 class DriftNoise:
-    """sigma: standard deviation of w, in the unit of the errors. correlation: c in [0, 1). share: of v to w in variance.
+    """sigma: standard deviation of w, in the unit of the errors. correlation: c in [0, 1). share: `var v / var w`.
 
     White noise has `correlation` and `share` zero.
     """

@@ -22,7 +22,7 @@ class ContinuousTrajectory:
         self._rotations = RotationSpline(since, Rotation.from_matrix(trajectory.rotations))
 
     def covers(self, times: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Which times lie between two poses that are at most two usual intervals apart: across a gap a spline invents."""
+        """Which times lie between two poses that are at most two usual intervals apart; a spline invents more."""
         after = np.searchsorted(self.times, times).clip(1, len(self.times) - 1)
         gap = self.times[after] - self.times[after - 1]
         inside = (times >= self.times[0]) & (times <= self.times[-1])

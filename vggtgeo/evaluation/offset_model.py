@@ -1,4 +1,4 @@
-"""What a truth of other moments, or of another point of the body, makes of an estimate: a nonlinear least-squares model.
+"""The model of an estimate whose truth is of other moments, or of another point of the body.
 
 The estimate has camera poses `E_i` at times `t_i`; the truth is a continuous motion `T(t)` of a point fixed to the
 camera. With the alignment A (a similarity), the time offset d that is to be added to the truth's times, and the pose B
@@ -7,8 +7,8 @@ of the truth's point in the camera's frame (lever arm and rotation),
     T(t_i - d) = A E_i B,    residuals  p_T - p_AEB  and  log(R_T R_AEB^T),  in the truth's world.
 
 Both residuals are white noise upon a drift (`drift_noise`), estimated in turn with the unknowns (D. Cochrane, G. H.
-Orcutt, JASA 44, 1949): neighbouring errors of SLAM are alike, so that n poses are no n observations. Of the rotation and
-lever arm: R. Horaud, F. Dornaika, "Hand-eye calibration", IJRR 14(3), 1995.
+Orcutt, JASA 44, 1949): neighbouring errors of SLAM are alike, so that n poses are not n observations. Rotation and
+lever arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 Noises = tuple[DriftNoise, DriftNoise]
 
 UNKNOWNS = 14
-"""3 of the alignment's translation, 3 of its rotation, its scale, the time offset, 3 of B's position, 3 of its rotation."""
+"""3 of A's translation, 3 of its rotation, its scale, the time offset, 3 of B's position, 3 of its rotation."""
 SCALE, TIME, LEVER, TURN = slice(6, 7), slice(7, 8), slice(8, 11), slice(11, 14)
 LONGEST = 10.0
 """Seconds: the largest time offset that is looked for."""
@@ -101,12 +101,10 @@ class OffsetModel:
         self._truth, self._with_scale = truth, with_scale
         rows = np.arange(0, len(estimate), -(-len(estimate) // _MOST_POSES))
         times = estimate.timestamps
-        before = np.searchsorted(times, times[rows] - _REACH, side="right") - 1
-        after = np.searchsorted(times, times[rows] + _REACH)
         # Of each row the poses on both sides, too, whose differences are its velocity.
-        self._sides = np.stack(
-            [np.clip(np.minimum(before, rows - 1), 0, None), np.clip(np.maximum(after, rows + 1), None, len(times) - 1)]
-        )
+        before = np.minimum(np.searchsorted(times, times[rows] - _REACH, side="right") - 1, rows - 1)
+        after = np.maximum(np.searchsorted(times, times[rows] + _REACH), rows + 1)
+        self._sides = np.maximum(before, 0), np.minimum(after, len(times) - 1)
         self._all, self._rows, self._times = estimate, rows, times[rows]
         self._every = -(-len(rows) // _MOST_TRIED)
         true = truth.poses(self._times[self._seen(0.0)])[:, :3, 3]
@@ -134,7 +132,7 @@ class OffsetModel:
         return float(tried[np.argmin(costs)]), len(tried)
 
     def fit(self, free: Bool[np.ndarray, "14"], *times: float) -> Fit:
-        """The unknowns that are `free`, in turn with the noise, from near the best of the time offsets `times` and 0."""
+        """The unknowns that are `free`, in turn with the noise; the time offset from near 0 or one of `times`."""
         starts = [
             self._solved(start, free, self._white(self._residuals(start)))
             for time in {0.0, *times}
@@ -301,8 +299,8 @@ class OffsetModel:
 
     def _scaled(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Both Jacobians J and Z, whitened and by unknowns in units of the prior's deviations, and a basis of the
-        directions that the motion determines: where they agree by four times what the prior tells, so that the deviation
-        is less than half of it, and more than noise alone would agree.
+        directions that the motion determines: where they agree by four times what the prior tells (a deviation of less
+        than half of its), and more than noise alone would agree.
         """
         jacobians = self._jacobian(unknowns), self._other_jacobian(unknowns)
         own, other = (self._whitened(one, noise) * (self._prior * free) for one in jacobians)
@@ -344,8 +342,8 @@ def _mean(rotations: np.ndarray) -> np.ndarray:
 
 
 def _turn_of_steps(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, float]:
-    """The rotation of the truth's body in the camera's frame by the rotation vectors from one pose to the next, which no
-    alignment changes (W. Kabsch, Acta Cryst. A 32, 1976), and the mean square of what it leaves, rad^2.
+    """The rotation of the truth's body in the camera's frame, and the mean square of what it leaves, rad^2: by the
+    rotation vectors from one pose to the next, which no alignment changes (W. Kabsch, Acta Cryst. A 32, 1976).
     """
     camera, body = (Rotation.from_matrix(one[:-1].mT @ one[1:]).as_rotvec() for one in (found, true))
     u, _, vt = np.linalg.svd(camera.T @ body)

@@ -81,10 +81,8 @@ class Offsets:
             found[name] = found[name][0]
         found |= {"significant": list(self.significant), "explains_most": self.explains}
         found |= {"alignment": "sim3" if self.with_scale else "se3", "ate_m": self.ate, "ate_left_m": self.ate_left}
-        angles = self.rotation_error, self.rotation_error_left
-        return found | dict(
-            zip(("rotation_error_deg", "rotation_error_left_deg"), np.degrees(angles).tolist(), strict=True)
-        )
+        angles = np.degrees([self.rotation_error, self.rotation_error_left]).tolist()
+        return found | {"rotation_error_deg": angles[0], "rotation_error_left_deg": angles[1]}
 
     @property
     def _turned(self) -> np.ndarray:

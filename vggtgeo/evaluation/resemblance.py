@@ -58,7 +58,8 @@ def comparability(
     (`metric`) has another size altogether. InputError where no poses match within `max_dt` seconds.
     """
     matched, reference = associate(estimate, truth, max_dt)
-    reasons, doubts = [], []
+    reasons: list[str] = []
+    doubts: list[str] = []
     shorter = min(len(estimate), len(truth))
     if len(matched) < FEW * shorter:
         text = f"only {len(matched)} of {shorter} poses match within {max_dt:g} s: are both of one sequence?"
@@ -84,8 +85,8 @@ def comparability(
     inverse = place_misfit(Trajectory(matched.timestamps, rigid.invert(matched.poses)), reference)
     if share is not None and inverse is not None and inverse < MOST * share:
         reasons.append(
-            f"the inverse of the estimated poses fits better (error after Sim(3) {inverse:.3f} of the path's spread, as "
-            f"given {share:.3f}): they are world to camera, and must be camera to world"
+            f"the inverse of the estimated poses fits better (error after Sim(3) {inverse:.3f} of the path's spread, "
+            f"and {share:.3f} as given): they are world to camera, and must be camera to world"
         )
     apart = orientation_gap(matched, reference) if share is not None and share < AGREEING else None
     if apart is not None and apart > MOST_TURNED:
