@@ -63,8 +63,8 @@ def _pair(
     return Trajectory(images, estimate), Trajectory(samples - late, world @ poses(samples) @ body)
 
 
-def _offsets(estimate: Trajectory, truth: Trajectory, with_scale: bool = True) -> Offsets:
-    found = estimate_offsets(estimate, truth, with_scale)
+def _offsets(estimate: Trajectory, truth: Trajectory) -> Offsets:
+    found = estimate_offsets(estimate, truth)
     assert found is not None
     return found
 
@@ -101,7 +101,7 @@ def test_a_clock_that_is_late_is_told(late: float) -> None:
 
 def test_a_lever_arm_is_found_where_the_clock_is_right() -> None:
     # Proves that a marker beside the lens is told to millimetres, and is no clock. Oracle: what was applied.
-    found = _offsets(*_pair(2, lever=LEVER), with_scale=False)
+    found = _offsets(*_pair(2, lever=LEVER))
     assert found.significant == ("lever arm",)
     np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
     assert abs(found.time) < 3 * found.time_sd

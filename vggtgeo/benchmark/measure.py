@@ -108,7 +108,7 @@ def trajectory_errors(
     except InputError as error:
         return {"warnings": str(error), "matched": 0}, None
     verdict = comparability(estimate, truth, max_dt, metric)
-    offsets = estimate_offsets(estimate, truth, not metric, max_dt)
+    offsets = estimate_offsets(estimate, truth, max_dt)
     explained = [offsets.message] if offsets is not None and offsets.explains else []
     row: dict[str, Any] = {
         "matched": report.matched,
@@ -125,7 +125,7 @@ def trajectory_errors(
     if offsets is not None:
         known = offsets.as_dict()
         row |= {"time_offset_s": known["time_offset_s"], "time_offset_sd_s": known["time_offset_s_sd"]}
-        row |= {"offsets": ", ".join(offsets.significant), "ate_without_offsets_m": offsets.ate_left}
+        row |= {"offsets": ", ".join(offsets.significant), "ate_sim3_without_offsets_m": offsets.ate_left}
     if verdict.reasons:
         row |= {"status": NOT_COMPARABLE, "message": "; ".join([*verdict.reasons, *verdict.doubts, *explained])}
     for name, delta, unit in DELTAS:

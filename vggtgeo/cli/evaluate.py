@@ -69,7 +69,7 @@ def evaluate(
         report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
         metric = metres is not False and scale is not None and scale.startswith("metric")
         verdict = comparability(found, true, max_dt, metric)
-        offsets = estimate_offsets(found, true, not metric, max_dt)
+        offsets = estimate_offsets(found, true, max_dt)
         left = verdict
         if offsets is not None and offsets.significant:
             true = offsets.removed(found, true)

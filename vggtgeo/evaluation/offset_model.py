@@ -29,7 +29,7 @@ Noises = tuple[DriftNoise, DriftNoise]
 
 UNKNOWNS = 14
 """3 of A's translation, 3 of its rotation, its scale, the time offset, 3 of B's position, 3 of its rotation."""
-SCALE, TIME, LEVER, TURN = slice(6, 7), slice(7, 8), slice(8, 11), slice(11, 14)
+TIME, LEVER, TURN = slice(7, 8), slice(8, 11), slice(11, 14)
 LONGEST = 10.0
 """Seconds: the largest time offset that is looked for."""
 LEVEL = 1e-3
@@ -97,8 +97,8 @@ class Fit:
 class OffsetModel:
     """The model of one pair of trajectories. estimate: camera -> world; truth: covers some of its times."""
 
-    def __init__(self, estimate: Trajectory, truth: ContinuousTrajectory, with_scale: bool) -> None:
-        self._truth, self._with_scale = truth, with_scale
+    def __init__(self, estimate: Trajectory, truth: ContinuousTrajectory) -> None:
+        self._truth = truth
         rows = np.arange(0, len(estimate), -(-len(estimate) // _MOST_POSES))
         times = estimate.timestamps
         # Of each row the poses on both sides, too, whose differences are its velocity.
@@ -171,7 +171,7 @@ class OffsetModel:
 
     def _apart(self, time: float) -> float:
         found, true = self._pair(time, self._every)
-        moved = umeyama(found[:, :3, 3], true[:, :3, 3], self._with_scale).points(found[:, :3, 3])
+        moved = umeyama(found[:, :3, 3], true[:, :3, 3], True).points(found[:, :3, 3])
         position = ((moved - true[:, :3, 3]) ** 2).sum(axis=1).mean()
         rotation = _turn_of_steps(found[:, :3, :3], true[:, :3, :3])[1]
         return float(np.log(position + self._least[0] ** 2) + np.log(rotation + self._least[1] ** 2))
@@ -185,7 +185,7 @@ class OffsetModel:
         """
         found, true = self._pair(time)
         turned, turns = true[:, :3, :3], bool(free[TURN].all())
-        by_positions = umeyama(found[:, :3, 3], true[:, :3, 3], self._with_scale).rotation
+        by_positions = umeyama(found[:, :3, 3], true[:, :3, 3], True).rotation
         own = _turn_of_steps(found[:: self._every, :3, :3], turned[:: self._every])[0] if turns else np.eye(3)
         by_rotations = _mean(turned @ own.T @ found[:, :3, :3].mT)
         for rotation in (by_positions, by_rotations):
@@ -200,11 +200,10 @@ class OffsetModel:
         along = found[:, :3, 3] @ rotation.T
         columns = [np.broadcast_to(np.eye(3), (len(found), 3, 3))]
         columns += [rotation @ found[:, :3, :3]] if lever else []
-        columns += [along[..., None]] if self._with_scale else []
-        target = true[:, :3, 3] if self._with_scale else true[:, :3, 3] - along
+        columns += [along[..., None]]
         matrix = np.concatenate(columns, axis=2).reshape(3 * len(found), -1)
-        solved = np.linalg.lstsq(matrix, target.reshape(-1), rcond=1e-3)[0]
-        scale = float(solved[-1]) if self._with_scale and solved[-1] > 0 else 1.0
+        solved = np.linalg.lstsq(matrix, true[:, :3, 3].reshape(-1), rcond=1e-3)[0]
+        scale = float(solved[-1]) if solved[-1] > 0 else 1.0
         return Unknowns(rotation, solved[:3], scale, time, solved[3:6] if lever else np.zeros(3), turn)
 
     def _solved(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:

@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
 from vggtgeo.evaluation.absolute import absolute_error
-from vggtgeo.evaluation.alignment import Alignment
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check_trajectories
 from vggtgeo.evaluation.interpolation import ContinuousTrajectory
-from vggtgeo.evaluation.offset_model import LEVEL, LEVER, LONGEST, SCALE, TIME, TURN, UNKNOWNS, Fit, OffsetModel
+from vggtgeo.evaluation.offset_model import LEVEL, LEVER, LONGEST, TIME, TURN, UNKNOWNS, Fit, OffsetModel
 from vggtgeo.evaluation.report import FEW_MATCHES
 from vggtgeo.evaluation.resemblance import MOST, comparability
 from vggtgeo.geometry import rigid
@@ -39,10 +38,9 @@ class Offsets:
         turn: float64 [3, 3], axes of the truth's body in the camera's frame.
         turn_sd: float64 [3], radians, of a small rotation about each of the camera's axes.
         significant: those that are not zero by chance, of "time offset", "lever arm", "rotation".
-        ate, ate_left: RMSE after an alignment (Sim(3) where `with_scale`, else SE(3)), in the unit of the truth, and
-            what is left of it without the significant offsets.
+        ate, ate_left: RMSE after Sim(3), in the unit of the truth, and what is left of it without the significant
+            offsets. Sim(3), as a lever arm would explain a part of an error of scale.
         rotation_error, rotation_error_left: RMS, radians, of both the same.
-        with_scale: of the alignment.
         explains: whether they are most of the error: without them less than half of that of positions or rotations is
             left, and the two are comparable.
     """
@@ -58,7 +56,6 @@ class Offsets:
     ate_left: float
     rotation_error: float
     rotation_error_left: float
-    with_scale: bool
     explains: bool = False
 
     def removed(self, estimate: Trajectory, truth: Trajectory) -> Trajectory:
@@ -80,7 +77,7 @@ class Offsets:
         for name in ("time_offset_s", "time_offset_s_sd"):
             found[name] = found[name][0]
         found |= {"significant": list(self.significant), "explains_most": self.explains}
-        found |= {"alignment": "sim3" if self.with_scale else "se3", "ate_m": self.ate, "ate_left_m": self.ate_left}
+        found |= {"ate_sim3_m": self.ate, "ate_sim3_left_m": self.ate_left}
         angles = np.degrees([self.rotation_error, self.rotation_error_left]).tolist()
         return found | {"rotation_error_deg": angles[0], "rotation_error_left_deg": angles[1]}
 
@@ -108,19 +105,15 @@ class Offsets:
         names = "; ".join(self._texts[name] for name in self.significant)
         angles = np.degrees([self.rotation_error, self.rotation_error_left])
         return (
-            f"most of the error is a constant offset ({names}): without it ATE after "
-            f"{'Sim(3)' if self.with_scale else 'SE(3)'} {self.ate_left:.3g} in place of {self.ate:.3g}, rotations "
-            f"{angles[1]:.2g} in place of {angles[0]:.2g} deg"
+            f"most of the error is a constant offset ({names}): without it ATE after Sim(3) {self.ate_left:.3g} in "
+            f"place of {self.ate:.3g}, rotations {angles[1]:.2g} in place of {angles[0]:.2g} deg"
         )
 
 
-def estimate_offsets(
-    estimate: Trajectory, truth: Trajectory, with_scale: bool = True, max_dt: float = MAX_TIME_DIFFERENCE
-) -> Offsets | None:
+def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE) -> Offsets | None:
     """The constant offsets of time and body between two trajectories; None for fewer than ten poses.
 
-    with_scale: whether lengths of the estimate have an unknown scale. Offsets of more than ten seconds are not found.
-    InputError where no poses match within `max_dt` seconds.
+    Offsets of more than ten seconds are not found. InputError where no poses match within `max_dt` seconds.
 
     Example:
         >>> import vggtgeo as vg
@@ -132,8 +125,7 @@ def estimate_offsets(
 
     """
     check_trajectories(estimate, truth)
-    kind: Alignment = "sim3" if with_scale else "se3"
-    plain = absolute_error(*associate(estimate, truth, max_dt), kind).statistics.rmse
+    plain = absolute_error(*associate(estimate, truth, max_dt), "sim3").statistics.rmse
     first, last = estimate.timestamps[[0, -1]]
     near = truth.select((truth.timestamps >= first - 2 * LONGEST) & (truth.timestamps <= last + 2 * LONGEST))
     if min(len(estimate), len(near)) < FEW_MATCHES:
@@ -141,10 +133,9 @@ def estimate_offsets(
     continuous = ContinuousTrajectory(near)
     if continuous.covers(estimate.timestamps).sum() < FEW_MATCHES:
         return None
-    model = OffsetModel(estimate, continuous, with_scale)
+    model = OffsetModel(estimate, continuous)
     start, tried = model.search()
     free = np.ones(UNKNOWNS, bool)
-    free[SCALE] = with_scale
     kept, names = _reduced(model, model.fit(free, start), tried)
     alone = model.fit(free & (np.arange(UNKNOWNS) < TIME.start))
     shown = {name: kept if name in names else model.refit(kept, _with(kept.free, name)) for name in _PARTS}
@@ -161,13 +152,12 @@ def estimate_offsets(
         ate_left=plain,
         rotation_error=alone.rotation_error,
         rotation_error_left=kept.rotation_error,
-        with_scale=with_scale,
     )
     rest = found.removed(estimate, truth)
-    left = absolute_error(*associate(estimate, rest, max_dt), kind).statistics.rmse
+    left = absolute_error(*associate(estimate, rest, max_dt), "sim3").statistics.rmse
     most = left < MOST * plain or kept.rotation_error < MOST * alone.rotation_error
-    verdict = comparability(estimate, rest, max_dt, not with_scale)
-    doubts = set(verdict.doubts) - set(comparability(estimate, truth, max_dt, not with_scale).doubts)
+    verdict = comparability(estimate, rest, max_dt)
+    doubts = set(verdict.doubts) - set(comparability(estimate, truth, max_dt).doubts)
     return replace(found, ate_left=left, explains=bool(names) and most and not (verdict.reasons or doubts))
 
 
