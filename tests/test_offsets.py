@@ -36,9 +36,11 @@ def _pair(
     turning: float = 0.3,
     axis: tuple[float, float, float] = (1.0, 1.0, 1.0),
     moving: float = 0.3,
+    rough: float = 0.0,
 ) -> tuple[Trajectory, Trajectory]:
     """An estimate at 10 Hz, right to 5 mm and 2 mrad a direction, and a truth at 100 Hz of another world whose clock is
-    `late`. drift: of the estimate, metres a pose. moving 0: on a straight line, at constant velocity.
+    `late`. drift: of the estimate, metres a pose. moving 0: on a straight line, at constant velocity. rough: noise of
+    the truth, metres and radians.
     """
     rng = np.random.default_rng(seed)
     knots = np.arange(-2.0, SECONDS + 3.0)
@@ -60,7 +62,10 @@ def _pair(
     body[:3, 3] = np.zeros(3) if lever is None else lever
     body[:3, :3] = np.eye(3) if turn is None else turn.as_matrix()
     world[:3, :3], world[:3, 3] = Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix(), [1.0, 2.0, 3.0]
-    return Trajectory(images, estimate), Trajectory(samples - late, world @ poses(samples) @ body)
+    true = world @ poses(samples) @ body
+    true[:, :3, 3] += rng.normal(0, rough, (len(samples), 3))
+    true[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, rough, (len(samples), 3))).as_matrix() @ true[:, :3, :3]
+    return Trajectory(images, estimate), Trajectory(samples - late, true)
 
 
 def _offsets(estimate: Trajectory, truth: Trajectory) -> Offsets:
@@ -97,6 +102,14 @@ def test_a_clock_that_is_late_is_told(late: float) -> None:
     assert found.ate > 4 * found.ate_left
     assert found.ate_left == pytest.approx(0.005 * np.sqrt(3), rel=0.15)
     assert "time offset of the truth" in found.message
+
+
+def test_noise_of_the_truth_moves_no_clock() -> None:
+    # Proves that a truth with noise of its own, which is smaller between its poses as interpolation averages, does not
+    # draw the offset there. Oracle: poses of the estimate at every tenth of the truth's, which is exactly at one.
+    found = [_offsets(*_pair(seed, 0.1, turning=0.02, rough=0.001)) for seed in range(3)]
+    scaled = [(one.time - 0.1) / one.time_sd for one in found]
+    assert np.abs(scaled).max() < 3.0, f"{scaled} deviations off"
 
 
 def test_a_lever_arm_is_found_where_the_clock_is_right() -> None:
