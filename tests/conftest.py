@@ -114,6 +114,12 @@ def shared_bench() -> Path:
 
 
 @pytest.fixture(scope="session")
+def shared_cases() -> Path:
+    """The folder of small inputs that fail, by kind, or a skip."""
+    return _shared("cases")
+
+
+@pytest.fixture(scope="session")
 def healthy() -> Any:
     """A synthetic walk that no check of the verdict has anything to say of."""
     from witness import walk  # after the hook above

@@ -5,11 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny_suites as tiny
-from bench_rows import EXTERNAL, ROWS
+from bench_rows import EXTERNAL, ROWS, row
+from scipy.spatial.transform import Rotation
 
 from vggtgeo.benchmark import markdown
+from vggtgeo.benchmark.common_time import less_baseline
 from vggtgeo.benchmark.external import external_rows, tell_missing
+from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.published import published
+from vggtgeo.benchmark.statistics import paired
+from vggtgeo.benchmark.suite import Suite
+from vggtgeo.benchmark.table import Row
+from vggtgeo.evaluation import comparability
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -39,6 +46,51 @@ def test_other_systems_are_rows_of_their_own(tmp_path: Path) -> None:
     (tmp_path / "other/walk.txt").write_text("nothing")
     (broken,) = external_rows(suite, tiny.jobs(), tmp_path / "out/runs", tmp_path)
     assert broken["status"] == "error"
+
+
+def _walk(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (100, 1, 1))
+    poses[:, :3, 3] = rng.normal(scale=0.1, size=(100, 3)).cumsum(axis=0)
+    poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(scale=0.03, size=(100, 3)).cumsum(axis=0)).as_matrix()
+    return poses
+
+
+def _systems(tmp_path: Path, ours: np.ndarray, theirs: Trajectory) -> tuple[Suite, list[Row]]:
+    """A run of ours on the walk, and the trajectory of another system beside it."""
+    truth = Trajectory(np.arange(100) / 10, _walk(0))
+    place = tmp_path / "out/runs/walk.full.0"
+    truth.save_tum(place / "truth.txt")
+    Trajectory(truth.timestamps, ours).save_tum(place / "estimate.txt")
+    theirs.save_tum(tmp_path / "other/walk.txt")
+    suite = tiny.suite(tiny.TEXT + EXTERNAL)
+    errors, _ = trajectory_errors(Trajectory(truth.timestamps, ours), truth)
+    rows = [row("walk", "full", 0, None, **errors), *external_rows(suite, tiny.jobs(), place.parent, tmp_path)]
+    return suite, less_baseline(suite, rows, place.parent)
+
+
+def test_another_sequence_has_the_status_that_evaluate_gives(tmp_path: Path) -> None:
+    # Proves that a batch does not rank what `vggtgeo evaluate` calls not comparable. Oracle: `comparability`.
+    times = np.arange(100) / 10
+    for poses in (_walk(1), np.linalg.inv(_walk(0))):
+        _, (_, found) = _systems(tmp_path, _walk(0), Trajectory(times, poses))
+        reasons = comparability(Trajectory(times, poses), Trajectory(times, _walk(0)), metric=True).reasons
+        assert found["status"] == "not comparable"
+        assert all(one in found["message"] for one in reasons)
+
+
+def test_differences_are_over_the_time_that_both_cover(tmp_path: Path) -> None:
+    # Proves that a system which was lost after a third is compared with ours over that third. Oracle: ours is exact
+    # there and wrong by a decimetre after, theirs wrong by 3 cm; over all, ours would be worse.
+    rng = np.random.default_rng(2)
+    ours, theirs = _walk(0), _walk(0)
+    ours[40:, :3, 3] += rng.normal(scale=0.1, size=(60, 3))
+    theirs[:, :3, 3] += rng.normal(scale=0.03, size=(100, 3))
+    suite, rows = _systems(tmp_path, ours, Trajectory(np.arange(33) / 10, theirs[:33]))
+    assert rows[1]["coverage"] < 0.4
+    assert rows[1]["ate_se3_m"] < rows[0]["ate_se3_m"]
+    (found,) = paired(rows, "other", suite.base, "ate_se3_m", "walk")
+    assert found == pytest.approx(rows[1]["ate_se3_m"], abs=1e-6)
 
 
 def test_a_system_without_any_file_is_told_before_the_runs(tmp_path: Path) -> None:

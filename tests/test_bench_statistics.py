@@ -140,3 +140,30 @@ def test_the_truth_is_that_of_the_frames_that_were_read() -> None:
     part = between(truth, 2.0, 4.0)
     assert (part.timestamps[0], part.timestamps[-1]) == (2.0, 4.0)
     assert len(between(truth, 50.0, 60.0)) == 100
+
+
+def test_accuracy_is_ranked_at_equal_coverage_only() -> None:
+    # Proves that a system which was lost is neither the best nor in a mean, that coverage stands beside the error, and
+    # that the others' mean does not lose sequences by it. Oracle: by hand.
+    rows = [
+        row(name, setting, 0, cm, coverage=share)
+        for name in ("walk", "hall")
+        for setting, cm, share in (("full", 3.0, 1.0), ("bare", 5.0, 0.95), ("other", 1.0, 0.2))
+    ]
+    rows[-1] |= {"external": "a.txt"}
+    suite = tiny.suite(tiny.TEXT + EXTERNAL)
+    lines = dict(cells.matrix(suite, rows, cells.SE3))
+    assert cells.matrix_heads(suite, rows, cells.SE3) == ["walk", "hall", "mean"]
+    assert lines["full system"] == [cells.Cell("3.00 at 100 %", 1)] * 2 + [cells.Cell("3.00", 1)]
+    assert lines["without | lines"] == [cells.Cell("5.00 at 95 %", 2)] * 2 + [cells.Cell("5.00", 2)]
+    assert lines["Other-SLAM"] == [cells.Cell("1.00 at 20 %")] * 2 + [cells.Cell("")]
+
+
+def test_what_cannot_be_compared_is_neither_ranked_nor_averaged() -> None:
+    # Proves that the status of a row keeps it out of the numbers, and stands in their place with the reasons below.
+    # Oracle: by hand.
+    rows = [*ROWS[:3], *({**one, "status": "not comparable", "message": "world to camera"} for one in ROWS[3:6])]
+    text = markdown.page(tiny.suite(), rows)
+    assert "| without \\| lines | 3 not comparable |" in text
+    assert "| walk | bare | 0 | not comparable | world to camera |" in text
+    assert "## Against" not in text

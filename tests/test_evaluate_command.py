@@ -15,7 +15,7 @@ import vggtgeo.cli.evaluate
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.cli.progress import errors_line
 from vggtgeo.datasets import open_sequence
-from vggtgeo.evaluation import MAX_TIME_DIFFERENCE, evaluate_trajectory
+from vggtgeo.evaluation import MAX_TIME_DIFFERENCE, estimate_offsets, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -46,8 +46,10 @@ def test_json_has_the_metrics(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*map(str, files), "--json", "--delta", "3", "--all-pairs", "--max-dt", "0.02"])
     assert result.exit_code == 0, result.output
     expected = evaluate_trajectory(*_load(files), max_dt=0.02, delta=3, all_pairs=True)
+    offsets = estimate_offsets(*_load(files), max_dt=0.02)
+    assert offsets is not None
     assert json.loads(result.output) == json.loads(
-        json.dumps({**expected.as_dict(), "truth_in_metres": None, "comparable": True})
+        json.dumps({**expected.as_dict(), "truth_in_metres": None, "offsets": offsets.as_dict(), "comparable": True})
     )
 
 
@@ -196,8 +198,9 @@ def test_a_camera_that_hardly_turns_tells_of_strangers_over_longer_times(tmp_pat
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         outcome = CliRunner().invoke(app, [str(tmp_path / "trajectory.txt"), str(tmp_path / "truth.txt")])
-    assert outcome.exit_code == 0, outcome.output
+    assert outcome.exit_code == (3 if inverted else 0), outcome.output
     assert [True for one in warned if "hardly turns" in str(one.message)] == [True] * inverted
+    assert [True for one in warned if "they are world to camera" in str(one.message)] == [True] * inverted
 
 
 def test_lengths_in_another_unit_are_told_where_they_are_compared() -> None:

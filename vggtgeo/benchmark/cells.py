@@ -131,6 +131,26 @@ def is_whole(rows: Sequence[Row], column: Column) -> bool:
     return bool(rows) and summary_of(rows, column).count == len(rows)
 
 
+LEAST_COVERAGE = 0.9
+"""Share of the truth's duration; with less the error is that of another, mostly easier, part of the sequence."""
+
+
+def is_covered(rows: Sequence[Row]) -> bool:
+    """Whether no run is known to cover less than `LEAST_COVERAGE`."""
+    return not (values(rows, "coverage") < LEAST_COVERAGE).any()
+
+
+def is_ranked(rows: Sequence[Row], column: Column) -> bool:
+    """Whether the mean may be compared with others."""
+    return is_whole(rows, column) and (column.name == "coverage" or is_covered(rows))
+
+
+def at_coverage(rows: Sequence[Row]) -> str:
+    """At which mean coverage the numbers of runs are, rounded down; empty where that is not known."""
+    mean = Summary.of(values(finished(rows), "coverage")).mean
+    return f" at {np.floor(100 * mean + 1e-9):.0f} %" if np.isfinite(mean) else ""
+
+
 def text_of(rows: Sequence[Row], column: Column) -> str:
     """`summary_of` as text, and of how many of the runs it is where some have no number; empty where none has."""
     good = finished(rows)
@@ -161,14 +181,16 @@ def cell_of(rows: Sequence[Row], column: Column) -> Cell:
 def _text_or_ending(rows: Sequence[Row], column: Column) -> str:
     """Where no run has a number, how those ended that failed."""
     lost = [row for row in rows if row["status"] != "ok" or row.get("verdict") == "failed"]
-    return text_of(rows, column) or verdicts(lost)
+    text = text_of(rows, column)
+    return f"{text}{at_coverage(rows)}" if text and text != FREE else text or verdicts(lost)
 
 
 def ranked(groups: Sequence[Sequence[Row]], column: Column, beside_count: bool = False) -> list[Cell]:
-    """A cell of a column for each group of rows; those that some runs have no number of are not compared.
-    beside_count: `runs_text` stands beside, so that the cells need not say of how many runs they are.
+    """A cell of a column for each group of rows; those that some runs have no number of, or that do not cover the
+    sequence, are not compared. beside_count: `runs_text` and the coverage stand beside, so that the cells need not say
+    of how many runs and of what part of the sequence they are.
     """
-    whole = [summary_of(own, column) if is_whole(own, column) else Summary.of(np.array([])) for own in groups]
+    whole = [summary_of(own, column) if is_ranked(own, column) else Summary.of(np.array([])) for own in groups]
     texts = [text_of(finished(own), column) if beside_count else _text_or_ending(own, column) for own in groups]
     medians = [median_text(summary_of(own, column), column) for own in groups]
     return placed([summary.mean for summary in whole], texts, column, medians)
@@ -202,7 +224,7 @@ def sequences_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
 
 
 def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str, list[Cell]]]:
-    """A row a setting, a column a sequence, and over the sequences that all runs of all of them have a number for the
+    """A row a setting, a column a sequence, and over the sequences that all of them are ranked on (see `_common`) the
     mean, with the mean of the medians over seeds beside it, and the median. rows: those without a result, too.
     """
     settings, sequences = settings_of(suite, rows), sequences_of(suite, rows)
@@ -210,11 +232,14 @@ def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str,
     by_column = [ranked(groups[name], column) for name in sequences]
     common = _common(suite, rows, column)
     if len(common) > 1:
-        lists = [[summary_of(groups[name][row], column) for name in common] for row in range(len(settings))]
+        lists = [
+            [summary_of(groups[name][row], column) for name in common if is_ranked(groups[name][row], column)]
+            for row in range(len(settings))
+        ]
         pooled = [Summary.of(np.array([one.mean for one in own])) for own in lists]
         # Means of medians, as published: only where each sequence has enough seeds.
-        seeds = [min(one.count for one in own) >= LEAST_FOR_MEDIAN for own in lists]
-        medians = [f"{np.mean([one.median for one in own]):.{column.digits}f}" for own in lists]
+        seeds = [min((one.count for one in own), default=0) >= LEAST_FOR_MEDIAN for own in lists]
+        medians = [f"{np.mean([one.median for one in own]):.{column.digits}f}" if own else "" for own in lists]
         shown = [text if enough else "" for text, enough in zip(medians, seeds, strict=True)]
         by_column.append(_placed_alone([one.mean for one in pooled], column, shown))
         if len(common) >= LEAST_FOR_MEDIAN:
@@ -223,17 +248,15 @@ def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str,
 
 
 def _placed_alone(numbers: Sequence[float], column: Column, medians: Sequence[str]) -> list[Cell]:
-    return placed(numbers, [f"{one:.{column.digits}f}" for one in numbers], column, medians)
+    return placed(numbers, [f"{one:.{column.digits}f}" if np.isfinite(one) else "" for one in numbers], column, medians)
 
 
 def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """The sequences that every run of every setting has a number for."""
-    settings = settings_of(suite, rows)
-    return [
-        name
-        for name in sequences_of(suite, rows)
-        if all(is_whole(select(rows, name, setting), column) for setting in settings)
-    ]
+    """The sequences on which every setting is ranked that is ranked on any."""
+    names = sequences_of(suite, rows)
+    groups = [[select(rows, name, setting) for name in names] for setting in settings_of(suite, rows)]
+    ranks = [[is_ranked(own, column) for own in line] for line in groups]
+    return [name for place, name in enumerate(names) if all(line[place] for line in ranks if any(line))]
 
 
 def matrix_heads(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
@@ -287,7 +310,7 @@ def _difference(summary: Summary, column: Column) -> Cell:
 
 def verdicts(rows: Sequence[Row]) -> str:
     """How runs ended: their verdicts, and what ended without one, with counts where there are several."""
-    words = [str(row.get("verdict") or row["status"]) for row in rows]
+    words = [str((row["status"] == "ok" and row.get("verdict")) or row["status"]) for row in rows]
     counts = {word: words.count(word) for word in dict.fromkeys(words)}
     return ", ".join(word if len(words) == 1 else f"{count} {word}" for word, count in counts.items())
 

@@ -45,7 +45,8 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
         for name in cells.sequences_of(suite, good)
     }
     panels = {name: keys for name, keys in panels.items() if keys}
-    rows_of = {name: [_wrapped(suite.title_of(key), _LABEL) for key in keys] for name, keys in panels.items()}
+    label = lambda name, key: f"{suite.title_of(key)}{_part(select(good, name, key))}"
+    rows_of = {name: [_wrapped(label(name, key), _LABEL) for key in keys] for name, keys in panels.items()}
     heights = [_height(labels) + _MARGIN for labels in rows_of.values()]
     figure = NotebookFigure(figsize=(width, sum(heights) + 0.5 if panels else 1.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -58,6 +59,11 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
         axes.set_title(_wrapped(name, _TITLE), loc="left", fontsize=10, color=_INK)
     drawn[-1].set_xlabel(f"{column.head}; dots: runs, bars: means with 95 % intervals", fontsize=9, color=_INK)
     return figure
+
+
+def _part(rows: Sequence[Row]) -> str:
+    """The coverage where it is too small for a comparison."""
+    return "" if cells.is_covered(rows) else cells.at_coverage(rows)
 
 
 def _wrapped(text: str, width: int, most: int = 3) -> str:

@@ -18,8 +18,8 @@ def page(suite: Suite, rows: Sequence[Row]) -> str:
     there = [row for row in rows if row["status"] != "absent"]
     parts = [f"# {' '.join(suite.title.split())}", *([suite.about.strip()] if suite.about else []), notice(suite, rows)]
     if good:
-        parts += ["## Accuracy", "ATE RMSE after SE(3) alignment, cm.", accuracy(suite, there, cells.SE3)]
-        parts += ["ATE RMSE after Sim(3) alignment, cm.", accuracy(suite, there, cells.SIM3)]
+        parts += ["## Accuracy", f"ATE RMSE after SE(3) alignment, cm{_COVERED}", accuracy(suite, there, cells.SE3)]
+        parts += [f"ATE RMSE after Sim(3) alignment, cm{_COVERED}", accuracy(suite, there, cells.SIM3)]
         if cells.differences(suite, good):
             parts += [f"## Against {suite.title_of(suite.base)}", _DIFFERENCES, differences(suite, good)]
         parts += ["## Each sequence and setting", *details(suite, there)]
@@ -33,9 +33,13 @@ def page(suite: Suite, rows: Sequence[Row]) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
+_COVERED = (
+    f", at the share of the truth's duration that is covered: below {100 * cells.LEAST_COVERAGE:.0f} % an error is not "
+    "ranked."
+)
 _DIFFERENCES = (
-    "On the same sequence and seed: mean difference and its 95 % interval (Student), negative is less. Bold where the "
-    "interval leaves zero out."
+    "On the same sequence and seed, over the time that both cover: mean difference and its 95 % interval (Student), "
+    "negative is less. Bold where the interval leaves zero out."
 )
 
 

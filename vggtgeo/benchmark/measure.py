@@ -10,7 +10,15 @@ import numpy as np
 
 from vggtgeo.benchmark.inputs import Input
 from vggtgeo.benchmark.map_errors import depth_errors, map_errors
-from vggtgeo.evaluation import Similarity, TrajectoryReport, evaluate_trajectory, focal_error, pose_consistency
+from vggtgeo.evaluation import (
+    Similarity,
+    TrajectoryReport,
+    comparability,
+    estimate_offsets,
+    evaluate_trajectory,
+    focal_error,
+    pose_consistency,
+)
 from vggtgeo.evaluation.alignment import AXES, Axis
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -18,6 +26,8 @@ from vggtgeo.results.result import Result
 
 DELTAS: tuple[tuple[str, float, str], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0, "metres"))
 """Of RTE and RRE: the name in the columns, how far, and its unit."""
+NOT_COMPARABLE = "not comparable"
+"""The status of a row whose errors mean nothing, for the reasons in its message."""
 _AROUND = 0.02
 """Seconds before the first and after the last frame in which the truth still belongs to the run."""
 
@@ -90,12 +100,16 @@ def trajectory_errors(
     estimate: Trajectory, truth: Trajectory, metric: bool = True, max_dt: float = 0.01, vertical: Axis = "z"
 ) -> tuple[dict[str, Any], Similarity | None]:
     """ATE after each alignment, RTE and RRE at `DELTAS`; and the alignment that maps are compared after: SE(3) where
-    lengths are metres, else Sim(3). Relative errors of an estimate without scale are taken after that, too.
+    lengths are metres, else Sim(3). Relative errors of an estimate without scale are taken after that, too. A status
+    and a message where the errors mean nothing.
     """
     try:
         report = evaluate_trajectory(estimate, truth, max_dt, vertical=AXES[vertical])
     except InputError as error:
         return {"warnings": str(error), "matched": 0}, None
+    verdict = comparability(estimate, truth, max_dt, metric)
+    offsets = estimate_offsets(estimate, truth, max_dt)
+    explained = [offsets.message] if offsets is not None and offsets.explains else []
     row: dict[str, Any] = {
         "matched": report.matched,
         "coverage": report.coverage,
@@ -106,8 +120,14 @@ def trajectory_errors(
         "ate_unaligned_m": report.unaligned.statistics.rmse,
         "ate_se3_max_m": report.se3.statistics.maximum,
         "scale": report.sim3.alignment.scale,
-        "warnings": "; ".join(report.warnings),
+        "warnings": "; ".join([*report.warnings, *verdict.doubts, *explained]),
     }
+    if offsets is not None:
+        known = offsets.as_dict()
+        row |= {"time_offset_s": known["time_offset_s"], "time_offset_sd_s": known["time_offset_s_sd"]}
+        row |= {"offsets": ", ".join(offsets.significant), "ate_sim3_without_offsets_m": offsets.ate_left}
+    if verdict.reasons:
+        row |= {"status": NOT_COMPARABLE, "message": "; ".join([*verdict.reasons, *verdict.doubts, *explained])}
     for name, delta, unit in DELTAS:
         row |= _relative(evaluate_trajectory(estimate, truth, max_dt, delta, unit=unit), name, metric)  # type: ignore[arg-type]
     return row, (report.se3 if metric else report.sim3).alignment

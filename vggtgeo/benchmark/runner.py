@@ -11,6 +11,7 @@ from typing import Any
 
 from vggtgeo.benchmark import markdown
 from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
+from vggtgeo.benchmark.common_time import less_baseline
 from vggtgeo.benchmark.external import external_rows, tell_missing
 from vggtgeo.benchmark.figures import ablation_figure
 from vggtgeo.benchmark.inputs import data_folders
@@ -153,6 +154,7 @@ def bench(
         limits = Limits(60 * chosen.timeout_minutes, chosen.memory_gb)
         rows = all_rows(jobs, store, limits, workers, retry, progress, cluster)
         rows += external_rows(chosen, jobs, folder / "runs", base)
+        rows = less_baseline(chosen, rows, folder / "runs")
         report = BenchReport(chosen, tuple(rows), folder)
         report.write(folder)
     return report

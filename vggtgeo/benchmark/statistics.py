@@ -13,6 +13,8 @@ from scipy.stats import t as student
 from vggtgeo.benchmark.table import Row, number
 
 LEVEL = 0.95
+LESS_BASELINE = "_less_baseline"
+"""Behind the name of a column: the difference to the baseline over what both cover, where that was measured."""
 SAME = 1e-6
 """Relative spread below which numbers are the same: nothing was drawn at random."""
 
@@ -71,7 +73,8 @@ def paired(
     sequence: str | None = None,
     recorded: Collection[str] = (),
 ) -> Float[np.ndarray, " n"]:
-    """Setting minus baseline on the same sequence and seed, where both have a number.
+    """Setting minus baseline on the same sequence and seed, where both have a number; over what both cover, where a row
+    has that difference.
 
     recorded: sequences of which there is one, whatever the seed. Over several sequences such a one is one sample, the
     mean over its seeds: ten seeds of two recordings are no twenty recordings.
@@ -80,6 +83,8 @@ def paired(
     samples: dict[tuple[str, int | None], list[float]] = {}
     for row in select(rows, sequence, setting):
         difference = number(row, column) - other.get((row["sequence"], row["seed"]), np.nan)
+        if np.isfinite(difference) and f"{column}{LESS_BASELINE}" in row:
+            difference = number(row, f"{column}{LESS_BASELINE}")
         if np.isfinite(difference):
             one = sequence is None and row["sequence"] in recorded
             samples.setdefault((row["sequence"], None if one else row["seed"]), []).append(difference)

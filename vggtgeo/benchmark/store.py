@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.jobs import Job
+from vggtgeo.benchmark.measure import NOT_COMPARABLE
 from vggtgeo.benchmark.table import NUMBERS, Row
 from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.io.errors import InputError
@@ -67,7 +68,7 @@ class Store:
                 _check_row(row, job)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"`{path}` is no finished run ({error}); delete it and call again") from None
-        return row if same and not (retry and status != "ok") else None
+        return row if same and not (retry and status not in ("ok", NOT_COMPARABLE)) else None
 
     def begin(self, job: Job) -> Path:
         """An empty folder with what the run is to do."""

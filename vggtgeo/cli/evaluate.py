@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -44,29 +44,57 @@ def evaluate(
     vertical: Annotated[
         Literal["x", "y", "z"], typer.Option(help="Axis of GT that points up or down, for the yaw-only alignment.")
     ] = "z",
+    time_offset: Annotated[float, typer.Option(help="Seconds to add to the times of GT (its clock is late).")] = 0.0,
+    estimate_offset: Annotated[
+        bool,
+        typer.Option(
+            "--estimate-offset/--no-estimate-offset",
+            help="Report the errors without the estimated offsets of clock and body, too.",
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT.
+    """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT, and constant offsets between the two.
 
     Exit code 3: the numbers mean nothing, as the two are of different sequences, or the estimate failed.
     """
-    from vggtgeo.evaluation import evaluate_trajectory
+    from vggtgeo.evaluation import comparability, estimate_offsets, evaluate_trajectory, shifted
     from vggtgeo.evaluation.alignment import AXES
-    from vggtgeo.evaluation.resemblance import warn_of_strangers
 
     with collected_warnings() as warned:
         true, metres = load_truth(truth)
         found, scale = load_estimate(estimate, true), load_scale(estimate)
+        if time_offset:
+            true = shifted(found, true, time_offset)
         report = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
         metric = metres is not False and scale is not None and scale.startswith("metric")
-        meaningless = warn_of_strangers(found, true, max_dt, metric)
+        verdict = comparability(found, true, max_dt, metric)
+        offsets = estimate_offsets(found, true, max_dt)
+        left = verdict
+        if offsets is not None and offsets.significant:
+            true = offsets.removed(found, true)
+            left = comparability(found, true, max_dt, metric)
+        for text in (*verdict.reasons, *verdict.doubts):
+            warnings.warn(text, InputWarning, stacklevel=2)
+        if offsets is not None and offsets.explains:
+            warnings.warn(offsets.message, InputWarning, stacklevel=2)
+        rest = None
+        if estimate_offset and offsets is not None:
+            rest = evaluate_trajectory(found, true, max_dt, delta, all_pairs, unit, AXES[vertical])
     if as_json:
-        known = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
-        told = {"warnings": [*report.warnings, *map(str, warned)], "comparable": not meaningless}
+        known: dict[str, Any] = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
+        known["offsets"] = None if offsets is None else offsets.as_dict()
+        if rest is not None:
+            known["without_offsets"] = {**rest.as_dict(), "comparable": not left.reasons}
+        told = {"warnings": [*report.warnings, *map(str, warned)], "comparable": not verdict.reasons}
         typer.echo(json.dumps({**report.as_dict(), **known, **told}, indent=2))
     else:
         print_report(report, scale, metres)
-    if meaningless:
+        typer.echo(f"constant offsets: {'too few poses match to estimate them' if offsets is None else offsets}")
+        if rest is not None and offsets is not None:
+            typer.echo(f"without {', '.join(offsets.significant) or 'any, as none is significant'}:")
+            print_report(rest, scale, metres)
+    if (left if rest is not None else verdict).reasons:
         typer.echo("NOT COMPARABLE: these errors say nothing, see the warnings", err=True)
         raise typer.Exit(EXIT_FAILED)
 

@@ -8,8 +8,10 @@ from vggtgeo.evaluation.clouds import CloudError, cloud_error
 from vggtgeo.evaluation.consistency import Consistency, consistency, pose_consistency
 from vggtgeo.evaluation.depth import DepthError, depth_error, depth_of_cloud
 from vggtgeo.evaluation.meshes import Mesh, mesh_error, surface_points
+from vggtgeo.evaluation.offsets import Offsets, estimate_offsets, shifted
 from vggtgeo.evaluation.relative import UNITS, RelativeError, Unit, relative_error, rotation_angle
-from vggtgeo.evaluation.report import TrajectoryReport, coverage, evaluate_trajectory
+from vggtgeo.evaluation.report import TrajectoryReport, coverage, evaluate_trajectory, followed
+from vggtgeo.evaluation.resemblance import Comparability, comparability
 from vggtgeo.evaluation.statistics import ErrorStatistics
 
 __all__ = [
@@ -19,10 +21,12 @@ __all__ = [
     "AbsoluteError",
     "Alignment",
     "CloudError",
+    "Comparability",
     "Consistency",
     "DepthError",
     "ErrorStatistics",
     "Mesh",
+    "Offsets",
     "RelativeError",
     "Similarity",
     "TrajectoryReport",
@@ -31,12 +35,15 @@ __all__ = [
     "align",
     "associate",
     "cloud_error",
+    "comparability",
     "consistency",
     "coverage",
     "depth_error",
     "depth_of_cloud",
+    "estimate_offsets",
     "evaluate_trajectory",
     "focal_error",
+    "followed",
     "heading",
     "mesh_error",
     "nearest_in_time",
@@ -44,6 +51,7 @@ __all__ = [
     "relative_error",
     "rotation_angle",
     "scale_error",
+    "shifted",
     "surface_points",
     "umeyama",
 ]

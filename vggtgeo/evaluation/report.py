@@ -4,10 +4,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
 from vggtgeo.evaluation.alignment import VERTICAL
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check_trajectories, spans
+from vggtgeo.evaluation.association import (
+    MAX_TIME_DIFFERENCE,
+    associate,
+    check_trajectories,
+    nearest_in_time,
+    spans,
+)
 from vggtgeo.evaluation.relative import RelativeError, Unit, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -162,9 +169,24 @@ def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGE
         return float("nan")
     begin, end = truth.timestamps[[0, -1]]
     times = np.clip(estimate.timestamps, begin, end)
-    usual = float(np.median(np.diff(truth.timestamps)))
-    followed = np.diff(estimate.timestamps) <= max(longest_gap, 2.0 * usual)
-    return float(np.diff(times)[followed].sum() / (end - begin))
+    return float(np.diff(times)[_close(estimate, truth, longest_gap)].sum() / (end - begin))
+
+
+def followed(
+    times: Float[np.ndarray, " n"], estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGEST_GAP
+) -> Bool[np.ndarray, " n"]:
+    """Which of `times` (seconds) lie between two poses of the estimate as `coverage` counts them, or at one."""
+    poses = estimate.timestamps
+    after = np.searchsorted(poses, times)
+    close = np.concatenate([[False], _close(estimate, truth, longest_gap), [False]])
+    near = np.zeros(len(times), bool)
+    near[nearest_in_time(times, poses, MAX_TIME_DIFFERENCE)[0]] = True
+    return near | close[after]
+
+
+def _close(estimate: Trajectory, truth: Trajectory, longest_gap: float) -> np.ndarray:
+    usual = float(np.median(np.diff(truth.timestamps))) if len(truth) > 1 else 0.0
+    return np.diff(estimate.timestamps) <= max(longest_gap, 2.0 * usual)
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ sqrt(2) times as much if the two move alike. Where the camera hardly turns over 
 told and no more: there, an estimate of the same camera may have drifted as far.
 """
 
-import warnings
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from vggtgeo.evaluation.absolute import absolute_error
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
 from vggtgeo.evaluation.relative import relative_error, rotation_angle
 from vggtgeo.evaluation.report import ABSURD_SCALE, FEW_MATCHES
+from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputWarning
 
 LEAST_TURN = np.radians(2.0)
 """RMS rotation of the truth below which nothing can be said."""
@@ -32,60 +32,74 @@ AGREEING = 0.1
 """Of that spread: places that are the same."""
 WIDE = 0.05
 """Of the path's spread along its main direction, across it: a straight one may be turned about itself."""
+MOST = 0.5
+"""Share of an error that is left where something else explains most of it."""
 MOST_TURNED = np.radians(30.0)
 """Between orientations where places agree. An estimate that follows the path is not so far off."""
 
 
-def warn_of_strangers(
-    estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE, metric: bool = False
-) -> bool:
-    """An InputWarning where few poses match in time, and where rotations or places have nothing to do with each other.
+@dataclass(frozen=True)
+class Comparability:
+    """reasons: why the errors of two trajectories mean nothing, a sentence each; none where they do. doubts: what else
+    should be looked at.
+    """
 
-    True where the errors of the two mean nothing: too few poses match for an alignment, they are no better than those
-    of a camera that stands still, or an estimate that is known to be in metres (`metric`) has another size altogether.
+    reasons: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+
+def comparability(
+    estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE, metric: bool = False
+) -> Comparability:
+    """Whether the errors of the two mean something.
+
+    They do not where too few poses match for an alignment, where rotations or places are explained no better than by a
+    camera that stands still, where the inverse poses fit better, or where an estimate that is known to be in metres
+    (`metric`) has another size altogether. InputError where no poses match within `max_dt` seconds.
     """
     matched, reference = associate(estimate, truth, max_dt)
+    reasons: list[str] = []
+    doubts: list[str] = []
     shorter = min(len(estimate), len(truth))
-    few = len(matched) < FEW * shorter
-    if few:
-        _warn(f"only {len(matched)} of {shorter} poses match within {max_dt:g} s: are both of one sequence?")
+    if len(matched) < FEW * shorter:
+        text = f"only {len(matched)} of {shorter} poses match within {max_dt:g} s: are both of one sequence?"
+        (reasons if len(matched) < FEW_MATCHES else doubts).append(text)
     ratio = rotation_misfit(matched, reference)
-    turned = ratio is not None and ratio >= 1.0
-    if turned:
-        _warn(
+    if ratio is not None and ratio >= 1.0:
+        reasons.append(
             f"the estimate explains the true rotations no better than a camera that stands still (error / motion "
             f"{ratio:.2f}): it is of another sequence, or it failed"
         )
     longer = rotation_misfit(matched, reference, longest=0.5) if ratio is None else None
     if longer is not None and longer >= 1.0:
-        _warn(
+        doubts.append(
             f"the camera hardly turns, and what it turns the estimate explains no better than one that stands still "
             f"(error / motion {longer:.2f}): are both of one sequence, with poses camera to world?"
         )
     share = place_misfit(matched, reference)
-    elsewhere = share is not None and share >= WORST_SHARE
-    if elsewhere:
-        _warn(
+    if share is not None and share >= WORST_SHARE:
+        reasons.append(
             f"the estimate explains the true path hardly better than a camera that stands still (error after Sim(3) "
             f"{share:.2f} of the path's spread): it is of another sequence, or it failed"
         )
+    inverse = place_misfit(Trajectory(matched.timestamps, rigid.invert(matched.poses)), reference)
+    if share is not None and inverse is not None and inverse < MOST * share:
+        reasons.append(
+            f"the inverse of the estimated poses fits better (error after Sim(3) {inverse:.3f} of the path's spread, "
+            f"and {share:.3f} as given): they are world to camera, and must be camera to world"
+        )
     apart = orientation_gap(matched, reference) if share is not None and share < AGREEING else None
     if apart is not None and apart > MOST_TURNED:
-        _warn(
+        doubts.append(
             f"places agree, and orientations are {np.degrees(apart):.0f} deg apart: are the quaternions of both files "
             "`qx qy qz qw`, and their poses those of the same camera? RPE says nothing here"
         )
     scale = absolute_error(matched, reference, "sim3").alignment.scale if len(matched) >= FEW_MATCHES else 1.0
-    resized = metric and not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE
-    if resized:
-        _warn(
+    if metric and not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE:
+        reasons.append(
             f"the estimate is in metres, and the truth {scale:.3g} times as large: it is of another sequence, or unit"
         )
-    return turned or elsewhere or resized or (few and len(matched) < FEW_MATCHES)
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, InputWarning, stacklevel=3)
+    return Comparability(tuple(reasons), tuple(doubts))
 
 
 def place_misfit(matched: Trajectory, reference: Trajectory) -> float | None:

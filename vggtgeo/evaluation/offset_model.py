@@ -1,0 +1,350 @@
+"""The model of an estimate whose truth is of other moments, or of another point of the body.
+
+The estimate has camera poses `E_i` at times `t_i`; the truth is a continuous motion `T(t)` of a point fixed to the
+camera. With the alignment A (a similarity), the time offset d that is to be added to the truth's times, and the pose B
+of the truth's point in the camera's frame (lever arm and rotation),
+
+    T(t_i - d) = A E_i B,    residuals  p_T - p_AEB  and  log(R_T R_AEB^T),  in the truth's world.
+
+Both residuals are white noise upon a drift (`drift_noise`), estimated in turn with the unknowns (D. Cochrane, G. H.
+Orcutt, JASA 44, 1949): neighbouring errors of SLAM are alike, so that n poses are not n observations. Rotation and
+lever arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+from scipy.stats import norm
+
+from vggtgeo.evaluation.alignment import umeyama
+from vggtgeo.evaluation.drift_noise import DriftNoise
+from vggtgeo.evaluation.interpolation import ContinuousTrajectory
+from vggtgeo.geometry.rigid import cross
+from vggtgeo.geometry.trajectory import Trajectory
+
+Noises = tuple[DriftNoise, DriftNoise]
+
+UNKNOWNS = 14
+"""3 of A's translation, 3 of its rotation, its scale, the time offset, 3 of B's position, 3 of its rotation."""
+TIME, LEVER, TURN = slice(7, 8), slice(8, 11), slice(11, 14)
+LONGEST = 10.0
+"""Seconds: the largest time offset that is looked for."""
+LEVEL = 1e-3
+"""Significance level of all tests of offsets."""
+_ROUNDS, _STEPS, _HALVINGS = 5, 20, 6
+_LEAST_STEP = 0.1
+"""Seconds between the starts of the search, and between a pose and those its velocity is taken from: a body that is
+carried moves much the same within."""
+_REACH = _LEAST_STEP
+_LEAST_SPREAD = 1e-6
+"""Of a path: that of a still camera in a file of six decimals."""
+_WEAK, _TELLS = 10.0, 4.0
+_MOST_POSES, _MOST_TRIED = 400, 100
+"""Of a fit, and of a start of the search: with more it takes longer and knows little more, as errors are alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """rotation, translation, scale: of A. time: d, seconds. lever, turn: position (metres of the truth) and rotation of
+    B, that of the truth's point in the camera's frame.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+    scale: float
+    time: float
+    lever: Float[np.ndarray, "3"]
+    turn: Float[np.ndarray, "3 3"]
+
+    @property
+    def offsets(self) -> Float[np.ndarray, "14"]:
+        """Time offset, lever arm and rotation vector, in the order of the unknowns; zero for the alignment."""
+        turned = Rotation.from_matrix(self.turn).as_rotvec()
+        return np.concatenate([np.zeros(TIME.start), [self.time], self.lever, turned])
+
+    def moved(self, step: Float[np.ndarray, "14"], middle: Float[np.ndarray, "3"]) -> "Unknowns":
+        """After a step of all unknowns; the alignment turns and grows about `middle` in the truth's world."""
+        turn, growth = Rotation.from_rotvec(step[3:6]).as_matrix(), float(np.exp(step[6]))
+        return Unknowns(
+            turn @ self.rotation,
+            middle + step[:3] + growth * turn @ (self.translation - middle),
+            growth * self.scale,
+            self.time + float(step[7]),
+            self.lever + step[LEVER],
+            Rotation.from_rotvec(step[TURN]).as_matrix() @ self.turn,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """unknowns: estimated, of which those that are `free`. covariance: float64 [14, 14] of a step of them. determined:
+    which of them the motion determines. noise: of positions and rotations. degrees: of freedom. rotation_error: RMS,
+    radians.
+    """
+
+    unknowns: Unknowns
+    free: Bool[np.ndarray, "14"]
+    covariance: Float[np.ndarray, "14 14"]
+    determined: Bool[np.ndarray, "14"]
+    noise: tuple[DriftNoise, DriftNoise]
+    degrees: int
+    rotation_error: float
+
+
+class OffsetModel:
+    """The model of one pair of trajectories. estimate: camera -> world; truth: covers some of its times."""
+
+    def __init__(self, estimate: Trajectory, truth: ContinuousTrajectory) -> None:
+        self._truth = truth
+        rows = np.arange(0, len(estimate), -(-len(estimate) // _MOST_POSES))
+        times = estimate.timestamps
+        # Of each row the poses on both sides, too, whose differences are its velocity.
+        before = np.minimum(np.searchsorted(times, times[rows] - _REACH, side="right") - 1, rows - 1)
+        after = np.maximum(np.searchsorted(times, times[rows] + _REACH), rows + 1)
+        self._sides = np.maximum(before, 0), np.minimum(after, len(times) - 1)
+        self._all, self._rows, self._times = estimate, rows, times[rows]
+        self._every = -(-len(rows) // _MOST_TRIED)
+        true = truth.poses(self._times[self._seen(0.0)])[:, :3, 3]
+        self._middle = true.mean(axis=0)
+        spread = max(float(np.sqrt(((true - self._middle) ** 2).sum(axis=1).mean())), _LEAST_SPREAD)
+        # Deviations of what is known without any pose: nothing of the alignment, and of an offset that it is no longer
+        # than the search, no farther than the path extends, no more than a radian. The data must tell more than that.
+        self._prior = np.array([_WEAK * spread] * 3 + [_WEAK] * 4 + [LONGEST] + [spread] * 3 + [1.0] * 3)
+        self._least = 1e-6 * spread, 1e-6  # files of poses have six decimals or more
+
+    def matched(self, time: float) -> int:
+        """How many poses have a true one with this time offset."""
+        return int(self._seen(time).sum())
+
+    def search(self) -> tuple[float, int]:
+        """The time offset that suits positions and rotations best, each after an alignment of its own, and how many
+        were tried: no more than `LONGEST`, nor so large that fewer than half of the poses have a true one.
+        """
+        step = max(float(np.median(np.diff(self._all.timestamps))), _LEAST_STEP)
+        count = int(LONGEST / step)
+        grid = step * np.arange(-count, count + 1)
+        seen = np.array([self.matched(time) for time in grid])
+        tried = grid[seen >= 0.5 * seen.max()]
+        costs = [self._apart(time) for time in tried]
+        return float(tried[np.argmin(costs)]), len(tried)
+
+    def fit(self, free: Bool[np.ndarray, "14"], *times: float) -> Fit:
+        """The unknowns that are `free`, in turn with the noise; the time offset from near 0 or one of `times`."""
+        starts = [
+            self._solved(start, free, self._white(self._residuals(start)))
+            for time in {0.0, *times}
+            for start in self._starts(time, free)
+        ]
+        unknowns = min(starts, key=lambda one: self._apart_by(self._residuals(one)))
+        noise = self._noise(unknowns, free)
+        for _ in range(_ROUNDS):
+            unknowns, before = self._solved(unknowns, free, noise), noise
+            noise = self._noise(unknowns, free)
+            if [(one.correlation, one.share) for one in noise] == [(one.correlation, one.share) for one in before]:
+                break
+        return self._fitted(unknowns, free, noise)
+
+    def refit(self, fit: Fit, free: Bool[np.ndarray, "14"]) -> Fit:
+        """The unknowns that are `free`, others being zero, with the noise of a `fit`."""
+        held = np.where(free, fit.unknowns.offsets, 0.0)
+        starts = [self._solved(start, free, fit.noise) for start in self._starts(float(held[7]), free)]
+        cost = lambda one: np.mean(self._whitened(self._residuals(one), fit.noise) ** 2)
+        return self._fitted(min(starts, key=cost), free, fit.noise)
+
+    def _fitted(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Fit:
+        unknowns = self._balanced(unknowns, free, noise)
+        covariance, determined = self._covariance(unknowns, free, noise)
+        residuals = self._residuals(unknowns)
+        error = float(np.sqrt((residuals[:, 3:] ** 2).sum(axis=1).mean()))
+        return Fit(unknowns, free, covariance, determined, noise, residuals.size - int(free.sum()), error)
+
+    def _seen(self, time: float) -> np.ndarray:
+        return self._truth.covers(self._times - time)
+
+    def _pair(self, time: float, every: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Poses of the estimate and of the truth at the same moments."""
+        chosen = np.flatnonzero(self._seen(time))[::every]
+        return self._all.poses[self._rows[chosen]], self._truth.poses(self._times[chosen] - time)
+
+    def _apart(self, time: float) -> float:
+        found, true = self._pair(time, self._every)
+        moved = umeyama(found[:, :3, 3], true[:, :3, 3], True).points(found[:, :3, 3])
+        position = ((moved - true[:, :3, 3]) ** 2).sum(axis=1).mean()
+        rotation = _turn_of_steps(found[:, :3, :3], true[:, :3, :3])[1]
+        return float(np.log(position + self._least[0] ** 2) + np.log(rotation + self._least[1] ** 2))
+
+    def _apart_by(self, residuals: np.ndarray) -> float:
+        return sum(np.log(one.sigma) for one in self._white(residuals))
+
+    def _starts(self, time: float, free: np.ndarray) -> Iterator[Unknowns]:
+        """From the positions alone, as an alignment does, and from the rotations: where positions lie on a line or are
+        those of a point far away, the latter is nearer.
+        """
+        found, true = self._pair(time)
+        turned, turns = true[:, :3, :3], bool(free[TURN].all())
+        by_positions = umeyama(found[:, :3, 3], true[:, :3, 3], True).rotation
+        own = _turn_of_steps(found[:: self._every, :3, :3], turned[:: self._every])[0] if turns else np.eye(3)
+        by_rotations = _mean(turned @ own.T @ found[:, :3, :3].mT)
+        for rotation in (by_positions, by_rotations):
+            cameras = rotation @ found[:, :3, :3]
+            turn = _mean(cameras.mT @ turned) if turns else np.eye(3)
+            yield self._placed(rotation, turn, time, found, true, bool(free[LEVER].all()))
+
+    def _placed(
+        self, rotation: np.ndarray, turn: np.ndarray, time: float, found: np.ndarray, true: np.ndarray, lever: bool
+    ) -> Unknowns:
+        """With rotations known, scale, translation and lever arm are a linear problem."""
+        along = found[:, :3, 3] @ rotation.T
+        columns = [np.broadcast_to(np.eye(3), (len(found), 3, 3))]
+        columns += [rotation @ found[:, :3, :3]] if lever else []
+        columns += [along[..., None]]
+        matrix = np.concatenate(columns, axis=2).reshape(3 * len(found), -1)
+        solved = np.linalg.lstsq(matrix, true[:, :3, 3].reshape(-1), rcond=1e-3)[0]
+        scale = float(solved[-1]) if solved[-1] > 0 else 1.0
+        return Unknowns(rotation, solved[:3], scale, time, solved[3:6] if lever else np.zeros(3), turn)
+
+    def _solved(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:
+        """By Gauss-Newton."""
+        residuals = self._whitened(self._residuals(unknowns), noise)
+        for _ in range(_STEPS):
+            jacobian = self._whitened(self._jacobian(unknowns), noise) * (self._prior * free)
+            # The identity keeps directions that nothing determines where they are.
+            normal = jacobian.T @ jacobian + np.eye(UNKNOWNS)
+            size = 1.0 / np.sqrt(np.diag(normal))
+            inverse = np.linalg.pinv(normal * np.outer(size, size), rcond=1e-13, hermitian=True)
+            step = -size * (inverse @ (size * (jacobian.T @ residuals)))
+            now, share = np.mean(residuals**2), 1.0
+            for _ in range(_HALVINGS):
+                moved = unknowns.moved(share * step * self._prior * free, self._middle)
+                share /= 2
+                if self.matched(moved.time) < 2:
+                    continue
+                residuals = self._whitened(self._residuals(moved), noise)
+                if np.mean(residuals**2) < now:
+                    break
+            else:
+                return unknowns
+            unknowns = moved
+            if now - np.mean(residuals**2) < 1e-7 * now:
+                return unknowns
+        return unknowns
+
+    def _predicted(self, unknowns: Unknowns, poses: np.ndarray) -> np.ndarray:
+        found = poses.copy()
+        found[:, :3, :3] = unknowns.rotation @ poses[:, :3, :3]
+        found[:, :3, 3] = unknowns.scale * poses[:, :3, 3] @ unknowns.rotation.T + unknowns.translation
+        found[:, :3, 3] += found[:, :3, :3] @ unknowns.lever
+        found[:, :3, :3] = found[:, :3, :3] @ unknowns.turn
+        return found
+
+    def _residuals(self, unknowns: Unknowns) -> np.ndarray:
+        found, true = self._pair(unknowns.time)
+        made = self._predicted(unknowns, found)
+        turned = Rotation.from_matrix(true[:, :3, :3] @ made[:, :3, :3].mT).as_rotvec()
+        return np.concatenate([true[:, :3, 3] - made[:, :3, 3], turned], axis=1)
+
+    def _jacobian(self, unknowns: Unknowns) -> np.ndarray:
+        """Derivatives of the residuals, float64 [n, 6, 14]."""
+        seen = self._seen(unknowns.time)
+        made = self._predicted(unknowns, self._all.poses[self._rows[seen]])
+        return self._columns(unknowns, made, self._truth.velocities(self._times[seen] - unknowns.time))
+
+    def _other_jacobian(self, unknowns: Unknowns) -> np.ndarray:
+        """The same formulas with each trajectory in the other's place: the motion is the same, the noise is not."""
+        seen = self._seen(unknowns.time)
+        before, after = (self._predicted(unknowns, self._all.poses[side[seen]]) for side in self._sides)
+        seconds = np.subtract(*(self._all.timestamps[side[seen]] for side in self._sides[::-1]))
+        turned = Rotation.from_matrix(after[:, :3, :3] @ before[:, :3, :3].mT).as_rotvec()
+        motion = np.concatenate([after[:, :3, 3] - before[:, :3, 3], turned], axis=1)
+        true = self._truth.poses(self._times[seen] - unknowns.time)
+        return self._columns(unknowns, true, motion / seconds[:, None])
+
+    def _columns(self, unknowns: Unknowns, body: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """For poses of the truth's point and its velocity; without the log's own Jacobian, which is the identity where
+        the residual is small.
+        """
+        camera = body[:, :3, :3] @ unknowns.turn.T
+        arm = body[:, :3, 3] - self._middle
+        found = np.zeros((len(body), 6, UNKNOWNS))
+        found[:, :3, :3] = found[:, 3:, 3:6] = -np.eye(3)
+        found[:, :3, 3:6] = -cross(np.eye(3)[None], arm[:, None]).mT
+        found[:, :3, 6] = -(arm - camera @ unknowns.lever)
+        found[:, :, 7] = -velocity
+        found[:, :3, LEVER] = found[:, 3:, TURN] = -camera
+        return found
+
+    def _whitened(self, rows: np.ndarray, noise: Noises) -> np.ndarray:
+        """Of residuals or a Jacobian [n, 6, ...], rows of unit variance."""
+        parts = [
+            one.whitened(part.reshape(len(part), -1)).reshape(3 * len(part), *part.shape[2:])
+            for one, part in zip(noise, (rows[:, :3], rows[:, 3:]), strict=True)
+        ]
+        return np.concatenate(parts)
+
+    def _white(self, residuals: np.ndarray) -> Noises:
+        """As if the noise were white."""
+        parts = zip((residuals[:, :3], residuals[:, 3:]), self._least, strict=True)
+        first, second = (DriftNoise(max(float(np.sqrt(np.mean(part**2))), least)) for part, least in parts)
+        return first, second
+
+    def _noise(self, unknowns: Unknowns, free: np.ndarray) -> Noises:
+        residuals, jacobian = self._residuals(unknowns), self._jacobian(unknowns)[:, :, free] * self._prior[free]
+        parts = zip((slice(0, 3), slice(3, 6)), self._least, strict=True)
+        first, second = (DriftNoise.of(residuals[:, part], jacobian[:, part], least) for part, least in parts)
+        return first, second
+
+    def _scaled(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Both Jacobians J and Z, whitened and by unknowns in units of the prior's deviations, and a basis of the
+        directions that the motion determines: where they agree by four times what the prior tells (a deviation of less
+        than half of its), and more than noise alone would agree.
+        """
+        jacobians = self._jacobian(unknowns), self._other_jacobian(unknowns)
+        own, other = (self._whitened(one, noise) * (self._prior * free) for one in jacobians)
+        values, vectors = np.linalg.eigh(0.5 * (other.T @ own + own.T @ other))
+        lengths = np.sqrt(((own @ vectors) ** 2).sum(axis=0) * ((other @ vectors) ** 2).sum(axis=0))
+        chance = norm.ppf(1 - LEVEL / 2) / np.sqrt(0.5 * len(own))
+        return own, other, vectors[:, (values > _TELLS) & (values > chance * lengths)]
+
+    def _balanced(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:
+        """The solution of `Z^T r = 0`, see `_covariance`, near that of `J^T r = 0`. The latter is biased: noise of the
+        truth is smaller between its poses, as interpolation averages, and noisy rotations make a lever arm shorter.
+        """
+        size = np.inf
+        for _ in range(_STEPS):
+            own, other, basis = self._scaled(unknowns, free, noise)
+            own, other = own @ basis, other @ basis
+            residuals = self._whitened(self._residuals(unknowns), noise)
+            step = -basis @ np.linalg.lstsq(other.T @ own, other.T @ residuals, rcond=None)[0]
+            moved = unknowns.moved(step * self._prior, self._middle)
+            if not np.linalg.norm(step) < 0.5 * size or self.matched(moved.time) < 2:
+                return unknowns
+            unknowns, size = moved, float(np.linalg.norm(step))
+        return unknowns
+
+    def _covariance(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray]:
+        """Of the solution of `Z^T r = 0`, `(Z^T J)^-1 Z^T Z (Z^T J)^-T` with the Jacobians J and Z of the two
+        trajectories: noise of either is no motion, and `Z^T J` does not count it as some. Where the motion determines
+        nothing, that of the prior.
+        """
+        own, other, basis = self._scaled(unknowns, free, noise)
+        own, other = own @ basis, other @ basis
+        gain = basis @ np.linalg.pinv(other.T @ own, rcond=1e-18)
+        covariance = gain @ (other.T @ other) @ gain.T + np.eye(UNKNOWNS) - basis @ basis.T
+        return covariance * np.outer(self._prior, self._prior), free & (np.diag(covariance) < 1.0 / _TELLS)
+
+
+def _mean(rotations: np.ndarray) -> np.ndarray:
+    return np.asarray(Rotation.from_matrix(rotations).mean().as_matrix())
+
+
+def _turn_of_steps(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, float]:
+    """The rotation of the truth's body in the camera's frame, and the mean square of what it leaves, rad^2: by the
+    rotation vectors from one pose to the next, which no alignment changes (W. Kabsch, Acta Cryst. A 32, 1976).
+    """
+    camera, body = (Rotation.from_matrix(one[:-1].mT @ one[1:]).as_rotvec() for one in (found, true))
+    u, _, vt = np.linalg.svd(camera.T @ body)
+    turn = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return turn, float(((camera - body @ turn.T) ** 2).sum(axis=1).mean())
