@@ -92,7 +92,7 @@ def test_a_step_moves_each_coordinate(solved: dict[str, Any]) -> None:
     import jaxlie
 
     state = solved["state"]
-    step = jnp.zeros(22 + state.inverse_depth.size).at[8].set(0.1).at[10].set(0.3).at[18].set(2.0).at[22].set(0.05)
+    step = jnp.zeros(state.num_unknowns).at[8].set(0.1).at[10].set(0.3).at[18].set(2.0).at[22].set(0.05)
     moved = state.moved(step)
     expected = jaxlie.SE3.exp(step[6:12]) @ jaxlie.SE3(state.poses.wxyz_xyz[1])
     np.testing.assert_allclose(moved.poses.wxyz_xyz[1], expected.wxyz_xyz, atol=1e-12)
