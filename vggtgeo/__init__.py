@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from vggtgeo.bundle.terms.depth import DepthPrior as DepthPrior
     from vggtgeo.bundle.terms.edge import EdgeTerm as EdgeTerm
     from vggtgeo.bundle.terms.edge import ImageTerm as ImageTerm
+    from vggtgeo.bundle.terms.host_pixel import HostPixel as HostPixel
     from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior as IntrinsicsPrior
     from vggtgeo.bundle.terms.line import LineTerm as LineTerm
     from vggtgeo.bundle.terms.marginal import MarginalPrior as MarginalPrior
@@ -128,6 +129,7 @@ _HOME = {
     "bundle.graduation": ("Graduation",),
     "bundle.terms.baseline": ("BaselinePrior",),
     "bundle.terms.depth": ("DepthPrior",),
+    "bundle.terms.host_pixel": ("HostPixel",),
     "bundle.terms.edge": ("EdgeTerm", "ImageTerm"),
     "bundle.terms.intrinsics": ("IntrinsicsPrior",),
     "bundle.terms.line": ("LineTerm",),

@@ -30,6 +30,7 @@ from vggtgeo.bundle.packing_checks import (
     check_observations,
     check_positive,
     check_size,
+    check_whole_size,
     warn_of_far,
 )
 from vggtgeo.bundle.padding import (
@@ -123,6 +124,9 @@ def pack(
     dtype = jnp.result_type(float) if dtype is None else dtype
     check_dtype(dtype)
     check_kind("observations", observations, Observations, "`vggtgeo.Observations`")
+    check_kind("size", size, PaddedSize | None, "a `vggtgeo.PaddedSize`")
+    if size is not None:
+        check_whole_size(size)
     observations, poses = as_arrays(observations), as_poses(poses)
     intrinsics, inverse_depth = real_numbers("intrinsics", intrinsics), real_numbers("inverse_depth", inverse_depth)
     mean = intrinsics if intrinsics_mean is None else real_numbers("intrinsics_mean", intrinsics_mean)
@@ -183,7 +187,6 @@ def _layout(
     observations: Observations, keyframes: int, size: PaddedSize | None
 ) -> tuple[PaddedSize, Edges, Array | None, SlotIndex]:
     """The padded size, the graph, the host of each row, and where each landmark and edge lies in them."""
-    check_kind("size", size, PaddedSize | None, "a `vggtgeo.PaddedSize`")
     slots = count_slots(observations, keyframes, size.samples if size else None)
     needed = needed_size(slots, observations.edges, size)
     size = size or needed

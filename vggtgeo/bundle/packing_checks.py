@@ -268,11 +268,15 @@ def warn_of_far(inverse_depth: np.ndarray) -> None:
         )
 
 
-def check_size(size: PaddedSize, needed: PaddedSize) -> None:
-    """A padded size that is large enough, of whole numbers."""
+def check_whole_size(size: PaddedSize) -> None:
+    """A padded size of whole numbers."""
     for name in ("keyframes", "points", "lines", "degree", "edges", "samples", "rows"):
         if getattr(size, name) is not None or name not in ("edges", "samples", "rows"):
             check_whole(f"size.{name}", getattr(size, name), 0, MOST_PADDED)
+
+
+def check_size(size: PaddedSize, needed: PaddedSize) -> None:
+    """A padded size that is large enough."""
     if needed.samples is not None and size.lines % needed.samples:
         raise InputError(f"`size.lines` is {size.lines}; it must be a multiple of `size.samples`, {needed.samples}")
     for name in ("keyframes", "points", "lines", "degree", "rows", "edges"):

@@ -65,7 +65,7 @@ COMMANDS = (
     CommandEntry(
         "evaluate",
         "vggtgeo.cli.evaluate",
-        "Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT.",
+        "Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT, and constant offsets between the two.",
         (
             "vggtgeo evaluate runs/desk tum/desk  # a run's folder against a dataset's",
             "vggtgeo evaluate mine.txt truth.txt --json  # two files in the TUM format",
