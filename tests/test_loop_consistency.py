@@ -89,6 +89,35 @@ def test_a_less_plausible_cluster_that_contradicts_a_taken_one_goes() -> None:
     assert np.array_equal(np.flatnonzero(kept), [10, 11, 12]), np.flatnonzero(kept)
 
 
+def test_a_true_loop_tells_how_far_odometry_can_be_off_elsewhere() -> None:
+    """Six loops that odometry alone allows, half a metre off and far from all others, are refused once six true loops
+    have shown that odometry drifts less. Oracle: which loops are true.
+    """
+    rng, true = np.random.default_rng(0), _there_and_back()
+    motions = _odometry(rng, true, 0.0)
+    aside = np.eye(4)
+    aside[0, 3] = 0.5
+    motion = lambda first, second: true[second] @ rigid.invert(true[first])
+    right = [_measured(rng, row, row + 2 * SIDE, motion(row, row + 2 * SIDE), KNOWN) for row in range(6)]
+    wrong = [_measured(rng, row, row + SIDE, aside @ motion(row, row + SIDE), KNOWN) for row in range(20, 26)]
+    assert consistent_loops(wrong, motions, BELIEF).all(), "odometry alone should allow them"
+    kept = consistent_loops([*wrong, *right], motions, BELIEF)
+    assert np.array_equal(np.flatnonzero(kept), np.arange(6, 12)), np.flatnonzero(kept)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("bias", [0.0, 1.0, 2.0, 4.0])
+def test_true_loops_at_several_places_stay(seed: int, bias: float) -> None:
+    """True loops at three places stay, with independent errors and with a constant error of up to four standard
+    deviations, which turns the path by 20 degrees. Oracle: all loops are true.
+    """
+    rng, true = np.random.default_rng(seed), _there_and_back()
+    pairs = [(row + start, row + end) for start, end in ((0, 2 * SIDE), (10, 60), (30, 70)) for row in range(6)]
+    loops = [_measured(rng, first, second, true[second] @ rigid.invert(true[first]), KNOWN) for first, second in pairs]
+    kept = consistent_loops(loops, _odometry(rng, true, bias), BELIEF)
+    assert kept.all(), np.flatnonzero(~kept)
+
+
 def test_submaps_are_joined_by_the_larger_cluster() -> None:
     """Two submaps that no odometry ties are joined by six loops that agree, not by three others; one loop alone is not
     taken unless the caller says so. Oracle: which loops are true.

@@ -9,7 +9,8 @@ have to agree with odometry. Three tests of the squared Mahalanobis distance, al
    et al., ICRA 2018). Loops that agree are one cluster, a place that was seen again; a loop alone is not taken, as a
    large drift leaves room for it.
 3. Each cluster against the loops that were taken before, the most plausible cluster first: in the median, its loops
-   must agree with the nearest of those.
+   must agree with the nearest of those. What those measured of odometry's drift limits how far it can be off elsewhere:
+   its variance is at most the upper confidence limit by their distances, in place of the bound for any correlation.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -50,13 +52,26 @@ def consistent_loops(
     tests = _Tests(ends, np.array([loop.pose for loop in loops]), covariances, odometry)
     distances = odometry.distances(loops)
     plausible = np.flatnonzero(~(distances >= gate))  # NaN: no way between the ends
+    independent, drifts, growth = odometry.distances(loops, growth=1.0), [], np.inf
     for cluster in _in_order(_clusters(tests, plausible, gate), distances):
         if len(cluster) == 1 and (alone is None or not alone[cluster[0]]):
             continue
-        nearest = tests.against_nearest(cluster, np.flatnonzero(taken))
-        if not len(nearest) or np.median(nearest) < gate:
-            taken[cluster] = True
+        nearest = tests.against_nearest(cluster, np.flatnonzero(taken), growth)
+        if len(nearest) and np.median(nearest) >= gate:
+            continue
+        taken[cluster] = True
+        if np.isfinite(independent[cluster]).any():
+            drifts.append(np.nanmedian(independent[cluster]))
+            growth = _largest_growth(drifts, gate)
     return taken
+
+
+def _largest_growth(drifts: Sequence[float], gate: float) -> float:
+    """Upper confidence limit of the variance of odometry over that of independent motions, at least 1, at the
+    significance level of the gate. drifts: squared Mahalanobis distances that clusters measured, growth 1.
+    """
+    level = chi_square.sf(gate, 6)
+    return float(max(np.sum(drifts) / chi_square.ppf(level, 6 * len(drifts)), 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +85,7 @@ class _Tests:
     covariances: np.ndarray
     odometry: Odometry
 
-    def between(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    def between(self, first: np.ndarray, second: np.ndarray, growth: float = np.inf) -> np.ndarray:
         """Of loops `second` from what loops `first` and the ways between their ends say; infinite without a way."""
         before = self.odometry.way(self.ends[second, 0], self.ends[first, 0])
         after = self.odometry.way(self.ends[first, 1], self.ends[second, 1])
@@ -78,12 +93,13 @@ class _Tests:
         through = after.pose @ self.poses[first]
         expected = through @ before.pose
         carry, carry_way = rigid.adjoint(after.pose), rigid.adjoint(through)
-        drift = (before.count + after.count)[:, None, None] * (carry_way @ before.spread @ carry_way.mT + after.spread)
+        factor = np.minimum(before.count + after.count, growth)
+        drift = factor[:, None, None] * (carry_way @ before.spread @ carry_way.mT + after.spread)
         covariance = carry @ self.covariances[first] @ carry.mT + self.covariances[second] + drift
         distance = squared_distance(self.poses[second], expected, covariance)
         return np.where(before.connected & after.connected, distance, np.inf)
 
-    def against_nearest(self, loops: np.ndarray, taken: np.ndarray) -> np.ndarray:
+    def against_nearest(self, loops: np.ndarray, taken: np.ndarray, growth: float) -> np.ndarray:
         """Of each loop from that of the `taken` ones whose ends are nearest; left out where no way leads to any."""
         if not len(taken):
             return np.zeros(0)
@@ -92,7 +108,7 @@ class _Tests:
         comparable = (roots[loops, None] == roots[taken]).all(2)
         nearest = np.where(comparable, apart, np.iinfo(int).max).argmin(1)
         found = comparable.any(1)
-        return self.between(taken[nearest[found]], loops[found])
+        return self.between(taken[nearest[found]], loops[found], growth)
 
 
 def _clusters(tests: _Tests, among: np.ndarray, gate: float) -> list[np.ndarray]:

@@ -75,15 +75,17 @@ class Odometry:
         count = self.depth[start] + self.depth[end] - 2 * self.depth[meeting]
         return Way(pose, spread, count, connected)
 
-    def distances(self, measured: Sequence[MeasuredRelativePose]) -> np.ndarray:
+    def distances(self, measured: Sequence[MeasuredRelativePose], growth: float = np.inf) -> np.ndarray:
         """Squared Mahalanobis distance of each measured motion from odometry, 6 degrees of freedom, float64 [m]; NaN
         where no way leads from one end to the other.
+
+        growth: by what the sum of the motions' covariances is multiplied, at most by their count.
         """
         start, end = np.array([motion.keyframes for motion in measured], int).reshape(-1, 2).T
         way = self.way(start, end)
         noise = np.linalg.inv(np.array([motion.information for motion in measured]).reshape(-1, 6, 6))
         poses = np.array([motion.pose for motion in measured]).reshape(-1, 4, 4)
-        covariance = noise + way.count[:, None, None] * way.spread
+        covariance = noise + np.minimum(way.count, growth)[:, None, None] * way.spread
         return np.where(way.connected, squared_distance(poses, way.pose, covariance), np.nan)
 
     def _meeting(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
