@@ -52,7 +52,8 @@ def consistent_loops(
     tests = _Tests(ends, np.array([loop.pose for loop in loops]), covariances, odometry)
     distances = odometry.distances(loops)
     plausible = np.flatnonzero(~(distances >= gate))  # NaN: no way between the ends
-    independent, drifts, growth = odometry.distances(loops, growth=1.0), [], np.inf
+    independent, growth = odometry.distances(loops, growth=1.0), float("inf")
+    drifts: list[float] = []
     for cluster in _in_order(_clusters(tests, plausible, gate), distances):
         if len(cluster) == 1 and (alone is None or not alone[cluster[0]]):
             continue
@@ -61,7 +62,7 @@ def consistent_loops(
             continue
         taken[cluster] = True
         if np.isfinite(independent[cluster]).any():
-            drifts.append(np.nanmedian(independent[cluster]))
+            drifts.append(float(np.nanmedian(independent[cluster])))
             growth = _largest_growth(drifts, gate)
     return taken
 
