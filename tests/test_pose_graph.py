@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.global_map.loop_witnesses import witnessed
+from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, solve_pose_graph
 from vggtgeo.slam.global_map.unit_graph import UnitRatio, solve_units
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -89,8 +89,8 @@ def test_large_drift_comes_back_and_false_loops_do_no_harm(seed: int, false: flo
     """
     true, graph, right = _drifting(seed, false, bias, alike)
     before = _errors(graph.poses, true)
-    sure = witnessed(graph.loops, graph.motions, BELIEF)
-    assert np.mean(sure[right]) > 0.9, "true loops have witnesses"
+    sure = consistent_loops(graph.loops, graph.motions, BELIEF)
+    assert np.mean(sure[right]) > 0.9, "true loops are consistent"
     found = solve_pose_graph(replace(graph, loops=tuple(compress(graph.loops, sure))))
     right = right[sure]
     after = _errors(found.poses, true)

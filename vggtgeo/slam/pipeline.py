@@ -317,7 +317,7 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
         if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
             again = None  # drift may have put another keyframe there
     if again is None:
-        again = revisit(slam, sight, found.pose, roles)
+        again = revisit(slam, sight, found, roles)
     if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
         return slam, found
     near = again.keyframe

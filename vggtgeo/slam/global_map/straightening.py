@@ -11,7 +11,7 @@ from itertools import compress
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.global_map.loop_witnesses import witnessed
+from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, distance, solve_pose_graph
 from vggtgeo.slam.global_map.unit_graph import UnitRatio, solve_units
 from vggtgeo.slam.sparse_map.connected import piece_of
@@ -58,18 +58,20 @@ def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     torn = [tie for tie in closing if distance(tie, poses) > BELIEF and _pixels(tie, slam) > MENDABLE]
     if not drifted and not torn:
         return slam, list(loops)
-    units = np.ones(len(poses)) if slam.metric else _units(slam, motions, loops)
-    graph = _graph(slam, motions, (*closing, *(loop.motion for loop in loops)), units)
-    sure = witnessed(graph.loops, graph.motions, BELIEF) | (np.arange(len(graph.loops)) < len(closing))
+    measured = (*closing, *(loop.motion for loop in loops))
+    graph = _graph(slam, motions, measured, _units(slam, motions, loops))
+    tracked = graph.motions if slam.metric else [motion.of_free_length() for motion in graph.motions]
+    sure = consistent_loops(graph.loops, tracked, BELIEF, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
-        return _noted(slam, len(loops) - len(agreeing)), agreeing
-    found = solve_pose_graph(replace(graph, loops=tuple(compress(graph.loops, sure))))
-    dropped = [tie for tie, true in zip(closing, found.believed[: len(closing)], strict=True) if not true]
-    moved = _taken(slam, found.poses, units, dropped)
-    # A loop without a witness took no part; where the straightened map agrees with it, its matches are used.
-    true = np.zeros(len(graph.loops), bool)
+        return _noted(_without(slam, closing), len(loops) - len(agreeing)), agreeing
+    units = _units(slam, motions, tuple(compress(loops, sure[len(closing) :])))
+    found = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), units))
+    true = np.zeros(len(measured), bool)
     true[sure] = found.believed
+    dropped = [tie for tie, fits in zip(closing, true[: len(closing)], strict=True) if not fits]
+    moved = _taken(_without(slam, dropped), found.poses, units)
+    # A loop that took no part (refused, or alone) is used where the corrected map agrees with it.
     own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
     believed = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
     return _noted(moved, len(loops) - len(believed), slam), believed
@@ -125,16 +127,23 @@ def _graph(
 
 
 def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
-    """By what the lengths of each keyframe must be multiplied, float64 [n]."""
+    """By what the lengths of each keyframe must be multiplied, float64 [n]; by 1 where they are metres."""
+    if slam.metric:
+        return np.ones(len(slam.keyframes))
     ratios = [UnitRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
     return solve_units(len(slam.keyframes), [tie.keyframes for tie in motions], ratios)
 
 
-def _taken(slam: Slam, poses: np.ndarray, units: np.ndarray, dropped: Sequence[MeasuredRelativePose]) -> Slam:
-    """The map at other poses, its lengths multiplied keyframe by keyframe; tracked motions that are not believed go."""
-    gone = {id(tie) for tie in dropped}
+def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
+    """The map without some of its tracked motions."""
+    gone = {id(tie) for tie in ties}
+    return replace(slam, factors=tuple(factor for factor in slam.factors if id(factor) not in gone))
+
+
+def _taken(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
+    """The map at other poses, its lengths multiplied keyframe by keyframe."""
     unit = lambda number: float(units[number])
-    factors = tuple(scaled_factor(f, unit(f.keyframes[0])) for f in slam.factors if id(f) not in gone)
+    factors = tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.factors)
     return replace(
         slam,
         keyframes=tuple(

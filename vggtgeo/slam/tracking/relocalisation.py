@@ -15,8 +15,10 @@ from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import FramePose, Slam, Waiting
 from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.tracking.evidence import STEP_GATE
+from vggtgeo.slam.tracking.odometry import Odometry
 from vggtgeo.slam.tracking.rgbd_view import RgbdView
-from vggtgeo.slam.tracking.track import Expectation, Sight, Track, track
+from vggtgeo.slam.tracking.track import Expectation, Sight, Track, tie_between, track
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
@@ -36,19 +38,20 @@ def relocalise(
     return None
 
 
-def revisit(slam: Slam, sight: Sight, pose: np.ndarray, roles: Roles) -> Track | None:
+def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | None:
     """The frame's pose by an old keyframe that shows the same place, wherever drift has put it: a loop that is closed
     while the run goes on. The camera goes on from there, and the last adjustment spreads what the loop was off.
 
-    pose: where the frame is by the current estimate, world -> camera. One keyframe is verified at most, as that costs
-    as much as a tracked frame: one that looks as much like the frame as those of the window do, and that drift may have
-    put here. Without metric depth the unit drifts, too, and loops wait for the end.
+    current: the frame's track by the current estimate. One keyframe is verified at most, as that costs as much as a
+    tracked frame: one that looks as much like the frame as those of the window do, and that drift may have put here. A
+    place that odometry contradicts only looks the same. Without metric depth the unit drifts, too, and loops wait for
+    the end.
     """
     recent = slam.window[0] if slam.window else 0
     centres = np.array([rigid.centre(keyframe.pose) for keyframe in slam.keyframes])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     way = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # from each keyframe to the newest
-    within = np.linalg.norm(centres - rigid.centre(pose), axis=1) < MOST_DRIFT * way
+    within = np.linalg.norm(centres - rigid.centre(current.pose), axis=1) < MOST_DRIFT * way
     old = [k for k in slam.keyframes[:recent] if k.place is not None and within[k.number]]
     place = place_vector(sight.features) if slam.metric and old else None
     if place is None:
@@ -60,7 +63,10 @@ def revisit(slam: Slam, sight: Sight, pose: np.ndarray, roles: Roles) -> Track |
     if similarity[best] < usual:
         return None
     found = track(sight, old[best], view_of(old[best], slam, roles), None, slam.intrinsics, roles)
-    return found if found.accepted and found.evidence.certain else None
+    if not (found.accepted and found.evidence.certain):
+        return None
+    distance = Odometry.of(slam.ties, len(slam.keyframes)).distances([tie_between(current, found)])
+    return None if distance[0] >= STEP_GATE else found
 
 
 def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Keyframe, ...]:
