@@ -421,7 +421,7 @@ ARGUMENTS = rows(
         ("`--max-steps 0`", bad.problem(), {"argv": solve_with("--max-steps", "0")}),
         (
             "`--dtype float32` of a number beyond it",
-            bad.problem(T_init=bad.put((1, 4), 1e60)),
+            bad.problem(pt_target=bad.put((1, 0), 1e60)),
             {"argv": solve_with("--dtype", "float32"), "slack": 20.0},
         ),
         ("`--dtype float16`", bad.problem(), {"argv": solve_with("--dtype", "float16")}),
