@@ -26,6 +26,7 @@ from vggtgeo.bundle.objective import (
     hosts_of,
     motions_of,
     of_edge,
+    pixel_observations,
     places,
     relative_poses,
     view_of,
@@ -120,8 +121,8 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     landmarks = jnp.pad(jnp.zeros_like(state.inverse_depth), ((0, 0), (first, 0)))
     for term in problem.slot_terms:
         landmarks = landmarks.at[:, first:].add(term.gradient(state.inverse_depth))
-    for pixel in problem.pixel_terms:
-        landmarks = landmarks.at[:, :first].add(_as_landmarks(pixel.gradient(state.pixel_offset)))
+    for pixel, offset in pixel_observations(problem, state):
+        landmarks = landmarks.at[:, :first].add(_as_landmarks(pixel.gradient(offset)))
     dense = _dense_terms(problem, state, None, False)[1]
     factors = _node_factors(problem, state, None, False)
     if factors is not None:
@@ -219,7 +220,8 @@ def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[in
     # The barrier keeps XLA from forming the columns again in each product.
     columns, by_pixel = jax.lax.optimization_barrier((jnp.concatenate(shared, 1), by_pixel))
     starts = np.cumsum([0, *(part.shape[1] for part in parts)])
-    coupled, blocks = [], []
+    coupled: list[Array] = []
+    blocks: list[Array | None] = []
     for pixels, start, end, (_, view) in zip(by_pixel, starts, starts[1:], seen, strict=False):
         own, slots = columns[:, start:end], len(view.inverse_depth)
         if not view.free_pixels:
@@ -234,7 +236,9 @@ def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[in
 
 def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
     models: list[LocalModel] = [term.model(view) for term, view in seen]
-    gram, coupled, blocks = models[0].gram, [], []
+    gram = models[0].gram
+    coupled: list[Array] = []
+    blocks: list[Array | None] = []
     for model in models[1:]:
         gram = gram + model.gram
     for model in models:
@@ -295,8 +299,8 @@ def _landmark_terms(
     if state.pixel_offset is None:
         return cross, None
     blocks = jnp.zeros((rows, 3, first // 2), cross.dtype)
-    for pixel in problem.pixel_terms:
-        hessian, force = pixel.model(state.pixel_offset, correction, exact)
+    for pixel, offset in pixel_observations(problem, state):
+        hessian, force = pixel.model(offset, correction, exact)
         cross = cross.at[:, -2, :first].add(_as_landmarks(force))
         blocks += jnp.stack([hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1]], 1)
     return cross, blocks

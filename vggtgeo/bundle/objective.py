@@ -16,6 +16,7 @@ from vggtgeo.bundle.fast import pinhole
 from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
+from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.node import node_residuals
 from vggtgeo.bundle.terms.term import robust_energy
 from vggtgeo.geometry import lie
@@ -89,8 +90,8 @@ def _without_edges(problem: Problem, state: State) -> Float[Array, ""]:
     total = jnp.zeros((), state.inverse_depth.dtype)
     for slot in problem.slot_terms:
         total += robust_energy(slot.kernel, slot.weights, slot.residuals(state.inverse_depth))
-    for pixel in problem.pixel_terms:
-        total += robust_energy(pixel.kernel, pixel.weights, pixel.residuals(state.pixel_offset))
+    for pixel, offset in pixel_observations(problem, state):
+        total += robust_energy(pixel.kernel, pixel.weights, pixel.residuals(offset))
     for node in problem.node_terms:
         total += robust_energy(node.kernel, node.weights, node_residuals(node, poses, cameras))
     for own in problem.camera_terms:
@@ -98,6 +99,12 @@ def _without_edges(problem: Problem, state: State) -> Float[Array, ""]:
     for dense in problem.dense_terms:
         total += robust_energy(dense.kernel, dense.weights, dense.residual(state.poses, state.parameters))
     return total
+
+
+def pixel_observations(problem: Problem, state: State) -> list[tuple[HostPixel, Float[Array, "h p 2"]]]:
+    """The terms on the pixels of landmarks in their host, each with the offsets that it is about."""
+    offset = state.pixel_offset
+    return [] if offset is None else [(term, offset) for term in problem.pixel_terms]
 
 
 def cameras_of(problem: Problem, state: State) -> Cameras:

@@ -223,8 +223,8 @@ def _seen(
         return terms
     sigma = np.broadcast_to(np.asarray(seen.pixel_sigma, float), len(seen.host))
     check_positive("pixel_sigma", sigma, len(seen.host))
-    points = np.flatnonzero(index.slot < size.points)
-    pixels = FlatTerm(HostPixel, {"weight": weight_of("pixel_sigma", sigma[points], dtype)}, points)
+    chosen = np.flatnonzero(index.slot < size.points)
+    pixels = FlatTerm(HostPixel, {"weight": weight_of("pixel_sigma", sigma[chosen], dtype)}, chosen)
     return (*terms, placed(pixels, index, (0, size.points), dtype))
 
 

@@ -14,7 +14,6 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.terms.depth import DepthPrior
@@ -112,7 +111,7 @@ class Edges(eqx.Module):
     """Row of landmarks that each edge observes, ascending; None: that of its host's number."""
 
     @property
-    def row(self) -> Int[Array, " e"] | Int[np.ndarray, " e"]:
+    def row(self) -> Int[Array, " e"]:
         """Row of landmarks that each edge observes."""
         return self.source if self.row_of is None else self.row_of
 

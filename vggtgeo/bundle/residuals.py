@@ -137,6 +137,7 @@ def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[
     if isinstance(term, SlotTerm):
         return term.residuals(state.inverse_depth)
     if isinstance(term, HostPixel):
+        assert state.pixel_offset is not None  # `check_pair` has seen to it
         return term.residuals(state.pixel_offset)
     if isinstance(term, PoseTerm | PairTerm):
         return node_residuals(term, state.poses.wxyz_xyz, cameras)

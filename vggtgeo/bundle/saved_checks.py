@@ -60,9 +60,9 @@ def _check_shapes(problem: Problem, state: State, rows: int, edges: int, slots: 
     }
     if (problem.host is None) != (problem.edges.row_of is None):
         raise InputError("it has one of the arrays `problem/host` and `problem/edges/row_of`, not both")
-    if problem.host is not None:
+    if problem.host is not None and problem.edges.row_of is not None:
         expected["problem/host"] = (problem.host, (rows,))
-        expected["problem/edges/row_of"] = (problem.edges.row, (edges,))
+        expected["problem/edges/row_of"] = (problem.edges.row_of, (edges,))
     if problem.camera_of is not None:
         expected["problem/camera_of"] = (problem.camera_of, (keyframes,))
     if problem.fraction is not None:
@@ -111,7 +111,8 @@ def _check_numbers(name: str, values: Any, count: int, what: str) -> None:
 def _check_edges(problem: Problem) -> None:
     """Sorted by host and row; their places are those that follow from that."""
     edges, rows = problem.edges, len(problem.pixels)
-    source, row = np.asarray(edges.source), np.asarray(edges.row)
+    source = np.asarray(edges.source)
+    row = source if edges.row_of is None else np.asarray(edges.row_of)
     for name, values in (("source", source), ("target", edges.target)):
         _check_numbers(f"problem/edges/{name}", values, problem.num_keyframes, "keyframes")
     if np.any(np.diff(source) < 0):

@@ -158,7 +158,8 @@ class TrackCapture:
 
         self._errors = av.error.FFmpegError
         self._container = av.open(path)
-        self._stream = self._container.streams[index]
+        stream: Any = self._container.streams[index]  # of video, which its type does not say
+        self._stream = stream
         self._stream.thread_type = "AUTO"
         self._frames = self._decoded()
         self._frame: Any = None

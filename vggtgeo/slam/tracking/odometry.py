@@ -24,14 +24,14 @@ from vggtgeo.slam.tracking.fusion import with_systematic
 class Way(NamedTuple):
     """Motions camera `start` -> camera `end` by odometry, one row a pair of keyframes.
 
-    pose: float64 [m, 4, 4]. spread: sum of the motions' covariances in the camera of `end`, float64 [m, 6, 6]. count:
-    motions on the way, int [m]. Multiply `spread` by the count of all ways that an error goes over for the bound of its
+    pose: float64 [m, 4, 4]. spread: sum of the motions' covariances in the camera of `end`, float64 [m, 6, 6]. motions:
+    their number on the way, int [m]. The motions of all ways that an error goes over, times `spread`, bound its
     covariance. connected: bool [m]; the other values mean nothing where it is False.
     """
 
     pose: np.ndarray
     spread: np.ndarray
-    count: np.ndarray
+    motions: np.ndarray
     connected: np.ndarray
 
 
@@ -85,7 +85,7 @@ class Odometry:
         way = self.way(start, end)
         noise = np.linalg.inv(np.array([motion.information for motion in measured]).reshape(-1, 6, 6))
         poses = np.array([motion.pose for motion in measured]).reshape(-1, 4, 4)
-        covariance = noise + np.minimum(way.count, growth)[:, None, None] * way.spread
+        covariance = noise + np.minimum(way.motions, growth)[:, None, None] * way.spread
         return np.where(way.connected, squared_distance(poses, way.pose, covariance), np.nan)
 
     def _meeting(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
