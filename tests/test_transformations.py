@@ -20,7 +20,7 @@ STEP = 1e-3
 WINDOW = vg.simulate_window(2, points=4, lines=0, start_error=0.01)
 PACKED = WINDOW.pack()
 PROBLEM, STATE, INDEX = PACKED[0].with_term(vg.no_prior(2)), PACKED[1], PACKED[2]
-STEPS = 0.01 * jnp.cos(jnp.arange(6 * 2 + 4 + STATE.inverse_depth.size, dtype=float))
+STEPS = 0.01 * jnp.cos(jnp.arange(STATE.num_unknowns, dtype=float))
 MATCHES = jnp.ones(len(WINDOW.observations.point_edge))
 
 Function = Callable[[jax.Array], jax.Array]

@@ -30,14 +30,14 @@ class HostPixel(AbstractTerm):
         """Of one landmark, pixels."""
         return offset
 
-    def residuals(self, offset: Float[Array, "n p 2"]) -> Float[Array, "2 n p"]:
+    def residuals(self, offset: Float[Array, "h p 2"]) -> Float[Array, "2 h p"]:
         """Of all of them, the residual's own axis first."""
         each = lambda data, one: check_residual(self, self.holding(data).residual(one))
         return jax.vmap(jax.vmap(each, out_axes=-1), out_axes=1)(self.data(), offset)
 
     def model(
-        self, offset: Float[Array, "n p 2"], correction: Float[Array, ""] | None, exact: bool
-    ) -> tuple[Float[Array, "n p 2 2"], Float[Array, "n p 2"]]:
+        self, offset: Float[Array, "h p 2"], correction: Float[Array, ""] | None, exact: bool
+    ) -> tuple[Float[Array, "h p 2 2"], Float[Array, "h p 2"]]:
         """Hessian and gradient of the energy of each landmark; of a prepared term."""
 
         def one(data: dict, weight: Array, at: Array) -> tuple[Array, Array]:
@@ -46,7 +46,7 @@ class HostPixel(AbstractTerm):
 
         return jax.vmap(jax.vmap(one))(self.data(), self.weights, offset)
 
-    def gradient(self, offset: Float[Array, "n p 2"]) -> Float[Array, "n p 2"]:
+    def gradient(self, offset: Float[Array, "h p 2"]) -> Float[Array, "h p 2"]:
         """First derivative of the energy, differentiable once more."""
         pull = self.weights * self.kernel.weight(self.weights * jnp.sum(offset**2, -1))
         return pull[..., None] * offset
