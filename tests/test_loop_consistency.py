@@ -173,7 +173,7 @@ def test_ways_lead_over_branches_and_end_at_gaps() -> None:
     expected = motions[3].pose @ motions[2].pose @ rigid.invert(motions[1].pose)
     assert np.allclose(way.pose[0], expected, atol=1e-12)
     assert np.allclose(way.pose[1], rigid.invert(expected), atol=1e-12)
-    assert way.count[:2].tolist() == [3, 3]
+    assert way.motions[:2].tolist() == [3, 3]
     assert way.connected.tolist() == [True, True, False]
 
 

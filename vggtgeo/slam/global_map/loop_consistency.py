@@ -94,7 +94,7 @@ class _Tests:
         through = after.pose @ self.poses[first]
         expected = through @ before.pose
         carry, carry_way = rigid.adjoint(after.pose), rigid.adjoint(through)
-        factor = np.minimum(before.count + after.count, growth)
+        factor = np.minimum(before.motions + after.motions, growth)
         drift = factor[:, None, None] * (carry_way @ before.spread @ carry_way.mT + after.spread)
         covariance = carry @ self.covariances[first] @ carry.mT + self.covariances[second] + drift
         distance = squared_distance(self.poses[second], expected, covariance)

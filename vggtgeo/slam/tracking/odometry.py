@@ -24,14 +24,14 @@ from vggtgeo.slam.tracking.fusion import with_systematic
 class Way(NamedTuple):
     """Motions camera `start` -> camera `end` by odometry, one row a pair of keyframes.
 
-    pose: float64 [m, 4, 4]. spread: sum of the motions' covariances in the camera of `end`, float64 [m, 6, 6]. count:
-    motions on the way, int [m]. Multiply `spread` by the count of all ways that an error goes over for the bound of its
+    pose: float64 [m, 4, 4]. spread: sum of the motions' covariances in the camera of `end`, float64 [m, 6, 6]. motions:
+    how many are on the way, int [m]. Multiply `spread` by that of all ways that an error goes over for the bound of its
     covariance. connected: bool [m]; the other values mean nothing where it is False.
     """
 
     pose: np.ndarray
     spread: np.ndarray
-    count: np.ndarray
+    motions: np.ndarray
     connected: np.ndarray
 
 
@@ -72,8 +72,8 @@ class Odometry:
         pose = self.poses[end] @ rigid.invert(self.poses[start])
         carry = rigid.adjoint(self.poses[end])
         spread = carry @ (self.spread[start] + self.spread[end] - 2 * self.spread[meeting]) @ carry.mT
-        count = self.depth[start] + self.depth[end] - 2 * self.depth[meeting]
-        return Way(pose, spread, count, connected)
+        motions = self.depth[start] + self.depth[end] - 2 * self.depth[meeting]
+        return Way(pose, spread, motions, connected)
 
     def distances(self, measured: Sequence[MeasuredRelativePose], growth: float = np.inf) -> np.ndarray:
         """Squared Mahalanobis distance of each measured motion from odometry, 6 degrees of freedom, float64 [m]; NaN
@@ -85,7 +85,7 @@ class Odometry:
         way = self.way(start, end)
         noise = np.linalg.inv(np.array([motion.information for motion in measured]).reshape(-1, 6, 6))
         poses = np.array([motion.pose for motion in measured]).reshape(-1, 4, 4)
-        covariance = noise + np.minimum(way.count, growth)[:, None, None] * way.spread
+        covariance = noise + np.minimum(way.motions, growth)[:, None, None] * way.spread
         return np.where(way.connected, squared_distance(poses, way.pose, covariance), np.nan)
 
     def _meeting(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
