@@ -25,7 +25,7 @@ class Way(NamedTuple):
     """Motions camera `start` -> camera `end` by odometry, one row a pair of keyframes.
 
     pose: float64 [m, 4, 4]. spread: sum of the motions' covariances in the camera of `end`, float64 [m, 6, 6]. motions:
-    their number on the way, int [m]. The motions of all ways that an error goes over, times `spread`, bound its
+    how many are on the way, int [m]. Multiply `spread` by that of all ways that an error goes over for the bound of its
     covariance. connected: bool [m]; the other values mean nothing where it is False.
     """
 
@@ -72,8 +72,8 @@ class Odometry:
         pose = self.poses[end] @ rigid.invert(self.poses[start])
         carry = rigid.adjoint(self.poses[end])
         spread = carry @ (self.spread[start] + self.spread[end] - 2 * self.spread[meeting]) @ carry.mT
-        count = self.depth[start] + self.depth[end] - 2 * self.depth[meeting]
-        return Way(pose, spread, count, connected)
+        motions = self.depth[start] + self.depth[end] - 2 * self.depth[meeting]
+        return Way(pose, spread, motions, connected)
 
     def distances(self, measured: Sequence[MeasuredRelativePose], growth: float = np.inf) -> np.ndarray:
         """Squared Mahalanobis distance of each measured motion from odometry, 6 degrees of freedom, float64 [m]; NaN
