@@ -14,7 +14,11 @@ class HostPixel(AbstractTerm):
 
     Without it the bearing of a landmark is exact by construction, and the noise of the host's key point, which all its
     matches share, is taken for theirs. With it a landmark has three unknowns: `State.pixel_offset` and its inverse
-    depth, which is bundle adjustment over points in space. `weight` has the axes `[n, p]`: keyframe and point slot.
+    depth, which is bundle adjustment over points in space.
+
+    Fields:
+        weight: `[h, p]`, row of landmarks and point slot: 1 / variance of the pixel; 0 = nothing was observed.
+        kernel: robust kernel of each observation.
 
     Example:
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
