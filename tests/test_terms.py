@@ -24,11 +24,13 @@ from vggtgeo.solvers.kernels import Barron, Cauchy, Square
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import (
+    Place,
     cameras_of,
     edge_data,
     hosts_of,
     motions_of,
     of_edge,
+    places,
     prepared,
     relative_poses,
     view_of,
@@ -54,9 +56,9 @@ def by_hand_and_derived(problem: vg.Problem, state: vg.State, correction: jax.Ar
     ready = prepared(problem)
     cameras, hosts = cameras_of(ready, state), hosts_of(ready, state)
 
-    def one(ends: tuple[jax.Array, jax.Array], motion: Any, data: Any) -> dict[str, Pairs]:
+    def one(place: Place, motion: Any, data: Any) -> dict[str, Pairs]:
         found = {}
-        for term, seen in of_edge(ready, view_of(cameras, hosts, ends, motion), data):
+        for term, seen in of_edge(ready, view_of(cameras, hosts, place, motion), data):
             found[term.name] = [
                 (term.energy(seen), EdgeTerm.energy(term, seen)),
                 (term.columns(seen, None), EdgeTerm.columns(term, seen, None)),
@@ -66,7 +68,7 @@ def by_hand_and_derived(problem: vg.Problem, state: vg.State, correction: jax.Ar
             ]
         return found
 
-    return jax.vmap(one)(ready.edges.ends, motions_of(relative_poses(ready, state)), edge_data(ready))
+    return jax.vmap(one)(places(ready), motions_of(relative_poses(ready, state)), edge_data(ready))
 
 
 def used(model: Any) -> tuple[jax.Array, jax.Array]:
