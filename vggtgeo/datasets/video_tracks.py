@@ -98,7 +98,9 @@ def read_tracks(path: str) -> tuple[Track, ...]:
         return ()
     try:
         with av.open(path) as container:
-            return tuple(_track(number, stream) for number, stream in enumerate(container.streams.video))
+            streams = enumerate(container.streams.video)
+            # A damaged file may name a codec that does not exist: such a track has no decoder.
+            return tuple(_track(number, stream) for number, stream in streams if stream.codec_context is not None)
     except (av.error.FFmpegError, OSError, ValueError):  # OpenCV says what is wrong
         return ()
 

@@ -110,7 +110,7 @@ def _with_priors(windows: Batch, weight: Array) -> Problem:
     if all(term.name != BaselinePrior.name for term in problem.terms):
         return problem
     unit = problem.baselines
-    return problem.with_term(unit.reweighted(unit.weight.at[1:].set(0.0)))
+    return problem.with_term(unit.reweighted(unit.weight.at[1:].set(0.0)), replace=True)
 
 
 def _slid(problems: Problem, initials: State) -> Solution:
