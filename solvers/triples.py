@@ -43,7 +43,7 @@ def join_triples(system: ArrowSystem) -> ArrowSystem:
     by_u, by_v, by_d, _ = _split(system.cross, count)
     by_v = by_v - ratio_uv[:, None] * by_u
     by_d = by_d - ratio_u[:, None] * by_u - ratio_v[:, None] * by_v
-    # Stacked, not concatenated: on a CPU fifteen times as fast.
+    # Stacked, not concatenated: XLA does not vectorise a concatenation that it fuses on a CPU.
     rows = jnp.stack([by_u, by_v, by_d], 2).at[:, -1].set(jnp.stack([hessian_u, own_v, own_d], 1))
     cross = jax.lax.dynamic_update_slice(system.cross, rows.reshape(*rows.shape[:2], 3 * count), (0, 0, 0))
     return eqx.tree_at(
