@@ -6,7 +6,7 @@ recorder of a depth camera (k4arecorder writes COLOR, DEPTH and IR into one Matr
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,8 +98,8 @@ def read_tracks(path: str) -> tuple[Track, ...]:
         return ()
     try:
         with av.open(path) as container:
-            streams = enumerate(container.streams.video)
-            # A damaged file may name a codec that does not exist: such a track has no decoder.
+            # A damaged file may name a codec that does not exist: no decoder, which the types of av leave out.
+            streams: Iterable[tuple[int, Any]] = enumerate(container.streams.video)
             return tuple(_track(number, stream) for number, stream in streams if stream.codec_context is not None)
     except (av.error.FFmpegError, OSError, ValueError):  # OpenCV says what is wrong
         return ()
