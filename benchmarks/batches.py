@@ -127,7 +127,7 @@ def _ways(problems: Any, states: Any, solver: Any, count: int) -> dict[str, tupl
     first = jax.tree.map(lambda leaf: leaf[:few], (problems, states))
     one = jax.jit(lambda problem, state: vg.solve(problem, state, solver=solver).energy)
     singles = [jax.tree.map(lambda leaf, n=n: leaf[n], first) for n in range(few)]
-    batched = lambda **how: jax.jit(lambda p, s: vg.solve_batch(p, s, solver=solver, **how).energy)
+    batched = lambda **how: jax.jit(lambda p, s: vg.batches.solve_batch(p, s, solver=solver, **how).energy)
     in_turn, together = batched(at_once=1), batched(at_once=count)
     ways: dict[str, tuple[Callable[[], Any], int]] = {
         "alone": (lambda: [one(*single).block_until_ready() for single in singles], few),
@@ -144,7 +144,7 @@ def _ways(problems: Any, states: Any, solver: Any, count: int) -> dict[str, tupl
 def _cost(problems: Any, states: Any, solver: Any, count: int) -> dict[str, float]:
     """Operations and bytes of one iteration of one window, as XLA counts the program of a single iteration."""
     single = eqx.tree_at(lambda s: s.max_iterations, solver, 1)
-    run = jax.jit(lambda p, s: vg.solve_batch(p, s, solver=single, at_once=count).energy)
+    run = jax.jit(lambda p, s: vg.batches.solve_batch(p, s, solver=single, at_once=count).energy)
     found = run.lower(problems, states).compile().cost_analysis() or {}
     return {"flops": found.get("flops", 0.0) / count, "bytes": found.get("bytes accessed", 0.0) / count}
 

@@ -23,10 +23,10 @@ import numpy as np
 import vggtgeo as vg
 from vggtgeo.simulation.loop import simulate_loop
 
-MODELS = (vg.SquarePinhole, vg.SquareRadialTangential, vg.SquareKannalaBrandt)
+MODELS = (vg.cameras.SquarePinhole, vg.cameras.SquareRadialTangential, vg.cameras.SquareKannalaBrandt)
 SIGMA = 0.05
 """Of each coefficient of a lens."""
-FREE = np.isin(vg.SquareRadialTangential.names, ("f", "k1", "k2"))
+FREE = np.isin(vg.cameras.SquareRadialTangential.names, ("f", "k1", "k2"))
 """Of the parameters of each of many cameras."""
 ITERATIONS = 10
 """Of a timed solve."""
@@ -63,7 +63,7 @@ def many_cameras(groups: list[int], keyframes: int, points: int, reach: int, rou
         print(f"| {name} | {max(count, 1) * int(FREE.sum())} | {1e3 * seconds:.0f} | {seconds / least[0]:.2f} |")
 
 
-def timed_solve(window: vg.SimulatedWindow, count: int) -> Callable[[], float]:
+def timed_solve(window: vg.data.SimulatedWindow, count: int) -> Callable[[], float]:
     """Seconds an iteration of a compiled solve with so many cameras, which took the keyframes in turns."""
     focal, _, x, y = window.intrinsics
     guess = np.tile([1.01 * focal, x, y, 0.0, 0.0, 0.0, 0.0], (max(count, 1), 1))
@@ -75,7 +75,7 @@ def timed_solve(window: vg.SimulatedWindow, count: int) -> Callable[[], float]:
         guess, options = guess[0], {name: value[0] for name, value in options.items()}
     seen = window.observations
     problem, initial, _ = vg.pack(
-        seen, window.start, guess, seen.depth_mean, camera=vg.SquareRadialTangential, **options
+        seen, window.start, guess, seen.depth_mean, camera=vg.cameras.SquareRadialTangential, **options
     )
     solver = vg.SchurLevenbergMarquardt(rtol=0.0, max_iterations=ITERATIONS)
     solve = jax.jit(lambda problem, initial: vg.solve(problem, initial, solver=solver))

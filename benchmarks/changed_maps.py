@@ -29,7 +29,7 @@ import numpy as np
 import vggtgeo as vg
 from vggtgeo.io.errors import InputError
 
-SMALL = vg.SlamSettings(window=vg.WindowSettings(size=3, point_slots=64, line_slots=24))
+SMALL = vg.SlamSettings(window=vg.settings.WindowSettings(size=3, point_slots=64, line_slots=24))
 MAPPED, FRAMES = 8, 14
 FAR = 0.05
 """Metres: a result that is farther off is wrong."""

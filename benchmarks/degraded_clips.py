@@ -50,7 +50,7 @@ def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> t
 
 def evidence(sequence: SequenceView) -> Evidence:
     """What the verdict looks at, of each frame."""
-    recorder = vg.EvidenceRecorder(sequence.camera)
+    recorder = vg.callbacks.EvidenceRecorder(sequence.camera)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         for frame in sequence.frames():

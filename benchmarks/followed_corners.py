@@ -56,7 +56,7 @@ def main() -> None:
 
 def _steps(recording: Recording) -> tuple[list[Step], list[float]]:
     """The true steps against the corners, and the bands of light from image to image."""
-    recorder, images = vg.EvidenceRecorder(recording.camera), []
+    recorder, images = vg.callbacks.EvidenceRecorder(recording.camera), []
     for frame in recording.frames:
         recorder.add(frame)
         images.append(recorder.so_far().image)

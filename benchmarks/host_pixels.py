@@ -70,7 +70,7 @@ def _solver(free: bool):
     def solve(window: SimulatedWindow) -> tuple[np.ndarray, float]:
         if not free:
             window = replace(window, observations=replace(window.observations, pixel_sigma=None))
-        poses, covariance = adjust(*window.pack(kernel=vg.Square())[:2])
+        poses, covariance = adjust(*window.pack(kernel=vg.kernels.Square())[:2])
         return _judged(window, np.array(poses), np.array(covariance))
 
     return solve

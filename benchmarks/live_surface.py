@@ -1,4 +1,4 @@
-"""What it costs to keep a mesh up to date while a run goes on: `vg.SurfaceFusion` after every frame, docs/maps.md.
+"""Measure what a mesh costs that is kept up to date during a run (`vg.callbacks.SurfaceFusion`), see docs/maps.md.
 
     .venv/bin/python benchmarks/live_surface.py ../shared/data/corridor-office [--end 60]
 
@@ -24,7 +24,7 @@ class Surface(vg.Callback):
         self.bound, self.fusion, self.costs = bound, None, []
 
     def on_frame(self, slam, frame) -> None:
-        self.fusion = self.fusion or vg.SurfaceFusion(slam.intrinsics, bound=self.bound)
+        self.fusion = self.fusion or vg.callbacks.SurfaceFusion(slam.intrinsics, bound=self.bound)
         began = time.perf_counter()
         blocks = self.fusion.update(slam.adjusted_keyframes)
         if blocks:
@@ -46,7 +46,7 @@ def main() -> None:
         )
         print(f"  {mean[1]:.2f} s (at most {most[1]:.2f})")
     began = time.perf_counter()
-    blocks = vg.SurfaceFusion(slam.intrinsics).update(slam.keyframes)
+    blocks = vg.callbacks.SurfaceFusion(slam.intrinsics).update(slam.keyframes)
     print(f"all {len(slam.keyframes)} keyframes at once: {blocks} blocks, {time.perf_counter() - began:.1f} s")
 
 

@@ -96,7 +96,7 @@ def _row(keyframes: int, solver: str, parts: list[str]) -> dict[str, Any]:
 def _measure(keyframes: int, name: str, part: str) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)
     window, surfaces = simulate_loop(keyframes)
-    problem, initial, _ = window.pack(terms=(surfaces,), kernel=vg.Huber(1.5))
+    problem, initial, _ = window.pack(terms=(surfaces,), kernel=vg.kernels.Huber(1.5))
     reduced = SOLVERS[name](problem)
     solver = vg.SchurLevenbergMarquardt(reduced_solver=reduced)
     solve = lambda problem, state: vg.solve(problem, state, solver=solver)

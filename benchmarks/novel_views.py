@@ -82,7 +82,7 @@ def _rows(times: list[float], wanted: np.ndarray) -> np.ndarray:
     return np.abs(np.subtract.outer(wanted, np.array(times))).argmin(1)
 
 
-def _halved(frame: vg.Frame) -> Picture:
+def _halved(frame: vg.data.Frame) -> Picture:
     height, width = frame.image.shape[0] // HALF, frame.image.shape[1] // HALF
     colour = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     assert frame.depth is not None, "the clip needs depth"

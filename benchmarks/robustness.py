@@ -29,10 +29,10 @@ import vggtgeo as vg
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4)
 KINDS = {"near": "offset", "gross": "uniform"}
 KERNELS: dict[str, Callable[[], Any]] = {
-    "Huber": vg.Huber,
-    "Cauchy": vg.Cauchy,
-    "Geman-McClure": vg.GemanMcClure,
-    "Barron, alpha = -1": lambda: vg.Barron(alpha=-1.0),
+    "Huber": vg.kernels.Huber,
+    "Cauchy": vg.kernels.Cauchy,
+    "Geman-McClure": vg.kernels.GemanMcClure,
+    "Barron, alpha = -1": lambda: vg.kernels.Barron(alpha=-1.0),
 }
 ITERATIONS = 50
 TABLES = ("kernels", "corrections", "lines")

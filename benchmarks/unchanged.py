@@ -107,7 +107,7 @@ class _Stop(Exception):
 class _StopAt(vg.Callback):
     frame: int
 
-    def on_frame(self, slam: Slam, frame: vg.Frame) -> None:
+    def on_frame(self, slam: Slam, frame: vg.data.Frame) -> None:
         if frame.index == self.frame:
             raise _Stop
 

@@ -40,7 +40,7 @@ class AbstractKernel(eqx.Module):
     Fields:
 
     Example: a kernel of one's own, for small residuals the square.
-        >>> class Welsch(vg.AbstractKernel):
+        >>> class Welsch(vg.kernels.AbstractKernel):
         ...     def rho(self, s):
         ...         return 1 - jax.numpy.exp(-s)
         >>> float(Welsch().weight(jax.numpy.asarray(0.0)))
@@ -76,7 +76,7 @@ class Square(AbstractKernel):
     Fields:
 
     Example:
-        >>> float(vg.Square().weight(jax.numpy.asarray(9.0)))
+        >>> float(vg.kernels.Square().weight(jax.numpy.asarray(9.0)))
         1.0
 
     """
@@ -98,7 +98,7 @@ class Huber(AbstractKernel):
         delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
 
     Example: a residual of four times the width counts a quarter.
-        >>> float(vg.Huber(delta=1.5).weight(jax.numpy.asarray(6.0**2)))
+        >>> float(vg.kernels.Huber(delta=1.5).weight(jax.numpy.asarray(6.0**2)))
         0.25
 
     """
@@ -130,7 +130,7 @@ class Cauchy(AbstractKernel):
         delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
 
     Example: a residual of twice the width counts a fifth.
-        >>> float(vg.Cauchy(delta=1.5).weight(jax.numpy.asarray(3.0**2)))
+        >>> float(vg.kernels.Cauchy(delta=1.5).weight(jax.numpy.asarray(3.0**2)))
         0.2
 
     """
@@ -154,7 +154,7 @@ class GemanMcClure(AbstractKernel):
         delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
 
     Example: a residual as large as the width counts a quarter.
-        >>> float(vg.GemanMcClure(delta=1.5).weight(jax.numpy.asarray(1.5**2)))
+        >>> float(vg.kernels.GemanMcClure(delta=1.5).weight(jax.numpy.asarray(1.5**2)))
         0.25
 
     """
@@ -183,7 +183,7 @@ class Barron(AbstractKernel):
 
     Example: a shape of -2 is Geman-McClure's kernel.
         >>> s = jax.numpy.asarray(4.0)
-        >>> round(float(vg.Barron(alpha=-2.0).weight(s) / vg.GemanMcClure(delta=3.0).weight(s)), 12)
+        >>> round(float(vg.kernels.Barron(alpha=-2.0).weight(s) / vg.kernels.GemanMcClure(delta=3.0).weight(s)), 12)
         1.0
 
     """

@@ -62,10 +62,10 @@ class Half:
         return np.ones((image.shape[0] // 2, image.shape[1] // 2), np.float32)
 
 
-def frame(number: int, **changes: Any) -> vg.Frame:
+def frame(number: int, **changes: Any) -> vg.data.Frame:
     """A good frame with other fields."""
     fields = {"timestamp": number / 30, "image": IMAGES[number], "depth": None, "name": f"frame {number}"}
-    return vg.Frame(**{"index": number, **fields, **changes})
+    return vg.data.Frame(**{"index": number, **fields, **changes})
 
 
 def stream(items: Callable[[], Sequence[Any]]) -> Callable[[Path], Any]:
@@ -109,7 +109,7 @@ def same_place(count: int, truth: Any) -> Any:
 def written(folder: Path, **more: Any) -> None:
     """Three windows."""
     size = vg.PaddedSize(keyframes=3, points=40, lines=0, degree=2)
-    with vg.WindowWriter(folder) as writer:
+    with vg.learning.WindowWriter(folder) as writer:
         for seed in range(3):
             writer.add(vg.simulate_window(3, points=8, lines=0, seed=seed).pack(size=size), **more)
 
@@ -122,7 +122,7 @@ def dataset(
     def call(folder: Path) -> Any:
         written(folder / "windows", poses=np.zeros(3))
         change(folder / "windows")
-        return use(vg.WindowDataset.open(folder / "windows"))
+        return use(vg.learning.WindowDataset.open(folder / "windows"))
 
     return call
 
@@ -199,14 +199,14 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`plot`: a truth of another time", lambda _: vg.plot(fixed(), vg.Trajectory([100.0], [EYE]))),
     ("`plot` of a result: a file's name as truth", lambda _: vg.plot(result(), truth="truth.txt")),
     ("`frame_trajectory` of nothing", lambda _: vg.frame_trajectory(None)),
-    ("`SurfaceFusion.update` of nothing", lambda _: vg.SurfaceFusion([50.0, 50.0, 32.0, 24.0]).update(None)),
-    ("`SurfaceFusion`: three intrinsics", lambda _: vg.SurfaceFusion([50.0, 50.0, 32.0])),
-    ("`SurfaceFusion`: a focal length of 0", lambda _: vg.SurfaceFusion([0.0, 50.0, 32.0, 24.0])),
+    ("`SurfaceFusion.update` of nothing", lambda _: vg.callbacks.SurfaceFusion([50.0, 50.0, 32.0, 24.0]).update(None)),
+    ("`SurfaceFusion`: three intrinsics", lambda _: vg.callbacks.SurfaceFusion([50.0, 50.0, 32.0])),
+    ("`SurfaceFusion`: a focal length of 0", lambda _: vg.callbacks.SurfaceFusion([0.0, 50.0, 32.0, 24.0])),
     (
         "`with_depth_scale` of a text",
         lambda made: with_depth_scale(open_sequence(tiny_sequences.tum(made)), "5000"),
     ),
-    ("`pack_batch` of no windows", lambda _: vg.pack_batch([None])),
+    ("`pack_batch` of no windows", lambda _: vg.batches.pack_batch([None])),
     ("frames that are a number", reconstruct(lambda: 5)),
     ("frames that are names of files", reconstruct(lambda: ["0.png", "1.png"])),
     ("images of numbers from 0 to 1", reconstruct(lambda: [IMAGES[0] / 255.0])),
@@ -256,7 +256,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`read` of a name of 5,000 letters", lambda _: vg.read("a" * 5000)),
     ("`read` of half a letter of UTF-16", lambda _: vg.read("\ud800")),
     ("`evaluate` of a name with a zero byte", lambda _: vg.evaluate("a\0b", trajectory([0.0], [EYE])(_))),
-    ("a window dataset of nothing", lambda _: vg.WindowDataset.open(None)),
+    ("a window dataset of nothing", lambda _: vg.learning.WindowDataset.open(None)),
     ("a cloud of nothing", lambda _: PointCloud.load_ply(None)),
     ("a trajectory saved to nothing", lambda _: trajectory([0.0], [EYE])(_).save_tum(None)),
     ("checkpoints of nothing", lambda _: vg.Checkpoints(None)),
@@ -304,7 +304,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`batches`: one number as a share", dataset(lambda place: None, lambda data: data.batches(1, share=1))),
     ("`batches`: -1 epochs", dataset(lambda place: None, lambda data: data.batches(1, epochs=-1))),
     ("a window of number `a`", dataset(lambda place: None, lambda data: data["a"])),
-    ("`stack_windows` of no window", lambda _: vg.stack_windows([])),
+    ("`stack_windows` of no window", lambda _: vg.learning.stack_windows([])),
     ("`WindowWriter` into a folder that holds windows", dataset(written)),
     ("`WindowWriter`: a label that is an object", lambda folder: written(folder, poses=object())),
     ("`WindowWriter`: a label called `file`", lambda folder: written(folder, file=1.0)),
@@ -322,7 +322,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`Sensor`: noise that is a text", lambda _: Sensor(noise="2")),
     ("`Sensor`: half a sample", lambda _: Sensor(blur_samples=2.5)),
     ("a `PointCloud` of nothing", lambda _: PointCloud(None, None)),
-    ("a setting of 10^400", lambda _: vg.WeightSettings(confidence_gain=10**400)),
+    ("a setting of 10^400", lambda _: vg.settings.WeightSettings(confidence_gain=10**400)),
     ("a number as matcher", lambda _: vg.Roles(points=5)),
     ("a name as depth", lambda _: vg.Roles(depth="moge2-small")),
     ("a confidence of one's own of another size", lambda _: next(vg.run(IMAGES, roles=vg.Roles(confidence=Half())))),

@@ -41,7 +41,7 @@ def not_finite(state: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf * np.nan, state)
 
 
-class Fix(vg.PoseTerm):
+class Fix(vg.terms.PoseTerm):
     """Where a camera stands."""
 
     position: jax.Array
@@ -67,7 +67,7 @@ def residual(value: Callable[[Any], Any]) -> Callable[[Path], Any]:
 
 def with_prior(kind: Any, **data: Any) -> Callable[[Path], Any]:
     """`vg.energy` with a term of the package, of one observation."""
-    ends = {"keyframe": [0]} if kind is vg.RotationPrior else {"first": [0], "second": [1]}
+    ends = {"keyframe": [0]} if kind is vg.terms.RotationPrior else {"first": [0], "second": [1]}
     term = {**ends, "weight": np.ones(1), **data}
     return with_pair(lambda p, s: vg.energy(p.with_term(kind(**term)), s))
 
@@ -82,7 +82,9 @@ def drawn(truth: Any = None, *, count: int = 3, batch: bool = False, **options: 
 
     def call(problem: Any, state: Any) -> Any:
         zeros = lambda *shape: jax.numpy.zeros((count, *shape))
-        known = vg.Covariances(zeros(6, 6), jax.numpy.zeros((4, 4)), zeros(2), zeros(1, 6, 6), jax.numpy.ones(()))
+        known = vg.analysis.Covariances(
+            zeros(6, 6), jax.numpy.zeros((4, 4)), zeros(2), zeros(1, 6, 6), jax.numpy.ones(())
+        )
         return vg.plot(stack([known, known]) if batch else known, state, truth, **options)
 
     return with_pair(call)
@@ -106,7 +108,7 @@ WINDOW = (SCENE.observations, SCENE.start_poses, SCENE.start_intrinsics, SCENE.i
 SHORT = (WINDOW[0], WINDOW[1][:1], *WINDOW[2:])
 
 
-class Nothing(vg.AbstractKernel):
+class Nothing(vg.kernels.AbstractKernel):
     """Its author forgot to return."""
 
     def rho(self, s: jax.Array) -> Any:
@@ -181,13 +183,16 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ),
     ("`within`: a keyframe twice", lambda _: SCENE.observations.within([0, 0])),
     ("`reorder`: a keyframe twice", lambda _: vg.reorder(vg.no_prior(3), [0, 0, 1])),
-    ("`solve_batch` of one window", with_pair(vg.solve_batch)),
-    ("`solve_batch`: two problems and one state", batched(lambda p, s: vg.solve_batch(p, jax.tree.map(ONLY_FIRST, s)))),
-    ("`solve_batch`: no window at once", batched(lambda p, s: vg.solve_batch(p, s, at_once=0))),
-    ("`solve_batch`: a device's name", batched(lambda p, s: vg.solve_batch(p, s, devices="cpu"))),
+    ("`solve_batch` of one window", with_pair(vg.batches.solve_batch)),
+    (
+        "`solve_batch`: two problems and one state",
+        batched(lambda p, s: vg.batches.solve_batch(p, jax.tree.map(ONLY_FIRST, s))),
+    ),
+    ("`solve_batch`: no window at once", batched(lambda p, s: vg.batches.solve_batch(p, s, at_once=0))),
+    ("`solve_batch`: a device's name", batched(lambda p, s: vg.batches.solve_batch(p, s, devices="cpu"))),
     (
         "`pack_batch`: fewer poses than keyframes",
-        lambda _: vg.pack_batch([WINDOW, SHORT]),
+        lambda _: vg.batches.pack_batch([WINDOW, SHORT]),
     ),
     ("`load_problem` of an empty name", lambda _: vg.load_problem("")),
     ("`load_problem` of whole numbers", lambda _: vg.load_problem("no.npz", dtype="int32")),
@@ -202,7 +207,7 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`solve`: an adjoint's name", with_pair(lambda p, s: vg.solve(p, s, adjoint="arrow"))),
     ("`simulate_window`: noise that is NaN", lambda _: vg.simulate_window(noise=np.nan)),
     ("`simulate_window`: more outliers than matches", lambda _: vg.simulate_window(outliers=2)),
-    ("a term with a kernel of width 0", with_pair(lambda p, s: replace(p.points, kernel=vg.Huber(0.0)))),
+    ("a term with a kernel of width 0", with_pair(lambda p, s: replace(p.points, kernel=vg.kernels.Huber(0.0)))),
     ("a term with a kernel's name", with_pair(lambda p, s: replace(p.points, kernel="huber"))),
     ("`Graduation`: a width below zero", lambda _: vg.Graduation((4.0, -2.0))),
     ("a term of a keyframe that is not there", with_pair(lambda p, s: vg.energy(p.with_term(fix(keyframe=[3])), s))),
@@ -217,13 +222,16 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a residual of truth values", residual(lambda centre: centre > 0)),
     ("a residual of complex numbers", residual(lambda centre: centre * 1j)),
     ("a residual that is a matrix", residual(lambda centre: jax.numpy.outer(centre, centre))),
-    ("a pair of a keyframe with itself", with_prior(vg.BaselinePrior, second=[0], length=ONE, sigma=ONE)),
-    ("a baseline of length 0", with_prior(vg.BaselinePrior, length=0 * ONE, sigma=ONE)),
-    ("a baseline whose length is nothing", with_prior(vg.BaselinePrior, length=None, sigma=ONE)),
-    ("a measured rotation of length 2", with_prior(vg.RotationPrior, measured=TWICE, root=ROOT)),
-    ("a measured rotation with the root of a pose", with_prior(vg.RotationPrior, measured=UPRIGHT, root=ROOT_OF_POSE)),
-    ("a kernel whose width is a text", lambda _: vg.Huber("1.5")),
-    ("`pack`: Barron's kernel of shape 3", pack(kernel=vg.Barron(1.5, 3.0))),
+    ("a pair of a keyframe with itself", with_prior(vg.terms.BaselinePrior, second=[0], length=ONE, sigma=ONE)),
+    ("a baseline of length 0", with_prior(vg.terms.BaselinePrior, length=0 * ONE, sigma=ONE)),
+    ("a baseline whose length is nothing", with_prior(vg.terms.BaselinePrior, length=None, sigma=ONE)),
+    ("a measured rotation of length 2", with_prior(vg.terms.RotationPrior, measured=TWICE, root=ROOT)),
+    (
+        "a measured rotation with the root of a pose",
+        with_prior(vg.terms.RotationPrior, measured=UPRIGHT, root=ROOT_OF_POSE),
+    ),
+    ("a kernel whose width is a text", lambda _: vg.kernels.Huber("1.5")),
+    ("`pack`: Barron's kernel of shape 3", pack(kernel=vg.kernels.Barron(1.5, 3.0))),
     ("a solver whose damping ends before it begins", lambda _: vg.SchurLevenbergMarquardt(max_damping=1e-20)),
     ("a solver with damping below zero", lambda _: vg.SchurLevenbergMarquardt(initial_damping=-1.0)),
     ("a derivative of half a step", lambda _: vg.ArrowAdjoint(polish=1.5)),
@@ -231,7 +239,7 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`no_prior` of -1 keyframes", lambda _: vg.no_prior(-1)),
     ("`no_prior` of 10^9 keyframes", lambda _: vg.no_prior(10**9)),
     ("`reorder` by a text", lambda _: vg.reorder(vg.no_prior(3), "210")),
-    ("`residual_sizes` of nothing", with_pair(lambda p, s: vg.residual_sizes(None, s))),
+    ("`residual_sizes` of nothing", with_pair(lambda p, s: vg.analysis.residual_sizes(None, s))),
     ("`simulate_window` of 10^9 keyframes", lambda _: vg.simulate_window(10**9)),
     ("`Graduation`: a number in place of widths", lambda _: vg.Graduation(-1)),
 )

@@ -62,7 +62,10 @@ def test_one_file_is_all(added: ModuleType, tmp_path: Path) -> None:
     problem, start, index = SCENE.pack(terms=[heights, vg.no_prior(3)])
     without = problem.with_term(heights.reweighted(jnp.zeros(2)), replace=True)
 
-    energy, size = eqx.filter_jit(vg.energy_terms)(problem, start), eqx.filter_jit(vg.residual_sizes)(problem, start)
+    energy, size = (
+        eqx.filter_jit(vg.analysis.energy_terms)(problem, start),
+        eqx.filter_jit(vg.analysis.residual_sizes)(problem, start),
+    )
     off = start.poses.inverse().translation()[1:, 1] - centres[1:, 1]
     assert float(energy["heights"]) == pytest.approx(0.5e8 * float(jnp.sum(off**2)), rel=1e-9)
     assert int(size.count["heights"]) == 2
@@ -88,6 +91,6 @@ def test_one_file_is_all(added: ModuleType, tmp_path: Path) -> None:
     assert bool(eqx.tree_equal(read, problem))
 
     window = (SCENE.observations, SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth)
-    problems, states, _ = vg.pack_batch([(*window, [heights]), window], intrinsics_sigma=5.0)
-    values = jax.vmap(vg.energy_terms)(problems, states)["heights"]
+    problems, states, _ = vg.batches.pack_batch([(*window, [heights]), window], intrinsics_sigma=5.0)
+    values = jax.vmap(vg.analysis.energy_terms)(problems, states)["heights"]
     np.testing.assert_allclose(values, [float(energy["heights"]), 0.0], rtol=1e-9)

@@ -113,7 +113,7 @@ def two_pinholes() -> tuple[Rig, vg.Problem, vg.State, np.ndarray]:
         intrinsics_sigma=np.array([np.full(4, np.inf), np.full(4, 3.0)]),
         fixed_intrinsics=held,
         camera_of=GROUP,
-        kernel=vg.Square(),
+        kernel=vg.kernels.Square(),
     )
     return made, problem, state, index, guess
 
@@ -176,7 +176,7 @@ def test_two_cameras_are_adjusted_and_judged_as_by_dense_algebra() -> None:
     assert "aspect ratio of camera 1" in names
 
 
-class Seen(vg.PoseTerm):
+class Seen(vg.terms.PoseTerm):
     """A known place and where it was seen: a term on a pose and the camera that took it."""
 
     place: jax.Array
@@ -196,7 +196,7 @@ def test_second_derivatives_with_several_cameras() -> None:
         keyframe=[1, 2], place=jnp.array([[0.1, 0.2, 2.0]] * 2), pixel=jnp.full((2, 2), 150.0), weight=[0.3, 1]
     )
     problem, state, _ = vg.pack(
-        *(made.seen, poses, made.cameras, depth), camera=vg.RadialTangential, camera_of=GROUP, terms=[place]
+        *(made.seen, poses, made.cameras, depth), camera=vg.cameras.RadialTangential, camera_of=GROUP, terms=[place]
     )
     flat, unflat = ravel_pytree(BundleAdjustment(problem).zero_step(state))
 
@@ -231,7 +231,7 @@ def test_an_edge_sees_two_cameras_however_many_there_are() -> None:
         assert len(system.free) == 4 * 6 + 4 * count
 
 
-class Ratio(vg.CameraTerm):
+class Ratio(vg.terms.CameraTerm):
     """Of the first focal lengths of two cameras."""
 
     ratio: jax.Array
@@ -243,7 +243,7 @@ class Ratio(vg.CameraTerm):
 def test_a_term_on_all_cameras() -> None:
     # Proves the model of a term that two cameras are part of, under a robust kernel. Oracle: the energy written out,
     # differentiated, and `sum w rho' J'J`.
-    term = Ratio(ratio=jnp.array([1.0, 1.3]), weight=jnp.array([4.0, 25.0]), kernel=vg.Huber(0.7))
+    term = Ratio(ratio=jnp.array([1.0, 1.3]), weight=jnp.array([4.0, 25.0]), kernel=vg.kernels.Huber(0.7))
     at = jnp.asarray(PINHOLES.reshape(-1))
     one = lambda p, ratio: jnp.stack([p[0] / p[4] - ratio, (p[1] - p[5]) / 100])
 
@@ -266,14 +266,14 @@ def test_a_term_on_all_cameras() -> None:
 @pytest.mark.parametrize(
     ("model", "truth"),
     [
-        pytest.param(vg.RadialTangential, BENT, marks=pytest.mark.long),
-        pytest.param(vg.KannalaBrandt, FISHEYE, marks=pytest.mark.slow),
+        pytest.param(vg.cameras.RadialTangential, BENT, marks=pytest.mark.long),
+        pytest.param(vg.cameras.KannalaBrandt, FISHEYE, marks=pytest.mark.slow),
     ],
 )
-def test_a_distortion_is_found(model: type[vg.AbstractCamera], truth: np.ndarray) -> None:
+def test_a_distortion_is_found(model: type[vg.cameras.AbstractCamera], truth: np.ndarray) -> None:
     # Proves `pack(camera=...)`: from no distortion and a focal length 1 % off, exact matches give the camera that drew
     # them. Oracle: OpenCV drew them.
-    made = rig((tuple(truth),), fisheye=model is vg.KannalaBrandt, points=25)
+    made = rig((tuple(truth),), fisheye=model is vg.cameras.KannalaBrandt, points=25)
     poses, _ = start_of(made)
     guess = np.concatenate([truth[:4] * [1.01, 0.99, 1.0, 1.0], np.zeros(4)])
     problem, state, index = vg.pack(made.seen, poses, guess, made.inverse_depth, camera=model)
@@ -284,7 +284,7 @@ def test_a_distortion_is_found(model: type[vg.AbstractCamera], truth: np.ndarray
     assert len(eqx.filter_jit(vg.covariances)(problem, solution.state).to_dict()["intrinsics_sigma_px"]) == 8
 
 
-class EqualFocalLengths(vg.CameraTerm):
+class EqualFocalLengths(vg.terms.CameraTerm):
     """The same tie as a stiff term."""
 
     def residual(self, parameters):
@@ -298,7 +298,7 @@ def test_square_pixels_are_an_exact_tie() -> None:
     window = vg.simulate_window(3, points=10, lines=1)
     given = (window.observations, window.start)
     guess, depth = 1.05 * window.intrinsics[1:], window.observations.depth_mean
-    found = solve(*vg.pack(*given, guess, depth, camera=vg.SquarePinhole)[:2]).state.intrinsics
+    found = solve(*vg.pack(*given, guess, depth, camera=vg.cameras.SquarePinhole)[:2]).state.intrinsics
     tie = EqualFocalLengths(weight=jnp.full(1, 1e8))
     tied = solve(*vg.pack(*given, np.append(guess[0], guess), depth, terms=[tie])[:2]).state.intrinsics
     np.testing.assert_allclose(np.append(found[0], found), tied, rtol=1e-6)
@@ -308,13 +308,16 @@ def test_square_pixels_are_an_exact_tie() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"camera": vg.RadialTangential}, r"`intrinsics` has shape \(4,\); expected \(8\): fx, .*RadialTangential"),
+        (
+            {"camera": vg.cameras.RadialTangential},
+            r"`intrinsics` has shape \(4,\); expected \(8\): fx, .*RadialTangential",
+        ),
         ({"camera": "pinhole"}, "`camera` is 'pinhole'; expected a camera's class"),
         ({"camera_of": [0, 0, 0, 0]}, r"expected \(g, 4\)"),
         ({"camera_of": [0, 2, 0, 1], "intrinsics": PINHOLES}, "`camera_of` goes from 0 to 2; `intrinsics` has 2 rows"),
         ({"camera_of": [0, 1], "intrinsics": PINHOLES}, "expected 4 whole numbers"),
         ({"intrinsics_sigma": [1.0, 2.0]}, r"`intrinsics_sigma` has shape \(2,\)"),
-        ({"camera": vg.SquarePinhole, "intrinsics": [-1.0, 2, 3]}, "focal lengths must be positive"),
+        ({"camera": vg.cameras.SquarePinhole, "intrinsics": [-1.0, 2, 3]}, "focal lengths must be positive"),
     ],
 )
 def test_cameras_that_do_not_fit_are_refused(options: dict, message: str) -> None:

@@ -19,22 +19,22 @@ PROBLEM, START, _ = WINDOW.pack(fixed_intrinsics=True)
 CENTRES = np.asarray(WINDOW.centres)
 
 
-class Fix(vg.PoseTerm):
+class Fix(vg.terms.PoseTerm):
     """A position in the world."""
 
     position: jax.Array
 
-    def residual(self, pose: vg.PoseTerm, camera: object) -> jax.Array:
+    def residual(self, pose: vg.terms.PoseTerm, camera: object) -> jax.Array:
         return pose.inverse().translation() - self.position
 
 
-class Range(vg.PoseTerm):
+class Range(vg.terms.PoseTerm):
     """A distance from an anchor, by a norm that has no derivative at zero."""
 
     anchor: jax.Array
     distance: jax.Array
 
-    def residual(self, pose: vg.PoseTerm, camera: object) -> jax.Array:
+    def residual(self, pose: vg.terms.PoseTerm, camera: object) -> jax.Array:
         return jnp.linalg.norm(pose.inverse().translation() - self.anchor) - self.distance
 
 
@@ -45,11 +45,11 @@ def ranges(anchor: np.ndarray) -> Problem:
     return PROBLEM.with_term(Range(keyframe=[0, 1, 2], anchor=anchors, distance=distance, weight=[400.0, 400.0, 0.0]))
 
 
-def fixes(offset: float, kernel: vg.AbstractKernel | None = None, sigma: float = 0.02) -> Problem:
+def fixes(offset: float, kernel: vg.kernels.AbstractKernel | None = None, sigma: float = 0.02) -> Problem:
     """A fix on each keyframe, all in a frame that is `offset` metres aside of the held pose's."""
     there = jnp.asarray(CENTRES + np.array([offset, 0.0, 0.0]))
     return PROBLEM.with_term(
-        Fix(keyframe=[0, 1, 2], position=there, weight=jnp.full(3, sigma**-2), kernel=kernel or vg.Square())
+        Fix(keyframe=[0, 1, 2], position=there, weight=jnp.full(3, sigma**-2), kernel=kernel or vg.kernels.Square())
     )
 
 
@@ -126,12 +126,12 @@ def test_a_term_that_its_kernel_rejects_is_named() -> None:
     # Proves that a redescending kernel that drops a term is reported with the share, and that noise is not, nor a
     # kernel that goes on pulling. Oracle: positions a metre off at a stated 2 cm.
     truth = WINDOW.truth()
-    for kernel in (vg.GemanMcClure(1.5), vg.Cauchy(1.5)):
+    for kernel in (vg.kernels.GemanMcClure(1.5), vg.kernels.Cauchy(1.5)):
         found = _diagnosed(fixes(1.0, kernel), truth)
         assert float(found.rejected[-1]) == 1
         assert "`fix` rejects 100%" in said(fixes(1.0, kernel), truth)
         assert "fix" not in said(fixes(0.02, kernel), truth)
-    assert float(_diagnosed(fixes(1.0, vg.Huber(1.5)), truth).rejected[-1]) == 0
+    assert float(_diagnosed(fixes(1.0, vg.kernels.Huber(1.5)), truth).rejected[-1]) == 0
 
 
 def test_a_held_pose_in_another_frame_is_named() -> None:
@@ -148,7 +148,7 @@ def test_a_held_pose_in_another_frame_is_named() -> None:
     assert "1 m" in words
     assert said(fixes(0.005), truth) == ""
     assert said(fixes(1.0, sigma=2.0), truth) == ""  # a metre is noise there
-    relative = vg.RelativePose(
+    relative = vg.terms.RelativePose(
         first=[0],
         second=[1],
         measured=jnp.array([[1.0, 0, 0, 0, 9.0, 0, 0]]),

@@ -27,7 +27,7 @@ FISHEYE = Camera((90.0, 92.0, 79.0, 61.0), 160, 120, COEFFICIENTS, fisheye=True)
 
 def drawn(camera: Camera, rays: np.ndarray) -> np.ndarray:
     """Where the fisheye draws viewing rays [n, 3], pixels [n, 2]."""
-    lens = vg.KannalaBrandt(jnp.asarray([*camera.intrinsics, *camera.distortion]))
+    lens = vg.cameras.KannalaBrandt(jnp.asarray([*camera.intrinsics, *camera.distortion]))
     return np.asarray(jax.vmap(lens.project)(jnp.asarray(rays)))
 
 

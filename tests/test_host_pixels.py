@@ -23,7 +23,7 @@ POINTS, LINES, KEYFRAMES = 6, 2, 3
 def window() -> tuple[Problem, State]:
     """A window with points, two-ends lines, a free camera, and pixel offsets that are not zero."""
     simulated = vg.simulate_window(KEYFRAMES, POINTS, LINES, host_noise=True)
-    problem, state, _ = simulated.pack(fixed_intrinsics=False, intrinsics_sigma=5.0, kernel=vg.Huber(1.5))
+    problem, state, _ = simulated.pack(fixed_intrinsics=False, intrinsics_sigma=5.0, kernel=vg.kernels.Huber(1.5))
     offset = np.random.default_rng(0).normal(0, 0.3, (KEYFRAMES, POINTS, 2))
     return problem, replace(state, pixel_offset=jnp.asarray(offset))
 
@@ -89,7 +89,7 @@ def test_segments_and_triples_stand_beside_each_other():
 
 def test_covariances_are_those_of_a_dense_inverse():
     """Poses and inverse depths, against the inverse of the dense Gauss-Newton matrix over all unknowns."""
-    problem, initial, _ = vg.simulate_window(KEYFRAMES, POINTS, 0, host_noise=True).pack(kernel=vg.Square())
+    problem, initial, _ = vg.simulate_window(KEYFRAMES, POINTS, 0, host_noise=True).pack(kernel=vg.kernels.Square())
     state = vg.solve(problem, initial).state
 
     def residuals(step):
@@ -149,7 +149,7 @@ def test_noise_of_the_host_is_counted():
         seen = replace(made.observations, point_weight=np.full(240, 4.0), alpha=1.0)
         for free, found in nees.items():
             own = replace(made, observations=replace(seen, pixel_sigma=0.5 if free else None))
-            poses, covariance = adjust(*own.pack(kernel=vg.Square())[:2])
+            poses, covariance = adjust(*own.pack(kernel=vg.kernels.Square())[:2])
             truth = own.truth().poses
             error = np.asarray((poses @ truth.inverse()).log())[1:]
             blocks = np.asarray(covariance)[1:]
@@ -162,7 +162,7 @@ def test_noise_of_the_host_is_counted():
 def test_marginalisation_takes_the_pixels_along():
     """The prior that a leaving keyframe leaves, against dense elimination of its unknowns."""
     problem, initial, _ = vg.simulate_window(KEYFRAMES, POINTS, 0, host_noise=True).pack(
-        terms=[vg.no_prior(KEYFRAMES)], kernel=vg.Square()
+        terms=[vg.no_prior(KEYFRAMES)], kernel=vg.kernels.Square()
     )
     state = vg.solve(problem, initial).state
     prior = vg.marginalise(problem, state, jnp.asarray(1))

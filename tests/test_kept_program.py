@@ -137,14 +137,14 @@ def test_a_damaged_file_is_made_anew(folder: Path, content: bytes | None) -> Non
 def test_what_has_no_lasting_name_is_not_kept(folder: Path) -> None:
     """A function made inside a function, and a kernel of a user's own: another process may mean another by it."""
 
-    class Own(vg.AbstractKernel):
+    class Own(vg.kernels.AbstractKernel):
         def rho(self, s: jax.Array) -> jax.Array:
             return s
 
     _expected(KeptProgram(lambda *given: pair(*given[:2], given[2]), _as_pair)(ONE, TWO, 3.0), 3.0)
     assert kept_program._lasting_name(Own()) is None
     assert kept_program._lasting_name((1.0, Own)) is None
-    assert kept_program._lasting_name(vg.Cauchy(1.0)) is not None
+    assert kept_program._lasting_name(vg.kernels.Cauchy(1.0)) is not None
     assert not folder.exists()
 
 

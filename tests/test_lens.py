@@ -37,10 +37,10 @@ WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error
 _solve = eqx.filter_jit(vg.solve)
 
 
-def bent(window: vg.SimulatedWindow, *distortion: float) -> vg.SimulatedWindow:
+def bent(window: vg.data.SimulatedWindow, *distortion: float) -> vg.data.SimulatedWindow:
     """Its key points and matches as a lens draws them."""
-    lens = vg.RadialTangential(jnp.asarray([*window.intrinsics, *distortion, 0.0, 0.0]))
-    straight = vg.Pinhole(jnp.asarray(window.intrinsics))
+    lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *distortion, 0.0, 0.0]))
+    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
     curve = lambda pixels: np.asarray(
         jax.vmap(lambda pixel: lens.project(straight.unproject(pixel)))(jnp.asarray(pixels))
     )
@@ -48,7 +48,7 @@ def bent(window: vg.SimulatedWindow, *distortion: float) -> vg.SimulatedWindow:
     return replace(window, observations=replace(seen, point_target=curve(seen.point_target), pixel=curve(seen.pixel)))
 
 
-def found_in(window: vg.SimulatedWindow, focal: float) -> FoundLens:
+def found_in(window: vg.data.SimulatedWindow, focal: float) -> FoundLens:
     """Adjusted as a pinhole that begins `focal` times too long, as a guess does, then sought."""
     _, _, cx, cy = window.intrinsics
     guess = np.array([focal * window.intrinsics[0], cx, cy])
@@ -162,7 +162,7 @@ def run_of_room() -> Slam:
 
 def redrawn(pixels: np.ndarray) -> np.ndarray:
     """Ideal pixels as the lens draws them: by this package's model, not by OpenCV."""
-    lens = vg.RadialTangential(jnp.asarray([*LENS.intrinsics, *LENS.distortion]))
+    lens = vg.cameras.RadialTangential(jnp.asarray([*LENS.intrinsics, *LENS.distortion]))
     rays = jnp.asarray(pinhole.rays(pixels.reshape(-1, 2), LENS.intrinsics))
     return np.asarray(jax.vmap(lens.project)(rays)).reshape(pixels.shape)
 

@@ -122,7 +122,7 @@ def test_prior_has_its_gradient_by_weights(leaving: int, window: tuple[Problem, 
     def energy(weight: jax.Array) -> jax.Array:
         seen = problem.with_term(problem.points.reweighted(weight))
 
-        def leave(prior: vg.MarginalPrior, number: jax.Array) -> tuple[vg.MarginalPrior, None]:
+        def leave(prior: vg.terms.MarginalPrior, number: jax.Array) -> tuple[vg.terms.MarginalPrior, None]:
             return vg.marginalise(seen.with_term(prior), state, number), None
 
         prior, _ = jax.lax.scan(leave, vg.no_prior(KEYFRAMES), jnp.asarray([leaving, 0]))
@@ -166,7 +166,11 @@ def test_energy_and_residuals_have_their_gradient(window: tuple[Problem, State])
     def total(weight: jax.Array) -> jax.Array:
         seen = problem.with_term(problem.points.reweighted(weight))
         residuals = jnp.where(weight[..., None] > 0, vg.residuals_at(seen, state)["points"], 0.0)
-        return vg.energy(seen, state) + vg.energy_terms(seen, state)["points"] + jnp.sum(weight[..., None] * residuals)
+        return (
+            vg.energy(seen, state)
+            + vg.analysis.energy_terms(seen, state)["points"]
+            + jnp.sum(weight[..., None] * residuals)
+        )
 
     check_by_weight(total, problem.points.weight)
 

@@ -22,7 +22,7 @@ from vggtgeo.simulation import simulate_window
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)
 
 
-class Scaled(vg.AbstractKernel):
+class Scaled(vg.kernels.AbstractKernel):
     """The square with a constant and a slope, as somebody may write a kernel."""
 
     offset: float = 0.0
@@ -32,7 +32,7 @@ class Scaled(vg.AbstractKernel):
         return self.slope * s + self.offset
 
 
-class Height(vg.PoseTerm):
+class Height(vg.terms.PoseTerm):
     """A known height of the camera's centre, metres."""
 
     height: jax.Array
@@ -130,7 +130,7 @@ def test_padding_is_harmless_and_held() -> None:
 def test_dtype_goes_through_everything() -> None:
     # Proves that one argument decides the precision of the whole problem, numbers of a kernel that were given as Python
     # has them too: a problem that was read from a file is no other type, and nothing is compiled twice.
-    problem, state, _ = SCENE.pack(dtype=np.float32, kernel=vg.Huber(1.5))
+    problem, state, _ = SCENE.pack(dtype=np.float32, kernel=vg.kernels.Huber(1.5))
     arrays = [leaf for leaf in jax.tree.leaves((problem, state)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     assert {array.dtype for array in arrays} == {np.dtype(np.float32)}
     assert not any(array.weak_type for array in arrays)
@@ -261,5 +261,5 @@ def test_a_problem_in_which_nothing_is_observed_is_refused() -> None:
         vg.solve(nothing, state)
     solution = jax.jit(vg.solve)(nothing, state)
     assert float(jnp.abs(solution.state.poses.wxyz_xyz - state.poses.wxyz_xyz).max()) == 0.0
-    fix = vg.BaselinePrior(first=[0], second=[1], length=jnp.ones(1), sigma=jnp.ones(1), weight=jnp.ones(1))
+    fix = vg.terms.BaselinePrior(first=[0], second=[1], length=jnp.ones(1), sigma=jnp.ones(1), weight=jnp.ones(1))
     assert float(vg.energy(pack(replace(seen, **zero), *start, terms=[fix])[0], state)) > 0

@@ -34,7 +34,7 @@ def solve(problem: Problem, state: State) -> State:
     return _solve(problem, state).state
 
 
-def rolling(seed: int) -> vg.SimulatedWindow:
+def rolling(seed: int) -> vg.data.SimulatedWindow:
     """A window whose cameras roll by up to 17 degrees either way. On its arc, which is level, any stretch of heights
     is as good as any other: with it the focal length downwards is not known.
     """
@@ -50,10 +50,10 @@ def rolling(seed: int) -> vg.SimulatedWindow:
     return replace(window, observations=seen, start=rigid.to_quaternion(turns @ start))
 
 
-def drawn(window: vg.SimulatedWindow, squeeze: float, *distortion: float) -> vg.SimulatedWindow:
+def drawn(window: vg.data.SimulatedWindow, squeeze: float, *distortion: float) -> vg.data.SimulatedWindow:
     """Its key points and matches as a lens draws them, in images of `squeeze` times the width."""
-    lens = vg.RadialTangential(jnp.asarray([*window.intrinsics, *(distortion or (0.0, 0.0)), 0.0, 0.0]))
-    straight = vg.Pinhole(jnp.asarray(window.intrinsics))
+    lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *(distortion or (0.0, 0.0)), 0.0, 0.0]))
+    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
     bent = lambda pixels: np.asarray(
         jax.vmap(lambda pixel: lens.project(straight.unproject(pixel)))(jnp.asarray(pixels))
     )
@@ -64,7 +64,7 @@ def drawn(window: vg.SimulatedWindow, squeeze: float, *distortion: float) -> vg.
     )
 
 
-def as_square(window: vg.SimulatedWindow, squeeze: float) -> tuple[Problem, State]:
+def as_square(window: vg.data.SimulatedWindow, squeeze: float) -> tuple[Problem, State]:
     """Adjusted with one focal length, which begins as that of the images before they were squeezed."""
     f, _, cx, cy = window.intrinsics
     guess = np.array([f, squeeze * cx, cy])
@@ -75,12 +75,12 @@ def as_square(window: vg.SimulatedWindow, squeeze: float) -> tuple[Problem, Stat
         guess,
         depths,
         intrinsics_sigma=np.full(3, 0.3 * f),
-        camera=vg.SquarePinhole,
+        camera=vg.cameras.SquarePinhole,
     )
     return packed[0], solve(*packed[:2])
 
 
-def found_in(window: vg.SimulatedWindow, squeeze: float) -> FoundAspect:
+def found_in(window: vg.data.SimulatedWindow, squeeze: float) -> FoundAspect:
     found = find_aspect(*as_square(window, squeeze), solve)
     assert found is not None
     return found
@@ -133,7 +133,7 @@ def test_what_ends_in_no_camera_is_none() -> None:
     f, _, cx, cy = window.intrinsics
     depths = 1.0 / window.observations.depth_mean
     problem, state, _ = vg.pack(
-        window.observations, window.start, np.array([f, cx, cy]), depths, camera=vg.SquarePinhole
+        window.observations, window.start, np.array([f, cx, cy]), depths, camera=vg.cameras.SquarePinhole
     )
     for focal in (-1.0, float("nan")):
         ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[1].set(f))
@@ -157,14 +157,14 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(global_adjustment, "can_undistort", lambda slam: False)
     slam = recorded_run().states[-1]
     guess = replace(slam, intrinsics_sigma=np.full(4, 100.0), camera_found=False, pending=None)
-    assert camera_of(guess) is vg.SquarePinhole
+    assert camera_of(guess) is vg.cameras.SquarePinhole
     done = adjust_all(guess, SETTINGS)
     fx, fy, *_ = done.intrinsics
     assert fy / fx == pytest.approx(1.2, rel=0.02)
     assert any("its pixels are not square" in note for note in done.notes)
     assert len(tried) == 1
     again = replace(guess, intrinsics=done.intrinsics, given_intrinsics=done.intrinsics, camera_found=True)
-    assert camera_of(again) is vg.Pinhole
+    assert camera_of(again) is vg.cameras.Pinhole
     adjust_all(again, SETTINGS)
     assert len(tried) == 1
 

@@ -41,7 +41,7 @@ class _Log(vg.Callback):
     def on_begin(self, name: str, total: int | None) -> None:
         self._note(f"begin {name} {total}")
 
-    def on_frame(self, slam: object, frame: vg.Frame) -> None:
+    def on_frame(self, slam: object, frame: vg.data.Frame) -> None:
         self._note(f"frame {frame.index}")
 
     def on_adjust(self, slam: object) -> None:

@@ -21,7 +21,7 @@ WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error
 _solve = eqx.filter_jit(vg.solve)
 
 
-def pairs(window: vg.SimulatedWindow) -> list[CameraPair]:
+def pairs(window: vg.data.SimulatedWindow) -> list[CameraPair]:
     """Every edge of the window, depths as the prior has them."""
     seen, poses = window.observations, rigid.to_matrix(window.start)
     found = []
@@ -34,7 +34,7 @@ def pairs(window: vg.SimulatedWindow) -> list[CameraPair]:
     return found
 
 
-def trial(window: vg.SimulatedWindow, given: np.ndarray) -> Refinement:
+def trial(window: vg.data.SimulatedWindow, given: np.ndarray) -> Refinement:
     """Adjusted with `given` held, then tried."""
     problem, initial, _ = window.pack(
         fixed_intrinsics=False, intrinsics_mean=given, intrinsics_sigma=np.full(4, HELD * given[0])
@@ -81,8 +81,8 @@ def test_a_lens_that_nobody_told_of_is_no_focal_length() -> None:
     # Proves that distortion is found as such, k1 to a tenth, and the focal length beside it to 1 %. Oracle: the lens
     # that the pixels were bent with.
     window = vg.simulate_window(seed=3, **WINDOW)
-    bent = vg.RadialTangential(jnp.asarray([*window.intrinsics, -0.2, 0.0, 0.0, 0.0]))
-    straight = vg.Pinhole(jnp.asarray(window.intrinsics))
+    bent = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, -0.2, 0.0, 0.0, 0.0]))
+    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
     curve = lambda pixels: np.asarray(jax.vmap(lambda pixel: bent.project(straight.unproject(pixel)))(pixels))
     seen = window.observations
     seen = replace(seen, point_target=curve(jnp.asarray(seen.point_target)), pixel=curve(jnp.asarray(seen.pixel)))

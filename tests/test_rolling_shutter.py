@@ -77,7 +77,7 @@ def seen_later(
     return seen
 
 
-def with_readout(motions: np.ndarray, seconds: float, columns: bool = False) -> vg.SimulatedWindow:
+def with_readout(motions: np.ndarray, seconds: float, columns: bool = False) -> vg.data.SimulatedWindow:
     """The window as such a camera sees it: its key points, its matches, and where its lines are matched."""
     seen = WINDOW.observations
     poses = rigid.to_matrix(WINDOW.poses)
@@ -322,7 +322,7 @@ def test_a_run_finds_the_shutter_of_its_camera() -> None:
     sequence = vg.simulate("office", 30, 0, (320, 240), rate=10.0, speed=1.5, sensor=sensor)
     errors = []
     for search in (False, True):
-        settings = vg.SlamSettings(refinement=vg.RefinementSettings(rolling_shutter=search))
+        settings = vg.SlamSettings(refinement=vg.settings.RefinementSettings(rolling_shutter=search))
         result = vg.reconstruct(sequence, settings=settings, dense="none")
         errors.append(result.summary["truth"]["ate_se3_m"]["rmse"])
         assert ("rolling_shutter" in result.summary) == search

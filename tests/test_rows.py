@@ -25,7 +25,7 @@ SPLIT = PaddedSize(4, 5, 4, 3, rows=11)
 """Three rows for each of three keyframes, one for a keyframe that pads, and a spare one."""
 
 
-class NotNear(vg.SlotTerm):
+class NotNear(vg.terms.SlotTerm):
     """A landmark term of a user."""
 
     nearest: jax.Array
@@ -34,12 +34,12 @@ class NotNear(vg.SlotTerm):
         return inverse_depth - self.nearest
 
 
-class Distance(vg.EdgeTerm):
+class Distance(vg.terms.EdgeTerm):
     """An edge term of a user."""
 
     known: jax.Array
 
-    def residual(self, view: vg.View) -> jax.Array:
+    def residual(self, view: vg.terms.View) -> jax.Array:
         return view.point[2] - self.known
 
 
@@ -47,9 +47,9 @@ def packed(size: PaddedSize | None) -> tuple[Problem, State, Any]:
     """The scene, with terms of a user on landmarks and edges."""
     seen = SCENE.observations
     landmark = np.arange(len(seen.host))[::-3].copy()
-    near = vg.FlatTerm(NotNear, {"nearest": 0.3 + 0.01 * landmark, "weight": 1.0 + landmark}, landmark)
+    near = vg.terms.FlatTerm(NotNear, {"nearest": 0.3 + 0.01 * landmark, "weight": 1.0 + landmark}, landmark)
     pairs = seen.point_edge[::2], seen.point_landmark[::2]
-    far = vg.FlatTerm(Distance, {"known": 3.0 + 0.1 * np.arange(len(pairs[0]))}, pairs[1], pairs[0])
+    far = vg.terms.FlatTerm(Distance, {"known": 3.0 + 0.1 * np.arange(len(pairs[0]))}, pairs[1], pairs[0])
     return SCENE.pack(size=size, terms=[near, far])
 
 
@@ -74,8 +74,8 @@ def test_the_solution_does_not_depend_on_the_rows(solutions: tuple[vg.Solution, 
     assert bool(whole.converged)
     assert float(whole.energy) < 0.6 * float(whole.history[0])
     np.testing.assert_allclose(rows.history, whole.history, rtol=1e-9)
-    for name, value in vg.energy_terms(WHOLE[0], WHOLE[1]).items():
-        assert float(vg.energy_terms(ROWS[0], ROWS[1])[name]) == pytest.approx(float(value), rel=1e-12), name
+    for name, value in vg.analysis.energy_terms(WHOLE[0], WHOLE[1]).items():
+        assert float(vg.analysis.energy_terms(ROWS[0], ROWS[1])[name]) == pytest.approx(float(value), rel=1e-12), name
     np.testing.assert_allclose(rows.state.poses.wxyz_xyz, whole.state.poses.wxyz_xyz, atol=1e-9)
     gathered = [index.gather(s.state.inverse_depth) for (_, _, index), s in zip((WHOLE, ROWS), solutions, strict=True)]
     np.testing.assert_allclose(gathered[1], gathered[0], rtol=1e-8)
@@ -149,9 +149,9 @@ def test_derivatives_do_not_depend_on_the_rows() -> None:
     np.testing.assert_allclose(squared[1], squared[0], rtol=1e-7, atol=1e-6 * float(jnp.abs(squared[0]).max()))
 
 
-def _with_target(problem: Problem, target: jax.Array) -> vg.PointTerm:
+def _with_target(problem: Problem, target: jax.Array) -> vg.terms.PointTerm:
     points = problem.points
-    return vg.PointTerm(target=target, weight=points.weight, kernel=points.kernel, first_slot=points.first_slot)
+    return vg.terms.PointTerm(target=target, weight=points.weight, kernel=points.kernel, first_slot=points.first_slot)
 
 
 def test_a_saved_problem_keeps_its_rows(tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_pack_chooses_rows_by_itself() -> None:
     whole = int(np.bincount(own.host).max())
     one, first, _ = vg.pack(own, *start, size=PaddedSize(3, whole, 0, 2))
     assert float(vg.energy(problem, initial)) == pytest.approx(float(vg.energy(one, first)), rel=1e-12)
-    problems, initials, _ = vg.pack_batch([(own, *start), (seen, *start[:2], rich.start_inverse_depth)])
+    problems, initials, _ = vg.batches.pack_batch([(own, *start), (seen, *start[:2], rich.start_inverse_depth)])
     energies = jax.vmap(vg.energy)(problems, initials)
     assert float(energies[0]) == pytest.approx(float(vg.energy(one, first)), rel=1e-12)
     for size in (PaddedSize(3, 5, 0, 2, rows=4), PaddedSize(3, 0, 0, 2, rows=99), PaddedSize(3, 5, 0, 2)):

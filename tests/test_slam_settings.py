@@ -112,7 +112,7 @@ def test_a_group_in_its_place(group: str) -> None:
 
 def test_settings_that_do_not_fit_each_other_are_refused() -> None:
     """Slots that are no multiple of a segment's samples are refused where segments have two unknowns only."""
-    assert vg.SlamSettings(window=vg.WindowSettings(line_slots=100)).padded_samples is None
+    assert vg.SlamSettings(window=vg.settings.WindowSettings(line_slots=100)).padded_samples is None
     with pytest.raises(vg.InputError, match=r"`window.line_slots` is 100; with `line.two_ends_lines` it must be a mul"):
         updated(vg.SlamSettings(), {"window": {"line_slots": 100}, "line": {"two_ends_lines": True}})
 
@@ -182,5 +182,5 @@ def test_who_wins(table: dict, given: bool, assignments: tuple[str, ...], expect
     in_use = SimpleNamespace(tables=table, on_command_line=lambda name: given)
     settings = pipeline_settings(in_use, assignments, {"lines": {"line": {"use_lines": False}}})
     assert settings == dataclasses.replace(
-        vg.SlamSettings(), window=settings.window, line=vg.LineSettings(use_lines=expected)
+        vg.SlamSettings(), window=settings.window, line=vg.settings.LineSettings(use_lines=expected)
     )

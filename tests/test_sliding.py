@@ -19,19 +19,21 @@ KEYFRAMES, WINDOWS = 4, 5
 Windows = tuple[Problem, State]
 
 
-def long_window(**options: Any) -> vg.SimulatedWindow:
+def long_window(**options: Any) -> vg.data.SimulatedWindow:
     """All that any of the windows sees."""
     return vg.simulate_window(KEYFRAMES + WINDOWS - 1, points=8, lines=1, **{"noise": 0.5, "seed": 3, **options})
 
 
-def stacked(seen: vg.SimulatedWindow, windows: Sequence[int] = range(WINDOWS), **options: Any) -> Windows:
+def stacked(seen: vg.data.SimulatedWindow, windows: Sequence[int] = range(WINDOWS), **options: Any) -> Windows:
     """The windows from keyframe k on, stacked, each with an empty prior."""
     parts = []
     for first in windows:
         inside = range(first, first + KEYFRAMES)
         own = seen.observations.within(inside)
         parts.append((own, seen.start[list(inside)], seen.intrinsics, own.depth_mean))
-    problems, initials, _ = vg.pack_batch(parts, terms=[vg.no_prior(KEYFRAMES)], **{"intrinsics_sigma": 3.0, **options})
+    problems, initials, _ = vg.batches.pack_batch(
+        parts, terms=[vg.no_prior(KEYFRAMES)], **{"intrinsics_sigma": 3.0, **options}
+    )
     return problems, initials
 
 
@@ -47,7 +49,7 @@ def test_the_observations_within_some_keyframes_are_theirs() -> None:
     own = whole.observations.within(chosen)
     hosted = np.isin(whole.observations.host, chosen)
     problem, state, _ = vg.pack(own, whole.poses[chosen], whole.intrinsics, whole.inverse_depth[hosted])
-    sizes = vg.residual_sizes(problem, state)
+    sizes = vg.analysis.residual_sizes(problem, state)
     assert float(sizes.rms["points"]) < 1e-9
     assert float(sizes.rms["lines"]) < 1e-9
     assert int(sizes.count["points"]) == 3 * 2 * 8

@@ -155,7 +155,7 @@ def test_of_a_stream_it_is_told(count: int, every: int) -> None:
         picture = pictures[row % 19].copy()
         if row % every == 0:
             text(picture)
-        search.on_frame(slam, vg.Frame(row, row / 30, picture, None, str(row)))
+        search.on_frame(slam, vg.data.Frame(row, row / 30, picture, None, str(row)))
     assert len(search._pictures) <= 40
     found = [finding.text for finding in search.findings()]
     assert search.found is None
@@ -231,7 +231,7 @@ def test_nothing_is_looked_for_there(matcher: SiftMatcher | OrbMatcher) -> None:
     recorder = EvidenceRecorder(CAMERA)
     recorder.leave_out(mask)
     for row, image in enumerate(moving(3, (3, 2))):
-        recorder.add(vg.Frame(row, row / 15, image, None, str(row)))
+        recorder.add(vg.data.Frame(row, row / 15, image, None, str(row)))
     assert all(len(frame.ids) > 20 for frame in recorder.frames)
     for frame in recorder.frames:
         assert not mask[tuple(np.rint(frame.pixels).astype(int).T[::-1])].any()
@@ -292,7 +292,7 @@ def test_a_run_with_text_in_the_picture_is_as_good_as_one_without(tmp_path: Path
     with pytest.warns(InputWarning, match="% of the picture stays in its place while the rest moves"):
         result = vg.reconstruct(tmp_path / "room", dense="none")
     assert 0.1 < result.summary["still_parts"] < 0.35
-    off = vg.SlamSettings(camera=vg.CameraSettings(still_parts=False))
+    off = vg.SlamSettings(camera=vg.settings.CameraSettings(still_parts=False))
     without = vg.reconstruct(tmp_path / "room", settings=off, dense="none")
     assert "still_parts" not in without.summary
     errors = [run.summary["truth"]["ate_se3_m"]["rmse"] for run in (result, without)]

@@ -57,7 +57,7 @@ def test_a_small_weight_has_the_derivative_that_a_weight_of_0_lacks() -> None:
     has that one-sided slope. Oracle: a one-sided difference.
     """
     window = vg.simulate_window(2, points=3, lines=0)
-    problem, initial, _ = window.pack(kernel=vg.Square())
+    problem, initial, _ = window.pack(kernel=vg.kernels.Square())
     energy = jax.jit(lambda weight: vg.energy(problem.with_term(problem.points.reweighted(weight)), initial))
     absent = problem.points.weight.at[0, 0].set(0.0)
     slope = float((energy(absent.at[0, 0].set(1e-3)) - energy(absent)) / 1e-3)
@@ -97,7 +97,7 @@ def test_padding_changes_neither_energy_nor_gradient(packed) -> None:
     assert float(energy_terms(missing, larger)["position_fix"]) < float(energy_terms(roomy, larger)["position_fix"])
 
 
-energy_terms = eqx.filter_jit(vg.energy_terms)
+energy_terms = eqx.filter_jit(vg.analysis.energy_terms)
 
 
 def test_a_prior_of_more_keyframes_says_nothing_about_them() -> None:
@@ -183,7 +183,7 @@ def test_a_batch_of_windows_with_different_terms(packed) -> None:
     )
     window = (SCENE.observations, SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth)
     lists = [[fix, wheels, planes], [one, some], []]
-    problems, states, _ = vg.pack_batch([(*window, terms) for terms in lists], intrinsics_sigma=5.0)
+    problems, states, _ = vg.batches.pack_batch([(*window, terms) for terms in lists], intrinsics_sigma=5.0)
     assert problems.position_fix.weight.shape == (3, 2)
     found, gradients = jax.vmap(energy_and_gradient)(problems, states)
     for number, terms in enumerate(lists):

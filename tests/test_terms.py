@@ -79,9 +79,13 @@ def used(model: Any) -> tuple[jax.Array, jax.Array]:
 @pytest.mark.long
 @pytest.mark.parametrize(  # one kind of kernel, so that it is compiled once
     ("shape", "camera"),
-    [(1.0, vg.Pinhole), (-2.0, vg.Pinhole), pytest.param(1.0, vg.SquarePinhole, marks=pytest.mark.slow)],
+    [
+        (1.0, vg.cameras.Pinhole),
+        (-2.0, vg.cameras.Pinhole),
+        pytest.param(1.0, vg.cameras.SquarePinhole, marks=pytest.mark.slow),
+    ],
 )
-def test_what_is_written_by_hand_is_what_is_derived(shape: float, camera: type[vg.AbstractCamera]) -> None:
+def test_what_is_written_by_hand_is_what_is_derived(shape: float, camera: type[vg.cameras.AbstractCamera]) -> None:
     # Proves energy, columns (with and without a correction), gradient and exact model of points and lines, outliers,
     # absent matches and a landmark behind its target included, with two focal lengths and with one. Oracle: automatic
     # differentiation of the residual.
@@ -114,7 +118,7 @@ def test_the_prior_of_marginalisation_is_what_is_derived() -> None:
             assert oracle.gap(found, expected) < 1e-12
 
 
-class LogDepth(vg.SlotTerm):
+class LogDepth(vg.terms.SlotTerm):
     """A slot's term that a user might write."""
 
     log: Float[Array, "n s"]
@@ -123,31 +127,31 @@ class LogDepth(vg.SlotTerm):
         return 10 * (jnp.log(inverse_depth) - self.log)
 
 
-class Epipolar(vg.EdgeTerm):
+class Epipolar(vg.terms.EdgeTerm):
     """An edge's term with data of every shape: the distance of the pixel seen from the epipolar line."""
 
     target: Float[Array, "e p 2"]
 
-    def residual(self, view: vg.View) -> Float[Array, ""]:
+    def residual(self, view: vg.terms.View) -> Float[Array, ""]:
         line = jnp.cross(view.relative.translation(), view.relative.rotation().as_matrix() @ view.ray)
         off = view.camera.unproject(self.target) @ line
         return 300 * off / jnp.sqrt(line[0] ** 2 + line[1] ** 2 + 1e-6) + view.inverse_depth
 
 
-class SquarePixels(vg.CameraTerm):
+class SquarePixels(vg.terms.CameraTerm):
     """A camera's term: both focal lengths are nearly one."""
 
     def residual(self, parameters: Float[Array, " q"]) -> Float[Array, ""]:
         return jnp.log(parameters[0] / parameters[1]) * 50
 
 
-class Sighting(vg.PoseTerm):
+class Sighting(vg.terms.PoseTerm):
     """A term on a pose and the camera: a known place and where it was seen."""
 
     place: Float[Array, "m 3"]
     pixel: Float[Array, "m 2"]
 
-    def residual(self, pose: jaxlie.SE3, camera: vg.AbstractCamera) -> Float[Array, "2"]:
+    def residual(self, pose: jaxlie.SE3, camera: vg.cameras.AbstractCamera) -> Float[Array, "2"]:
         return camera.project(pose @ self.place) - self.pixel
 
 
@@ -155,7 +159,7 @@ def turn(*vector: float) -> np.ndarray:
     return Rotation.from_rotvec(vector).as_matrix()
 
 
-def made(kind: str, problem: vg.Problem, state: vg.State) -> vg.AbstractTerm:
+def made(kind: str, problem: vg.Problem, state: vg.State) -> vg.terms.AbstractTerm:
     """A term of some kind, about keyframes 0 to 2, some distance from its optimum."""
     kernel, information = Cauchy(2.0), np.diag([400.0, 300.0, 500.0, 4e3, 3e3, 5e3])
     information[0, 4] = information[4, 0] = 500.0
@@ -263,7 +267,7 @@ def test_a_quadratic_becomes_a_measured_pose() -> None:
     hessian, gradient = root.T @ root, root.T @ rng.normal(size=5) * 1e-3
     at = jaxlie.SE3.exp(jnp.asarray(rng.normal(0, 0.5, 6)))
     measured, found = quadratic(at.wxyz_xyz[None], jnp.asarray(hessian)[None], jnp.asarray(gradient)[None])
-    term = vg.RelativePose(first=[0], second=[1], measured=measured, root=found, weight=jnp.ones(1)).holding(
+    term = vg.terms.RelativePose(first=[0], second=[1], measured=measured, root=found, weight=jnp.ones(1)).holding(
         {"measured": measured[0], "root": found[0]}
     )
     energy = jax.jit(lambda eta: 0.5 * jnp.sum(term.residual(jaxlie.SE3.identity(), jaxlie.SE3.exp(eta) @ at) ** 2))
@@ -290,12 +294,12 @@ def test_a_written_residual_is_solved() -> None:
     np.testing.assert_allclose(found.state.poses.wxyz_xyz, truth, atol=1e-6)
 
 
-class Fix(vg.PoseTerm):
+class Fix(vg.terms.PoseTerm):
     """Position of a camera."""
 
     position: jax.Array
 
-    def residual(self, pose: jaxlie.SE3, camera: vg.AbstractCamera) -> jax.Array:
+    def residual(self, pose: jaxlie.SE3, camera: vg.cameras.AbstractCamera) -> jax.Array:
         return pose.inverse().translation() - self.position
 
 
@@ -316,7 +320,7 @@ def test_a_second_list_of_one_class_does_not_take_the_place_of_the_first() -> No
         one.with_term(second)
     with pytest.raises(vg.InputError, match=r"`terms` holds a second term `fix`.*`name`"):
         SCENE.pack(terms=[first, second])
-    size = lambda problem, name: float(vg.energy_terms(problem, initial)[name])
+    size = lambda problem, name: float(vg.analysis.energy_terms(problem, initial)[name])
     replaced = one.with_term(second, replace=True)
     assert len(replaced.terms) == len(one.terms)
     assert size(replaced, "fix") != size(one, "fix")

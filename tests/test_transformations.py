@@ -43,15 +43,15 @@ def solved(share: jax.Array) -> vg.Solution:
 
 
 def reordered(share: jax.Array) -> jax.Array:
-    prior = vg.MarginalPrior(**{**vars(PROBLEM.marginal), "root": share * jnp.eye(16)})
+    prior = vg.terms.MarginalPrior(**{**vars(PROBLEM.marginal), "root": share * jnp.eye(16)})
     return jnp.sum(vg.reorder(prior, np.array([1, -1])).root ** 2)
 
 
 FUNCTIONS: dict[str, Function] = {
     "`energy`": lambda x: vg.energy(weighted(x), STATE),
-    "`energy_terms`": lambda x: vg.energy_terms(weighted(x), STATE)["points"],
+    "`energy_terms`": lambda x: vg.analysis.energy_terms(weighted(x), STATE)["points"],
     "`residuals_at`": lambda x: jnp.sum(vg.residuals_at(PROBLEM, STATE.moved(x * STEPS))["points"] ** 2),
-    "`residual_sizes(...).rms`": lambda x: vg.residual_sizes(weighted(x), STATE).rms["points"],
+    "`residual_sizes(...).rms`": lambda x: vg.analysis.residual_sizes(weighted(x), STATE).rms["points"],
     "`covariances(...).poses`": lambda x: jnp.sum(jnp.log(jnp.diag(vg.covariances(weighted(x), STATE).poses[1]))),
     "`observability(...).whole.values`": lambda x: jnp.sum(vg.observability(weighted(x), STATE).whole.values[0, :2]),
     "`marginalise(...).root`": prior_left,

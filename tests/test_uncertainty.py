@@ -191,21 +191,21 @@ def test_errors_have_the_covariance_claimed(delta: float, low: float) -> None:
     assert low < means["variance factor"] < 1.03
 
 
-class Aspect(vg.CameraTerm):
+class Aspect(vg.terms.CameraTerm):
     """A term of the camera that the package does not know."""
 
     def residual(self, parameters):
         return parameters[0] / parameters[1] - 1
 
 
-class Centre(vg.PoseTerm):
+class Centre(vg.terms.PoseTerm):
     """A known camera centre."""
 
     def residual(self, pose, camera):
         return pose.inverse().translation()
 
 
-class Sight(vg.PoseTerm):
+class Sight(vg.terms.PoseTerm):
     """A landmark at a known place, seen by the camera."""
 
     def residual(self, pose, camera):
@@ -229,5 +229,5 @@ def test_what_speaks_of_held_unknowns_alone_is_no_redundancy() -> None:
     held = eqx.tree_at(lambda p: p.fixed_intrinsics, problem, jnp.ones(4, bool))
     assert kept(Sight(keyframe=every, weight=one), held) == [0.0, 1.0, 1.0]
     both = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[1].set(True))
-    pair = vg.BaselinePrior(first=[0, 0], second=[1, 2], length=one[:2], sigma=one[:2], weight=one[:2])
+    pair = vg.terms.BaselinePrior(first=[0, 0], second=[1, 2], length=one[:2], sigma=one[:2], weight=one[:2])
     assert kept(pair, both) == [0.0, 1.0]

@@ -17,7 +17,7 @@ import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 
 
-class PositionFix(vg.PoseTerm):
+class PositionFix(vg.terms.PoseTerm):
     """A measured camera centre, as GPS gives it."""
 
     position: jax.Array  # [m, 3], metres
@@ -26,7 +26,7 @@ class PositionFix(vg.PoseTerm):
         return pose.inverse().translation() - self.position
 
 
-class StepOfWheels(vg.PairTerm):
+class StepOfWheels(vg.terms.PairTerm):
     """A measured motion between two keyframes."""
 
     measured: jax.Array  # [m, 3], metres, in the second camera
@@ -35,7 +35,7 @@ class StepOfWheels(vg.PairTerm):
         return (second @ first.inverse()).translation() - self.measured
 
 
-class PointToPlane(vg.EdgeTerm):
+class PointToPlane(vg.terms.EdgeTerm):
     """A landmark that lies on a plane known in the target camera."""
 
     normal: jax.Array  # [e, s, 3]
@@ -45,7 +45,7 @@ class PointToPlane(vg.EdgeTerm):
         return self.normal @ view.point - self.distance
 
 
-class LogCosh(vg.AbstractKernel):
+class LogCosh(vg.kernels.AbstractKernel):
     """A kernel of one's own: only `rho` is needed."""
 
     def rho(self, s):
@@ -57,7 +57,7 @@ SCENE = make_scene(3, 6, 1, 2, noise=0.5, depth_error=0.05, seed=6)
 SOLVER = vg.SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
 
 
-def own_terms() -> list[vg.AbstractTerm | vg.FlatTerm]:
+def own_terms() -> list[vg.terms.AbstractTerm | vg.terms.FlatTerm]:
     """One term of each kind above, exact at the truth."""
     _, truth, _ = SCENE.at_truth()
     centres = truth.poses.inverse().translation()
@@ -76,7 +76,7 @@ def own_terms() -> list[vg.AbstractTerm | vg.FlatTerm]:
     return [
         PositionFix(keyframe=[1, 2], position=centres[1:], weight=jnp.full(2, 1e6), kernel=LogCosh()),
         StepOfWheels(first=[0], second=[1], measured=step[None], weight=jnp.full(1, 1e5)),
-        vg.FlatTerm(PointToPlane, planes, landmark, edge),
+        vg.terms.FlatTerm(PointToPlane, planes, landmark, edge),
     ]
 
 
@@ -173,7 +173,7 @@ def test_own_terms_are_known_everywhere(own, solved) -> None:
     less_known = without(problem, "position_fix")
     sigma = lambda p: np.sqrt(np.trace(np.asarray(known(p, solved.state).poses)[2, :3, :3]))
     assert sigma(problem) < 0.9 * sigma(less_known)
-    sizes = eqx.filter_jit(vg.residual_sizes)(problem, solved.state)
+    sizes = eqx.filter_jit(vg.analysis.residual_sizes)(problem, solved.state)
     assert int(sizes.count["position_fix"]) == 2
     assert "position_fix" in str(sizes)
     found = eqx.filter_jit(vg.observability)(problem, solved.state)

@@ -9,7 +9,7 @@ from test_user_terms import SCENE, PointToPlane, PositionFix, StepOfWheels
 import vggtgeo as vg
 
 
-class SquarePixels(vg.CameraTerm):
+class SquarePixels(vg.terms.CameraTerm):
     """Both focal lengths are one."""
 
     def residual(self, parameters: jax.Array) -> jax.Array:
@@ -35,12 +35,12 @@ def test_one_number_is_the_weight_of_each_observation(kind: str, given: dict[str
     count = 1 if kind == "camera" else 2
     listed = KINDS[kind](weight=jnp.full(count, given.get("weight", 1.0)))
     name, short = listed.name, KINDS[kind](**given)
-    expected = vg.energy_terms(problem.with_term(listed), initial)[name]
+    expected = vg.analysis.energy_terms(problem.with_term(listed), initial)[name]
     assert float(expected) > 0
     packed, start, _ = SCENE.pack(terms=[short])
     for found, state in ((problem.with_term(short), initial), (packed, start)):
         assert getattr(found, name).weight.shape == (count,)
-        assert float(vg.energy_terms(found, state)[name]) == pytest.approx(float(expected), rel=1e-12)
+        assert float(vg.analysis.energy_terms(found, state)[name]) == pytest.approx(float(expected), rel=1e-12)
 
 
 def test_one_number_is_the_weight_of_each_row_of_a_flat_term() -> None:
@@ -48,7 +48,7 @@ def test_one_number_is_the_weight_of_each_row_of_a_flat_term() -> None:
     rows = {"normal": np.tile([0.0, 0.0, 1.0], (3, 1)), "distance": np.full(3, 2.0)}
     at = {"landmark": SCENE.observations.point_landmark[:3], "edge": SCENE.observations.point_edge[:3]}
     one, listed = (
-        SCENE.pack(terms=[vg.FlatTerm(PointToPlane, {**rows, "weight": weight}, **at)])[0].point_to_plane.weight
+        SCENE.pack(terms=[vg.terms.FlatTerm(PointToPlane, {**rows, "weight": weight}, **at)])[0].point_to_plane.weight
         for weight in (2.0, np.full(3, 2.0))
     )
     assert float(one.sum()) == 6.0

@@ -16,7 +16,7 @@ SIZE = vg.PaddedSize(keyframes=3, points=16, lines=0, degree=2)
 COUNT = 7
 
 
-def _window(seed: int) -> vg.SimulatedWindow:
+def _window(seed: int) -> vg.data.SimulatedWindow:
     return vg.simulate_window(3, points=8 + seed % 3, lines=0, seed=seed)
 
 
@@ -86,7 +86,7 @@ def test_only_two_batches_are_read_ahead(folder: Path, monkeypatch: pytest.Monke
 def test_a_batch_can_be_solved(folder: Path) -> None:
     # Proves that a batch is what `solve_batch` takes. Oracle: energies fall, and poses come nearer to the labels.
     batch = next(WindowDataset.open(folder).batches(2, seed=0))
-    solution = jax.jit(vg.solve_batch)(batch.problem, batch.initial)
+    solution = jax.jit(vg.batches.solve_batch)(batch.problem, batch.initial)
     off = lambda state: np.linalg.norm(np.asarray(state.poses.wxyz_xyz)[..., 4:] - batch.labels["poses"][..., 4:])
     assert off(solution.state) < 0.5 * off(batch.initial)
 
@@ -111,11 +111,11 @@ import jax
 import vggtgeo as vg
 
 warnings.simplefilter("ignore")  # JAX's own about forks
-data = vg.WindowDataset.open(sys.argv[1])
+data = vg.learning.WindowDataset.open(sys.argv[1])
 jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((500, 500))))
 
 def read(row):
-    return vg.stack_windows([data[row], data[row + 1]]).labels["seed"].tolist()
+    return vg.learning.stack_windows([data[row], data[row + 1]]).labels["seed"].tolist()
 
 with multiprocessing.get_context("fork").Pool(2) as pool:
     print(pool.map_async(read, range(4)).get(30))
@@ -162,8 +162,8 @@ def test_the_windows_of_a_run(tmp_path: Path) -> None:
     # Proves that every window that a run adjusts is stored, and solves to what the run made of it. Oracle: the energy
     # that the run reports.
     settings = vg.SlamSettings(
-        window=vg.WindowSettings(size=3, point_slots=32, line_slots=12),
-        refinement=vg.RefinementSettings(global_adjustment=False),
+        window=vg.settings.WindowSettings(size=3, point_slots=32, line_slots=12),
+        refinement=vg.settings.RefinementSettings(global_adjustment=False),
     )
     sequence = vg.simulate("room", 20, size=(160, 120), rate=4.0)
     with WindowWriter(tmp_path) as writer:

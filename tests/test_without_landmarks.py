@@ -14,7 +14,7 @@ from vggtgeo.bundle.linearise import scale_direction
 from vggtgeo.bundle.problem import Problem, State
 
 
-class Epipolar(vg.PairTerm):
+class Epipolar(vg.terms.PairTerm):
     """A match as a constraint on two poses, which the length of the baseline does not enter."""
 
     host: jax.Array
@@ -98,7 +98,7 @@ def test_a_scale_that_a_baseline_fixes_is_not_held(solved: tuple[Problem, State,
     problem, state, _ = solved
     centres = np.asarray(state.poses.inverse().translation())
     length, sigma = np.linalg.norm(centres[1] - centres[0]), 0.3
-    known = vg.BaselinePrior(
+    known = vg.terms.BaselinePrior(
         first=[0], second=[1], length=jnp.array([length]), sigma=jnp.array([sigma]), weight=jnp.ones(1)
     )
     found = np.asarray(vg.covariances(problem.with_term(known), state).poses[1])[:3, :3]

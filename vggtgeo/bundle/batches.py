@@ -48,7 +48,7 @@ def pack_batch(
     Example:
         >>> seen = [vg.simulate_window(keyframes) for keyframes in (2, 3)]
         >>> windows = [(w.observations, w.start, w.intrinsics, w.observations.depth_mean) for w in seen]
-        >>> problems, states, indices = vg.pack_batch(windows, fixed_intrinsics=True)
+        >>> problems, states, indices = vg.batches.pack_batch(windows, fixed_intrinsics=True)
         >>> states.intrinsics.shape, len(indices)
         ((2, 4), 2)
 
@@ -137,7 +137,7 @@ def solve_batch(
 
     Example:
         >>> twice = jax.tree.map(lambda leaf: jax.numpy.stack([leaf, leaf]), (problem, initial))
-        >>> solutions = jax.jit(vg.solve_batch)(*twice)
+        >>> solutions = jax.jit(vg.batches.solve_batch)(*twice)
         >>> solutions.energy.shape
         (2,)
 
@@ -145,7 +145,7 @@ def solve_batch(
     check_kinds(problems, initials, "initials")
     if jnp.ndim(initials.inverse_depth) != 3:
         raise InputError(
-            "`initials` has no axis of windows; give what `vggtgeo.pack_batch` makes, or use `vggtgeo.solve`"
+            "`initials` has no axis of windows; give what `vggtgeo.batches.pack_batch` makes, or use `vggtgeo.solve`"
         )
     count = len(initials.intrinsics)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((problems, initials))}
@@ -153,7 +153,7 @@ def solve_batch(
         found = ", ".join(str(length[0]) if length else "none" for length in sorted(lengths))
         raise InputError(
             f"the arrays of `problems` and `initials` have different numbers of windows ({found}); give both as "
-            "`vggtgeo.pack_batch` makes them"
+            "`vggtgeo.batches.pack_batch` makes them"
         )
     if at_once is not None:
         check_whole("at_once", at_once, 1)

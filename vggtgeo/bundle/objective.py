@@ -48,7 +48,7 @@ def energy_terms(problem: Problem, state: State) -> dict[str, Float[Array, ""]]:
     """The energy of each term at `state`, by its name.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
-        >>> terms = jax.jit(vg.energy_terms)(problem, solution.state)
+        >>> terms = jax.jit(vg.analysis.energy_terms)(problem, solution.state)
         >>> bool(terms["lines"] < terms["points"])
         True
 

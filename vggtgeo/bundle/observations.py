@@ -149,14 +149,14 @@ class FlatTerm:
 
     Example: each landmark that keyframe 0 hosts lies on a plane that is known in keyframe 1.
         >>> import numpy as np, vggtgeo as vg
-        >>> class PointToPlane(vg.EdgeTerm):
+        >>> class PointToPlane(vg.terms.EdgeTerm):
         ...     normal: jax.Array
         ...     distance: jax.Array
         ...     def residual(self, view):
         ...         return self.normal @ view.point - self.distance
         >>> window = vg.simulate_window(keyframes=3, points=10, lines=1)
         >>> fields = dict(normal=np.tile([0.0, 0.0, 1.0], (10, 1)), distance=np.full(10, 3.0))
-        >>> planes = vg.FlatTerm(PointToPlane, fields, landmark=np.arange(10), edge=np.zeros(10, int))
+        >>> planes = vg.terms.FlatTerm(PointToPlane, fields, landmark=np.arange(10), edge=np.zeros(10, int))
         >>> window.pack(terms=[planes])[0].point_to_plane.normal.shape  # edges, slots, entries
         (6, 14, 3)
 

@@ -206,7 +206,9 @@ def _check_shapes(observations: Observations, poses: np.ndarray) -> None:
 def check_intrinsics(camera: Any, intrinsics: np.ndarray, camera_of: np.ndarray | None, keyframes: int) -> None:
     """As many parameters as the model has, positive focal lengths, a camera for each keyframe."""
     if not (isinstance(camera, type) and issubclass(camera, AbstractCamera)):
-        raise InputError(f"`camera` is {camera!r:.60}; expected a camera's class, as `vggtgeo.RadialTangential`")
+        raise InputError(
+            f"`camera` is {camera!r:.60}; expected a camera's class, as `vggtgeo.cameras.RadialTangential`"
+        )
     names, cameras = ", ".join(camera.names), "" if camera_of is None else "g, "
     if intrinsics.ndim != 1 + (camera_of is not None) or intrinsics.shape[-1] != len(camera.names):
         raise InputError(

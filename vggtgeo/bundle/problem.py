@@ -189,7 +189,7 @@ class Problem(eqx.Module):
 
         Example: two receivers, each with measurements of its own.
             >>> import jax.numpy as jnp
-            >>> class PositionFix(vg.PoseTerm):
+            >>> class PositionFix(vg.terms.PoseTerm):
             ...     position: jnp.ndarray
             ...     def residual(self, pose, camera):
             ...         return pose.inverse().translation() - self.position
@@ -200,7 +200,7 @@ class Problem(eqx.Module):
             ['position_fix', 'second_fix']
 
         """
-        check_kind("term", term, AbstractTerm, "a term, such as `vggtgeo.PointTerm`")
+        check_kind("term", term, AbstractTerm, "a term, such as `vggtgeo.terms.PointTerm`")
         term = term.broadcast()
         if isinstance(term, EdgeTerm | SlotTerm):
             rows = self.edges.source.shape if isinstance(term, EdgeTerm) else self.pixels.shape[:-2]
@@ -233,7 +233,7 @@ class Problem(eqx.Module):
         """
         check_kind("terms", terms, tuple, "a tuple of terms")
         for term in terms:
-            check_kind("terms", term, AbstractTerm, "terms in it, such as `vggtgeo.PointTerm`")
+            check_kind("terms", term, AbstractTerm, "terms in it, such as `vggtgeo.terms.PointTerm`")
         return eqx.tree_at(lambda problem: problem.terms, self, terms)
 
     @property

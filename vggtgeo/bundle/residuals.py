@@ -36,7 +36,7 @@ class ResidualSizes(Readable):
     """Root mean square of each term's residuals, weighted as its robust kernel weighs them; NaN where a term has none.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
-        >>> sizes = jax.jit(vg.residual_sizes)(problem, solution.state)
+        >>> sizes = jax.jit(vg.analysis.residual_sizes)(problem, solution.state)
         >>> int(sizes.count["points"])
         240
 
@@ -73,7 +73,7 @@ def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
         >>> import jax, vggtgeo as vg
         >>> window = vg.simulate_window(noise=0.5)
         >>> problem, initial, _ = window.pack()
-        >>> print(jax.jit(vg.residual_sizes)(problem.without_term("intrinsics_prior"), window.truth()))
+        >>> print(jax.jit(vg.analysis.residual_sizes)(problem.without_term("intrinsics_prior"), window.truth()))
         points 0.65 px (240), lines 0.43 px (144), depth 0.71 sigma (128), host_pixels 0.79 px (80)
 
     """

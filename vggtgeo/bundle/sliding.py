@@ -62,7 +62,7 @@ def slide(
         >>> windows = [(seen, long.start[k : k + 3], long.intrinsics, seen.depth_mean) for k, seen in enumerate(parts)]
         >>> (first, second), (start, guess) = (
         ...     [jax.tree.map(lambda leaf: leaf[k], tree) for k in (0, 1)]
-        ...     for tree in vg.pack_batch(windows, terms=[vg.no_prior(3)], fixed_intrinsics=True)[:2]
+        ...     for tree in vg.batches.pack_batch(windows, terms=[vg.no_prior(3)], fixed_intrinsics=True)[:2]
         ... )
         >>> problem, initial = vg.slide(first, vg.solve(first, start).state, second, guess)
         >>> bool(vg.solve(problem, initial).converged), problem.fixed_pose.tolist()
@@ -110,7 +110,8 @@ def _check_alike(problem: Problem, following: Problem) -> None:
             for window in (following, problem)
         )
         raise InputError(
-            f"`next_problem` has {found}, `problem` {wanted}; pack all windows to one shape with `vggtgeo.pack_batch`"
+            f"`next_problem` has {found}, `problem` {wanted}; "
+            "pack all windows to one shape with `vggtgeo.batches.pack_batch`"
         )
     if following.camera is not problem.camera:
         raise InputError(

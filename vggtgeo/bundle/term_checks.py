@@ -28,12 +28,14 @@ _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsP
 
 def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int) -> list[AbstractTerm | FlatTerm]:
     """Terms of different names, with weights that are weights and indices that exist; a weight for each observation."""
-    check_kind("terms", terms, (list, tuple), "a list of terms, as `[vggtgeo.RelativePose(...)]`")
+    check_kind("terms", terms, (list, tuple), "a list of terms, as `[vggtgeo.terms.RelativePose(...)]`")
     names = list(_OWN)
     terms = [term.broadcast() if isinstance(term, AbstractTerm) else term for term in terms]
     for term in terms:
         if not isinstance(term, AbstractTerm | FlatTerm):
-            raise InputError(f"`terms` holds {term!r:.60}; expected terms, as `vggtgeo.RelativePose`, or `FlatTerm`")
+            raise InputError(
+                f"`terms` holds {term!r:.60}; expected terms, as `vggtgeo.terms.RelativePose`, or `FlatTerm`"
+            )
         if term.name in names:
             raise InputError(
                 f"`terms` holds a second term `{term.name}`; join their observations in one term, or derive a class "

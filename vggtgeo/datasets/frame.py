@@ -27,7 +27,7 @@ class Frame:
 
     Example:
         >>> import numpy as np, vggtgeo as vg
-        >>> vg.Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), None, "black")
+        >>> vg.data.Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), None, "black")
         Frame(0, 0.000 s, 320 x 240, no depth, 'black')
 
     """

@@ -33,7 +33,7 @@ class AbstractCamera(eqx.Module):
         parameters: [q], as `names` lists them: pixels, then the distortion's without a unit.
 
     Example:
-        >>> vg.KannalaBrandt.names[:4]
+        >>> vg.cameras.KannalaBrandt.names[:4]
         ('fx', 'fy', 'cx', 'cy')
 
     """
@@ -60,7 +60,7 @@ class Pinhole(AbstractCamera):
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
-        >>> vg.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.0, 1.0])).tolist()
+        >>> vg.cameras.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.0, 1.0])).tolist()
         [370.0, 240.0]
 
     """
@@ -85,7 +85,7 @@ class RadialTangential(AbstractCamera):
 
     Example: without distortion it is the pinhole.
         >>> import jax.numpy as jnp, vggtgeo as vg
-        >>> camera = vg.RadialTangential(jnp.array([500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0]))
+        >>> camera = vg.cameras.RadialTangential(jnp.array([500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0]))
         >>> camera.unproject(camera.project(jnp.array([0.1, 0.2, 1.0]))).tolist()
         [0.1, 0.2, 1.0]
 
@@ -121,7 +121,7 @@ class KannalaBrandt(AbstractCamera):
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
-        >>> camera = vg.KannalaBrandt(jnp.array([300.0, 300.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0]))
+        >>> camera = vg.cameras.KannalaBrandt(jnp.array([300.0, 300.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0]))
         >>> [round(float(value), 9) for value in camera.unproject(camera.project(jnp.array([0.4, 0.2, 1.0])))]
         [0.4, 0.2, 1.0]
 
@@ -167,8 +167,8 @@ class SquarePixels(AbstractCamera):
         parameters: [q], as `names` lists them.
 
     Example: of a model of one's own, as of this package's fisheye.
-        >>> class SquareFisheye(vg.SquarePixels):
-        ...     model = vg.KannalaBrandt
+        >>> class SquareFisheye(vg.cameras.SquarePixels):
+        ...     model = vg.cameras.KannalaBrandt
         >>> SquareFisheye.names
         ('f', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
 
@@ -198,7 +198,7 @@ class SquarePinhole(SquarePixels):
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
-        >>> vg.SquarePinhole(jnp.array([500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.2, 1.0])).tolist()
+        >>> vg.cameras.SquarePinhole(jnp.array([500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.2, 1.0])).tolist()
         [370.0, 340.0]
 
     """
@@ -213,7 +213,7 @@ class SquareRadialTangential(SquarePixels):
         parameters: [q], as `names` lists them.
 
     Example:
-        >>> vg.SquareRadialTangential.names
+        >>> vg.cameras.SquareRadialTangential.names
         ('f', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2')
 
     """
@@ -228,7 +228,7 @@ class SquareKannalaBrandt(SquarePixels):
         parameters: [q], as `names` lists them.
 
     Example:
-        >>> vg.SquareKannalaBrandt.names
+        >>> vg.cameras.SquareKannalaBrandt.names
         ('f', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
 
     """

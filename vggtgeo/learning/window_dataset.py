@@ -3,7 +3,7 @@
 A folder with one file a window (`vggtgeo.save_problem`, no pickles) and one of its labels. All windows have one padded
 shape, so that any of them can be stacked, and the solver is compiled once. It is a map-style data set, `len(d)` and
 `d[i]`, with numpy leaves, read without JAX, so that the loaders of grain and torch may read it in processes of their
-own, forked ones too (collate function: `vggtgeo.stack_windows`); `batches` needs neither.
+own, forked ones too (collate function: `vggtgeo.learning.stack_windows`); `batches` needs neither.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ class WindowWriter:
         >>> import tempfile, vggtgeo as vg
         >>> size = vg.PaddedSize(keyframes=3, points=40, lines=0, degree=2)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with vg.WindowWriter(folder) as writer:
+        ...     with vg.learning.WindowWriter(folder) as writer:
         ...         for seed in range(4):
         ...             window = vg.simulate_window(3, points=8, lines=0, seed=seed)
         ...             writer.add(window.pack(size=size), poses=window.poses)
-        ...     data = vg.WindowDataset.open(folder)
+        ...     data = vg.learning.WindowDataset.open(folder)
         ...     batch = next(data.batches(2, seed=1))
         >>> len(data), batch.initial.intrinsics.shape, batch.labels["poses"].shape
         (4, (2, 4), (2, 3, 7))
@@ -111,8 +111,8 @@ class RunWindows(Callback):
     label: of the state that has a window adjusted (`slam.solved`), for labels such as its keyframes' true poses.
 
     Example:
-        >>> with vg.WindowWriter("windows") as writer:  # doctest: +SKIP
-        ...     vg.reconstruct("clip.mp4", callbacks=[vg.RunWindows(writer)])
+        >>> with vg.learning.WindowWriter("windows") as writer:  # doctest: +SKIP
+        ...     vg.reconstruct("clip.mp4", callbacks=[vg.learning.RunWindows(writer)])
 
     """
 
@@ -146,7 +146,7 @@ class WindowDataset:
         terms: classes of your own that the problems hold.
 
     Example:
-        >>> vg.WindowDataset.open("no/such/folder")  # see `WindowWriter` for one that is there
+        >>> vg.learning.WindowDataset.open("no/such/folder")  # see `WindowWriter` for one that is there
         Traceback (most recent call last):
             ...
         vggtgeo.io.errors.InputError: `no/such/folder` is no complete folder of windows; write one first
@@ -252,8 +252,8 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
 
     Example:
         >>> from torch.utils.data import DataLoader  # doctest: +SKIP
-        >>> data = vg.WindowDataset.open("windows")  # doctest: +SKIP
-        >>> loader = DataLoader(data, batch_size=8, num_workers=2, collate_fn=vg.stack_windows)  # doctest: +SKIP
+        >>> data = vg.learning.WindowDataset.open("windows")  # doctest: +SKIP
+        >>> loader = DataLoader(data, batch_size=8, collate_fn=vg.learning.stack_windows)  # doctest: +SKIP
 
     """
     check_kind("windows", windows, Sequence, "a list of windows, as `WindowDataset` gives them")

@@ -91,7 +91,7 @@ class SurfaceFusion:
     Example:
         >>> import numpy as np, vggtgeo as vg
         >>> update = next(vg.run(vg.simulate("room", 3, size=(160, 120))))
-        >>> fusion = vg.SurfaceFusion(update.intrinsics, voxel=0.1, least_views=1)
+        >>> fusion = vg.callbacks.SurfaceFusion(update.intrinsics, voxel=0.1, least_views=1)
         >>> fusion.update(update.adjusted_keyframes) > 0, fusion.update(update.adjusted_keyframes)
         (True, 0)
 

@@ -109,7 +109,7 @@ def reconstruct(
 
     Example:
         >>> import vggtgeo as vg
-        >>> settings = vg.SlamSettings(window=vg.WindowSettings(size=3, point_slots=16, line_slots=12))
+        >>> settings = vg.SlamSettings(window=vg.settings.WindowSettings(size=3, point_slots=16, line_slots=12))
         >>> vg.reconstruct(vg.simulate("room", 2, size=(160, 120)), settings=settings).summary["frames"]
         2
 

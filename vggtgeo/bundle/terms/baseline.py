@@ -23,7 +23,7 @@ class BaselinePrior(PairTerm):
 
     Example: the first two cameras are 20 cm apart, to a per mille.
         >>> one = jax.numpy.ones(1)
-        >>> vg.BaselinePrior(first=[0], second=[1], length=0.2 * one, sigma=1e-3 * one, weight=one).name
+        >>> vg.terms.BaselinePrior(first=[0], second=[1], length=0.2 * one, sigma=1e-3 * one, weight=one).name
         'baselines'
 
     """

@@ -123,7 +123,7 @@ class EdgeTerm(AbstractTerm):
         kernel: robust kernel of each observation.
 
     Example: a landmark lies on a plane that is known in the target camera.
-        >>> class PointToPlane(vg.EdgeTerm):
+        >>> class PointToPlane(vg.terms.EdgeTerm):
         ...     normal: jax.Array
         ...     distance: jax.Array
         ...     def residual(self, view):
@@ -258,7 +258,7 @@ class ImageTerm(EdgeTerm):
         first_slot: slot of the host that the first column is about; `pack` sets it.
 
     Example: only the column of a match is known.
-        >>> class Column(vg.ImageTerm):
+        >>> class Column(vg.terms.ImageTerm):
         ...     column: jax.Array
         ...     def image_residual(self, u, v):
         ...         return (u - self.column,)

@@ -46,7 +46,7 @@ class PoseTerm(AbstractTerm):
         kernel: robust kernel of each observation.
 
     Example: a position fix.
-        >>> class PositionFix(vg.PoseTerm):
+        >>> class PositionFix(vg.terms.PoseTerm):
         ...     position: jax.Array
         ...     def residual(self, pose, camera):
         ...         return pose.inverse().translation() - self.position
@@ -97,7 +97,7 @@ class PairTerm(AbstractTerm):
         kernel: robust kernel of each observation.
 
     Example: what the wheels say of a motion.
-        >>> class Wheels(vg.PairTerm):
+        >>> class Wheels(vg.terms.PairTerm):
         ...     step: jax.Array
         ...     def residual(self, first, second):
         ...         return (second @ first.inverse()).translation() - self.step
@@ -152,7 +152,7 @@ class CameraTerm(AbstractTerm):
         kernel: robust kernel of each observation.
 
     Example: pixels are square.
-        >>> class SquarePixels(vg.CameraTerm):
+        >>> class SquarePixels(vg.terms.CameraTerm):
         ...     def residual(self, parameters):
         ...         return parameters[0] - parameters[1]
         >>> square = SquarePixels(weight=jax.numpy.ones(1))
@@ -195,7 +195,7 @@ class DenseTerm(AbstractTerm):
         kernel: robust kernel of each observation.
 
     Example: the one of the package is the prior of marginalisation.
-        >>> isinstance(vg.no_prior(3), vg.DenseTerm)
+        >>> isinstance(vg.no_prior(3), vg.terms.DenseTerm)
         True
 
     """

@@ -28,7 +28,7 @@ class RelativePose(PairTerm):
         >>> import jax.numpy as jnp
         >>> root = 100.0 * jnp.eye(6)[None]
         >>> same = jnp.array([[1.0, 0, 0, 0, 0, 0, 0]])
-        >>> vg.RelativePose(first=[0], second=[1], measured=same, root=root, weight=jnp.ones(1)).name
+        >>> vg.terms.RelativePose(first=[0], second=[1], measured=same, root=root, weight=jnp.ones(1)).name
         'relative_poses'
 
     """

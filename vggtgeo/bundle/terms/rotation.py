@@ -23,7 +23,7 @@ class RotationPrior(PoseTerm):
     Example: the first camera stands upright, to a degree.
         >>> import jax.numpy as jnp
         >>> upright, root = jnp.array([[1.0, 0, 0, 0]]), 57.3 * jnp.eye(3)[None]
-        >>> vg.RotationPrior(keyframe=[0], measured=upright, root=root, weight=jnp.ones(1)).name
+        >>> vg.terms.RotationPrior(keyframe=[0], measured=upright, root=root, weight=jnp.ones(1)).name
         'rotations'
 
     """

@@ -21,7 +21,7 @@ class SlotTerm(AbstractTerm):
         kernel: robust kernel of each observation.
 
     Example: no landmark is nearer than it should be.
-        >>> class NotNear(vg.SlotTerm):
+        >>> class NotNear(vg.terms.SlotTerm):
         ...     def residual(self, inverse_depth):
         ...         return jax.numpy.maximum(inverse_depth - 2.0, 0.0)
         >>> float(NotNear().residual(2.5))

@@ -31,7 +31,7 @@ def check_width(name: str, kernel: Any) -> None:
     A traced width is not looked at.
     """
     if not isinstance(kernel, AbstractKernel):
-        raise InputError(f"`{name}` is {kernel!r}; expected a kernel object, as `vggtgeo.Huber(1.5)`")
+        raise InputError(f"`{name}` is {kernel!r}; expected a kernel object, as `vggtgeo.kernels.Huber(1.5)`")
     width = getattr(kernel, "delta", None)
     known = isinstance(width, jax.Array | np.ndarray | float | int) and not isinstance(width, jax.core.Tracer)
     if known and not np.all(np.asarray(width) > 0):
@@ -78,7 +78,7 @@ def check_padded(term: AbstractTerm, rows: tuple[int, ...], slots: int) -> None:
     for name, own, expected in found:
         raise InputError(
             f"`{term.name}.{name}` has shape {own}; it must begin with {expected}, the padded shape of the problem. "
-            "Give flat lists, one row an observation, as a `vggtgeo.FlatTerm` to `vggtgeo.pack(..., terms=[...])`"
+            "Give flat lists, one row an observation, as a `vggtgeo.terms.FlatTerm` to `vggtgeo.pack(..., terms=[...])`"
         )
 
 
@@ -86,8 +86,8 @@ def shared_field(**options: Any) -> Any:
     """A field of a term that all its observations share (a scale, a calibration), not data with an axis of its own.
 
     Example:
-        >>> class Height(vg.PoseTerm):
-        ...     floor: float = vg.shared_field(default=0.0)
+        >>> class Height(vg.terms.PoseTerm):
+        ...     floor: float = vg.terms.shared_field(default=0.0)
         ...     def residual(self, pose, camera):
         ...         return pose.inverse().translation()[1] - self.floor
         >>> Height(keyframe=[0]).data()
@@ -101,7 +101,7 @@ class AbstractTerm(eqx.Module):
     """One kind of observation; see the kinds beside this file for what `residual` takes.
 
     The fields that a subclass adds are data: every array in them has the axes of `weight` first. What all observations
-    share is declared with `vggtgeo.shared_field()`.
+    share is declared with `vggtgeo.terms.shared_field()`.
 
     Fields:
         weight: 1 / variance of the residual of each observation. 0 means that it is not there, and what is not there

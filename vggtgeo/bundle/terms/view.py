@@ -16,8 +16,8 @@ class View(eqx.Module):
 
     Example: a landmark seen by two cameras at one place.
         >>> import jax.numpy as jnp, jaxlie
-        >>> camera = vg.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0]))
-        >>> vg.View(jaxlie.SE3.identity(), camera, jnp.array([100.0, 50.0]), jnp.asarray(0.5)).projected.tolist()
+        >>> camera = vg.cameras.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0]))
+        >>> vg.terms.View(jaxlie.SE3.identity(), camera, jnp.array([100.0, 50.0]), jnp.asarray(0.5)).projected.tolist()
         [100.0, 50.0]
 
     """

@@ -22,7 +22,7 @@ class TrackingSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.SlamSettings(tracking=vg.TrackingSettings(least_inliers=80)).tracking.least_inliers
+        >>> vg.SlamSettings(tracking=vg.settings.TrackingSettings(least_inliers=80)).tracking.least_inliers
         80
 
     """
@@ -43,7 +43,7 @@ class KeyframeSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.KeyframeSettings(keyframe_distance=0.0)
+        >>> vg.settings.KeyframeSettings(keyframe_distance=0.0)
         Traceback (most recent call last):
             ...
         vggtgeo.io.errors.InputError: `keyframes.keyframe_distance` is 0.0; it must be a number above 0
@@ -72,7 +72,7 @@ class MatchingSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.MatchingSettings(least_overlap=0.4).match_gate
+        >>> vg.settings.MatchingSettings(least_overlap=0.4).match_gate
         8.0
 
     """
@@ -106,7 +106,7 @@ class LineSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.SlamSettings(line=vg.LineSettings(use_lines=False)).line.use_lines
+        >>> vg.SlamSettings(line=vg.settings.LineSettings(use_lines=False)).line.use_lines
         False
 
     """
@@ -136,7 +136,7 @@ class DepthSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.DepthSettings(depth_trust="omega")
+        >>> vg.settings.DepthSettings(depth_trust="omega")
         Traceback (most recent call last):
             ...
         vggtgeo.io.errors.InputError: `depth_terms.depth_trust` is 'omega'; it must be own, saliency or complement
@@ -160,7 +160,7 @@ class WeightSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.WeightSettings(use_confidence=False).confidence_floor
+        >>> vg.settings.WeightSettings(use_confidence=False).confidence_floor
         0.1
 
     """
@@ -199,7 +199,7 @@ class CameraSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.CameraSettings(known_intrinsics_sigma=0.01).guessed_intrinsics_sigma
+        >>> vg.settings.CameraSettings(known_intrinsics_sigma=0.01).guessed_intrinsics_sigma
         0.3
 
     """
@@ -214,7 +214,7 @@ class CameraSettings(CheckedSettings):
     refine_intrinsics: str = one_of("auto", "always", "never")
 
 
-_KERNEL = "a kernel of a width above 0, such as `cauchy 2.0` (`vggtgeo.Cauchy(2.0)`)"
+_KERNEL = "a kernel of a width above 0, such as `cauchy 2.0` (`vggtgeo.kernels.Cauchy(2.0)`)"
 
 
 def is_kernel(value: Any) -> bool:
@@ -238,7 +238,7 @@ class WindowSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.SlamSettings(window=vg.WindowSettings(size=8, kernel=vg.Huber(1.5))).window.size
+        >>> vg.SlamSettings(window=vg.settings.WindowSettings(size=8, kernel=vg.kernels.Huber(1.5))).window.size
         8
 
     """
@@ -270,7 +270,7 @@ class RefinementSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.SlamSettings(refinement=vg.RefinementSettings(global_adjustment=False)).refinement.global_adjustment
+        >>> vg.settings.RefinementSettings(global_adjustment=False).global_adjustment
         False
 
     """

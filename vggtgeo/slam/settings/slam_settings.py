@@ -160,7 +160,7 @@ class SlamSettings:
 
     Example:
         >>> import vggtgeo as vg
-        >>> settings = vg.SlamSettings(window=vg.WindowSettings(size=8), line=vg.LineSettings(manhattan=True))
+        >>> settings = vg.SlamSettings(window=vg.settings.WindowSettings(size=8))
         >>> settings.window.size, settings.tracking.least_inliers
         (8, 50)
 

@@ -109,7 +109,7 @@ class EvidenceRecorder(Callback):
     Example:
         >>> import vggtgeo as vg
         >>> sequence = vg.simulate("room", 3, size=(160, 120))
-        >>> recorder = vg.EvidenceRecorder(sequence.camera)
+        >>> recorder = vg.callbacks.EvidenceRecorder(sequence.camera)
         >>> for frame in sequence.frames():
         ...     recorder.add(frame)
         >>> len(recorder.frames)

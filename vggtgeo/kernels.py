@@ -1,0 +1,8 @@
+"""Robust kernels: how much a large residual counts."""
+
+from vggtgeo.solvers.kernels import AbstractKernel as AbstractKernel
+from vggtgeo.solvers.kernels import Barron as Barron
+from vggtgeo.solvers.kernels import Cauchy as Cauchy
+from vggtgeo.solvers.kernels import GemanMcClure as GemanMcClure
+from vggtgeo.solvers.kernels import Huber as Huber
+from vggtgeo.solvers.kernels import Square as Square
