@@ -1,6 +1,7 @@
-"""Draw `run.webp`, the moving picture of the README: a run in a simulated office, rendered on the spot.
+"""Draw `run.webp`, the moving picture of the README: a run on a real recording, or in a simulated room.
 
-python docs/draw_run.py [--scene office] [--frames 240] [--every 4]     (ten minutes on two cores)
+python docs/draw_run.py --clip ../shared/data/corridor-office --every 2     (a few minutes on two cores)
+python docs/draw_run.py [--scene office] [--frames 240] [--every 4]         (simulated; ten minutes)
 
 Left: each image with the key points of the last keyframes, drawn where the estimate puts them, with the way that they
 took. Right: the map from outside, as far as the keyframes have seen it by then, with the path of the camera.
@@ -22,7 +23,7 @@ import vggtgeo as vg
 from vggtgeo.figures.plots import view_axes
 from vggtgeo.geometry import rigid
 
-WIDTH, HEIGHT, BAR = 400, 300, 30
+WIDTH, BAR = 400, 30
 ELEVATION = np.deg2rad(52.0)
 PAPER, INK, BLUE, ORANGE = (246, 246, 244), (31, 41, 51), (31, 95, 191), (224, 123, 26)
 FADE = 3
@@ -68,7 +69,7 @@ class Watcher(vg.Callback):
             measured = frame.depth[row, column]
             ways.append(seen[inside & (np.abs(z - measured) < 0.1 * z)])  # the others are hidden by now
         scale = WIDTH / width
-        image = cv2.resize(frame.image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+        image = cv2.resize(frame.image, (WIDTH, round(scale * height)), interpolation=cv2.INTER_AREA)
         self.moments.append(Moment(image, scale * np.concatenate(ways), len(slam.keyframes)))
 
 
@@ -84,7 +85,8 @@ def with_points(moment: Moment) -> np.ndarray:
 class Outside:
     """The map from outside and above, without ceiling and without the backs of walls."""
 
-    def __init__(self, result: vg.Result):
+    def __init__(self, result: vg.Result, height: int):
+        self.size = np.array([WIDTH, height])
         trajectory, slam = result.trajectory, result.record.slam
         along, across, up = view_axes(trajectory)
         ahead = np.cos(ELEVATION) * across - np.sin(ELEVATION) * up
@@ -100,7 +102,7 @@ class Outside:
         path = trajectory.positions @ self.axes.T
         low, high = np.quantile(local[:, :2], 0.002, axis=0), np.quantile(local[:, :2], 0.998, axis=0)
         low, high = np.minimum(low, path[:, :2].min(0)), np.maximum(high, path[:, :2].max(0))
-        self.scale = 0.94 * min(np.array([WIDTH, HEIGHT]) / (high - low))
+        self.scale = 0.94 * min(self.size / (high - low))
         self.middle = 0.5 * (low + high)
         order = np.argsort(-local[:, 2], kind="stable")  # the nearest last
         self.first, self.colours = self.first[order], colours[order]
@@ -108,7 +110,7 @@ class Outside:
         self.path = self._placed(path)
 
     def _placed(self, local: np.ndarray) -> np.ndarray:
-        return np.array([WIDTH, HEIGHT]) / 2 + self.scale * (local[:, :2] - self.middle)
+        return self.size / 2 + self.scale * (local[:, :2] - self.middle)
 
     @staticmethod
     def _sees(keyframe, points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
@@ -122,13 +124,14 @@ class Outside:
 
     def drawn(self, keyframes: int, frames: int) -> np.ndarray:
         """As far as the first `keyframes` have seen it, with the path of the first `frames`."""
-        picture = np.full((HEIGHT, WIDTH, 3), PAPER, np.uint8)
+        width, height = self.size
+        picture = np.full((height, width, 3), PAPER, np.uint8)
         known = self.first < keyframes
         corner = np.floor(self.place[known]).astype(int)
         size = max(int(np.ceil(self.scale * 0.022)), 2)
         for down, right in np.ndindex(size, size):
             x, y = corner[:, 0] + right, corner[:, 1] + down
-            inside = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
             picture[y[inside], x[inside]] = self.colours[known][inside]
         line = np.rint(self.path[:frames] * 8).astype(np.int32)
         for colour, thickness in (((255, 255, 255), 5), (BLUE, 2)):
@@ -142,22 +145,23 @@ class Outside:
 
 def page(left: np.ndarray, right: np.ndarray, words: str) -> Image.Image:
     """Both pictures side by side, and a line below."""
-    whole = Image.new("RGB", (2 * WIDTH + 6, HEIGHT + BAR), PAPER)
+    height = left.shape[0]
+    whole = Image.new("RGB", (2 * WIDTH + 6, height + BAR), PAPER)
     whole.paste(Image.fromarray(left), (0, 0))
     whole.paste(Image.fromarray(right), (WIDTH + 6, 0))
     font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 15)
-    ImageDraw.Draw(whole).text((8, HEIGHT + 6), words, INK, font)
+    ImageDraw.Draw(whole).text((8, height + 6), words, INK, font)
     return whole
 
 
-def pages(result: vg.Result, moments: list[Moment], scene: str, error: float, every: int) -> list[Image.Image]:
+def pages(result: vg.Result, moments: list[Moment], name: str, error: float, every: int) -> list[Image.Image]:
     """All pictures. error: metres."""
-    outside, found = Outside(result), []
+    outside, found = Outside(result, moments[0].image.shape[0]), []
     for number in range(every, len(moments) + 1, every):
         moment = moments[number - 1]
-        words = f"simulated {scene}: frame {number} of {len(moments)}, {moment.keyframes} keyframes"
+        words = f"{name}: frame {number} of {len(moments)}, {moment.keyframes} keyframes"
         if number + every > len(moments):
-            words += f"; at the end {1000 * error:.1f} mm off the truth (ATE RMSE)"
+            words += f"; ATE RMSE {100 * error:.2f} cm"
         found.append(page(with_points(moment), outside.drawn(moment.keyframes, number), words))
     return found
 
@@ -171,16 +175,21 @@ def save(found: list[Image.Image], path: Path, quality: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scene", default="office")
+    parser.add_argument("--clip", type=Path, help="a recording with truth")
+    parser.add_argument("--scene", default="office", help="a simulated one, where no clip is given")
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--every", type=int, default=4)
     parser.add_argument("--quality", type=int, default=30)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("run.webp"))
     given = parser.parse_args()
-    sequence, watcher = vg.simulate(given.scene, given.frames, rate=10.0), Watcher()
+    if given.clip:
+        sequence, name = vg.open_sequence(given.clip), f"{given.clip.name}, HoloLens"
+    else:
+        sequence, name = vg.simulate(given.scene, given.frames, rate=10.0), f"simulated {given.scene}"
+    watcher = Watcher()
     result = vg.reconstruct(sequence, callbacks=[watcher])
     error = vg.evaluate_trajectory(result.trajectory, sequence.ground_truth()).se3.statistics.rmse
-    save(pages(result, watcher.moments, given.scene, error, given.every), given.out, given.quality)
+    save(pages(result, watcher.moments, name, error, given.every), given.out, given.quality)
 
 
 if __name__ == "__main__":
