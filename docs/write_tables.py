@@ -1,7 +1,7 @@
 """Puts the tables of finished suites into the documents, between their marks.
 
 .venv/bin/python docs/write_tables.py [RUN_FOLDER]     (of the suite `paper`; runs/paper if left out)
-.venv/bin/python docs/write_tables.py --clips [RUN_FOLDER]     (of the suite `clips`, into the README; runs/clips)
+.venv/bin/python docs/write_tables.py --clips [RUN_FOLDER]     (of the suite `clips`, into docs/results/clips.md; runs/clips)
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ def main() -> None:
     """Rewrite the document from the folder named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--clips", action="store_true", help="the table of the README")
+    parser.add_argument("--clips", action="store_true", help="the table of docs/results/clips.md")
     arguments = parser.parse_args()
     name = "clips" if arguments.clips else "paper"
     folder = arguments.folder or Path("runs") / name
     suite, rows = load_suite(name), load_rows(folder / "runs.csv")
     if arguments.clips:
         good = [row for row in rows if row["status"] == "ok"]
-        page, tables = DOCS.parent / "README.md", "\n\n".join(markdown.details(suite, good))
+        page, tables = DOCS / "results" / "clips.md", "\n\n".join(markdown.details(suite, good))
     else:
         page, tables = DOCS / "paper-tables.md", (folder / "tables.md").read_text().partition("\n\n")[2]
         with atomic_path(DOCS / "paper-tables.png") as temporary:

@@ -58,16 +58,18 @@ def test_what_was_measured_is_in_the_tables(tmp_path: Path) -> None:
 
 
 def test_the_tables_of_the_documents_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that `docs/write_tables.py --clips` puts the numbers of a batch between the marks of the README, and leaves
+    # Proves that `docs/write_tables.py --clips` puts the numbers of a batch between the marks of the page, and leaves
     # the rest. Oracle: the rows.
     rows = [row("icl-office", "default", 0, 2.0, **EVERYTHING)]
     (tmp_path / "runs.csv").write_text(as_csv(rows))
-    (tmp_path / "README.md").write_text("before\n<!-- tables: begin -->\nold\n<!-- tables: end -->\nafter\n")
+    (tmp_path / "docs" / "results").mkdir(parents=True)
+    page = tmp_path / "docs" / "results" / "clips.md"
+    page.write_text("before\n<!-- tables: begin -->\nold\n<!-- tables: end -->\nafter\n")
     write = runpy.run_path(str(ROOT / "docs" / "write_tables.py"))["main"]
     monkeypatch.setitem(write.__globals__, "DOCS", tmp_path / "docs")
     monkeypatch.setattr(sys, "argv", ["write_tables.py", "--clips", str(tmp_path)])
     write()
-    text = (tmp_path / "README.md").read_text()
+    text = page.read_text()
     assert text.startswith("before\n<!-- tables: begin -->\n### Poses\n\n| sequence |")
     assert text.endswith("<!-- tables: end -->\nafter\n")
     assert "| icl-office | RGB-D | 1 | 9/10 | 97.5 | 2.00 |" in text
