@@ -1,7 +1,7 @@
 """Puts the tables of finished suites into the documents, between their marks.
 
 .venv/bin/python docs/write_tables.py [RUN_FOLDER]     (of the suite `paper`; runs/paper if left out)
-.venv/bin/python docs/write_tables.py --clips [RUN_FOLDER]     (of the suite `clips`, into docs/results/clips.md; runs/clips)
+.venv/bin/python docs/write_tables.py --clips [RUN_FOLDER]     (suite `clips`, into docs/results/clips.md)
 """
 
 from __future__ import annotations

@@ -144,8 +144,7 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     moved = tangents[0]
     absent = jax.tree.map(lambda leaf: leaf is None, moved, is_leaf=lambda leaf: leaf is None)
     fixed, moving = eqx.partition(problem, absent, is_leaf=lambda leaf: leaf is None)
-    optimum, model = _polish(_detached(problem), _detached(point), options.polish, solver)
-    left = model.largest(_gradient(_detached(problem), optimum, model.system))
+    optimum, model, left = _polish(_detached(problem), _detached(point), options.polish, solver)
     told = _detached(Polish(jnp.asarray(True), left))
     # The optimum as a function of the problem once more, for derivatives of this derivative.
     at, _ = _attach_derivative(problem, _detached(optimum), told, options, solver)
@@ -224,8 +223,10 @@ def _gradient(problem: AbstractArrowProblem, point: Any, system: ArrowSystem) ->
 
 def _polish(
     problem: AbstractArrowProblem, point: Point, steps: int, solver: AbstractReducedSolver
-) -> tuple[Point, ExactModel]:
-    """The optimum near `point`, and the exact model there (of the point before the last, negligible, chord steps)."""
+) -> tuple[Point, ExactModel, Float[Array, ""]]:
+    """The optimum near `point`, the exact model there (of the point before the last, negligible, chord steps), and the
+    largest entry of the gradient that is left.
+    """
 
     def model_at(point: Point) -> ExactModel:
         return exact_model(problem.hessian(point), solver, lambda: problem.linearise(point))
@@ -234,17 +235,21 @@ def _polish(
     shapes, rest = eqx.partition(eqx.filter_eval_shape(model_at, point), is_shape)
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-    def turn(_: Any, carry: tuple[Point, Any]) -> tuple[Point, Any]:
+    def turn(_: Any, carry: tuple[Point, Any, Array]) -> tuple[Point, Any, Array]:
         model = model_at(carry[0])
-        return _chord_steps(problem, model, carry[0], steps), eqx.filter(model, eqx.is_array)
+        moved, gradient = _chord_steps(problem, model, carry[0], steps)
+        return moved, eqx.filter(model, eqx.is_array), model.largest(gradient)
 
     # A loop, not two calls: the Hessian is compiled once.
-    polished, arrays = jax.lax.fori_loop(0, 2, turn, (point, empty))
-    return polished, eqx.combine(arrays, rest)
+    largest = jnp.zeros((), jnp.result_type(*jax.tree.leaves(eqx.filter(point, eqx.is_inexact_array))))
+    polished, arrays, left = jax.lax.fori_loop(0, 2, turn, (point, empty, largest))
+    return polished, eqx.combine(arrays, rest), left
 
 
-def _chord_steps(problem: AbstractArrowProblem, model: ExactModel, point: Point, steps: int) -> Point:
-    """Move by `-H^-1 g`, the Hessian kept, as long as the gradient shrinks."""
+def _chord_steps(
+    problem: AbstractArrowProblem, model: ExactModel, point: Point, steps: int
+) -> tuple[Point, ArrowVector]:
+    """Move by `-H^-1 g`, the Hessian kept, as long as the gradient shrinks; with the gradient that is left."""
 
     def body(carry: Any) -> Any:
         point, gradient, size, number, _ = carry
@@ -262,7 +267,7 @@ def _chord_steps(problem: AbstractArrowProblem, model: ExactModel, point: Point,
     first = (point, gradient, model.size(gradient), jnp.asarray(0), jnp.asarray(True))
     last: Any = jax.lax.while_loop(lambda carry: carry[-1] & (carry[-2] < steps), body, first)
     polished: Point = last[0]
-    return polished
+    return polished, last[1]
 
 
 def _along(system: ArrowSystem, problem: AbstractArrowProblem) -> ArrowSystem:

@@ -24,6 +24,10 @@ entries of `Y`, the second part is
     rotation, translation: -1/2 d [G]x                          translation, depth:    G
     rotation, intrinsics:  dY/dk x G                            focal, focal / centre: 2 c ray / f^2, c / f^2.
 
+The landmark's own pixel `(u, v)` in its host, where it is an unknown, moves the ray against the centre: `D_u = c_0 /
+f_x`, `dY/du = R e_0 / f_x`, and `d2Y` by `u` and `f_x` is `-R e_0 / f_x^2` (so with `v`, `f_y`). `Y` is linear in
+the pixel.
+
 Layout (chosen by measurement on CPU): one array a quantity, slots contiguous.
 """
 
@@ -92,6 +96,33 @@ def row(edge: OneEdge, at: Projection, a: Array, b: Array) -> list[Array]:
     ]
 
 
+class EnergyGradient(NamedTuple):
+    """Gradient of one edge's energy, by the force `(a, b) = w rho' r` on each projected pixel."""
+
+    shared: Float[Array, "10"]
+    """By relative pose and intrinsics, summed over slots."""
+    depth: Float[Array, " p"]
+    pixel: Float[Array, "2 p"]
+    """By each pixel in the host."""
+
+
+def energy_gradient(edge: OneEdge, at: Projection, a: Array, b: Array) -> EnergyGradient:
+    """The sum over slots of `row`, as one product of moments: it compiles in a fraction of the time of ten sums."""
+    intrinsics, rotation = edge.intrinsics, edge.rotation
+    g0, g1 = a * intrinsics[0] * at.inverse_z, b * intrinsics[1] * at.inverse_z
+    g = jnp.stack([g0, g1, -(g0 * at.x + g1 * at.y) * at.in_front])
+    one = jnp.ones_like(at.depth)
+    others = jnp.stack([*at.point, at.depth, at.ray_x, at.ray_y, at.x, at.y, one])
+    moments = jnp.concatenate([g, jnp.stack([a, b])]) @ others.T
+    point, by_ray = moments[:3, :3], rotation[:, :2].T @ moments[:3]
+    turn = jnp.stack([point[i, j] - point[j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
+    # Of each axis: its force times the projection, less what moves the ray in the host.
+    focal = jnp.stack([moments[3, 6], moments[4, 7]]) - jnp.stack([by_ray[0, 4], by_ray[1, 5]]) / intrinsics[:2]
+    centre = moments[3:, 8] - by_ray[:, 8] / intrinsics[:2]
+    shared = jnp.concatenate([moments[:3, 3], turn, focal, centre])
+    return EnergyGradient(shared, edge.translation @ g, rotation[:, :2].T @ g / intrinsics[:2, None])
+
+
 def row_of_third(edge: OneEdge, at: Projection) -> list[Array]:
     """`P`: the derivatives of `Y_z`, over `Y_z`, in the order of `row`."""
     fx, fy = edge.intrinsics[:2]
@@ -127,6 +158,30 @@ def second_order(
     focal = (g[0] * (translation[0] / fx), g[1] * (translation[1] / fy))
     cross = [*g, *turn, *focal, third[10] * a, third[10] * b, jnp.zeros_like(a)]
     return half + half.T + _curvature_of_point(moments, edge), cross
+
+
+def second_order_of_pixel(
+    edge: OneEdge, at: Projection, force: tuple[Array, Array], pull: Array, axis: int
+) -> list[Array]:
+    """`d2(a u' + b v')` by the pixel in the host along `axis`, mixed with the shared coordinates and inverse depth (in
+    the order of `row`), but for `-(P D~' + D~ P')`.
+
+    Args:
+        edge: its relative pose and camera.
+        at: projection of the slots.
+        force: `(a, b) = w rho' r` on the projected pixel.
+        pull: `D_u` or `D_v`.
+        axis: 0 for `u`, 1 for `v`.
+    """
+    fx, fy = edge.intrinsics[:2]
+    focal, column = edge.intrinsics[axis], edge.rotation[:, axis]
+    a, b = force
+    g = (a * fx * at.inverse_z, b * fy * at.inverse_z, -(a * fx * at.x + b * fy * at.y) * at.inverse_z * at.in_front)
+    zero = jnp.zeros_like(a)
+    turn = (part / focal for part in _cross_product(column, g))
+    by_focal = [g[0] * (column[0] / (focal * fx)), g[1] * (column[1] / (focal * fy))]
+    by_focal[axis] = by_focal[axis] - pull / focal
+    return [zero, zero, zero, *turn, *by_focal, zero, zero, zero]
 
 
 class _Moments(NamedTuple):

@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.fast import pinhole
@@ -189,23 +190,26 @@ class EdgeTerm(AbstractTerm):
 
     def model(self, view: EdgeView) -> LocalModel:
         """Exact Hessian and gradient of one edge."""
-        zero, depth, pixels = jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth, view.pixels
+        size, depth, pixels = view.size, view.inverse_depth, view.pixels
         gradient = lambda x, d, u: jax.grad(self._energy_at, (1, 2, 3))(view, x, d, u)
-        along = lambda tangent: jax.jvp(lambda x: gradient(x, depth, pixels), (zero,), (tangent,))[1]
-        hessian, mixed, mixed_pixels = jax.vmap(along)(jnp.eye(view.size, dtype=zero.dtype))
-        ones = jnp.ones_like(depth)
-        (shared, own, force), (_, curvature, coupling) = jax.jvp(lambda d: gradient(zero, d, pixels), (depth,), (ones,))
-        gram = jnp.pad(hessian, (0, 1)).at[-1, :-1].set(shared).at[:-1, -1].set(shared)
-        coupled = jnp.concatenate([mixed, own[None], curvature[None]])
+        at = jnp.zeros(size, depth.dtype), depth, pixels
+        force, own, pull = gradient(*at)
+        # A residual sees the unknowns of one slot: one product with ones has the columns of all slots. All products in
+        # one `vmap`: a gradient that is traced once compiles once.
+        columns = 1 + 2 * bool(view.free_pixels)
+        by_depth = jnp.zeros((size + columns, *depth.shape), depth.dtype).at[size].set(1.0)
+        by_pixel = jnp.zeros((size + columns, *pixels.shape), depth.dtype)
+        for axis in range(columns - 1):
+            by_pixel = by_pixel.at[size + 1 + axis, axis].set(1.0)
+        along = lambda *tangents: jax.jvp(gradient, at, tangents)[1]
+        hessian, mixed, bend = jax.vmap(along)(jnp.eye(size + columns, size, dtype=depth.dtype), by_depth, by_pixel)
+        gram = jnp.pad(hessian[:size], (0, 1)).at[-1, :-1].set(force).at[:-1, -1].set(force)
+        coupled = jnp.concatenate([mixed[:size], own[None], mixed[size : size + 1]])
         if not view.free_pixels:
             return LocalModel(gram, coupled)
-        # A residual sees the pixel of one slot: one product with ones has the blocks of all slots.
-        bend = lambda axis: jax.jvp(
-            lambda u: gradient(zero, depth, u)[2], (pixels,), (jnp.zeros_like(pixels).at[axis].set(1.0),)
-        )[1]
-        (by_uu, by_uv), (_, by_vv) = bend(0), bend(1)
-        by_pixels = jnp.concatenate([mixed_pixels, force[None], coupling[None]])
-        return LocalModel(gram, coupled, PixelModel(by_pixels, jnp.stack([by_uu, by_vv, by_uv])))
+        by_pixels = jnp.concatenate([bend[:size], pull[None], bend[size : size + 1]])
+        blocks = jnp.stack([bend[size + 1, 0], bend[size + 2, 1], bend[size + 1, 1]])
+        return LocalModel(gram, coupled, PixelModel(by_pixels, blocks))
 
     def _by_pixel(self, view: EdgeView, parts: list[Array]) -> list[Float[Array, "2 m p"]]:
         """Derivatives of the residuals by `u` and `v` in the host, where those are unknowns."""
@@ -229,8 +233,8 @@ class EdgeTerm(AbstractTerm):
         depth: Float[Array, " p"],
         pixels: Float[Array, "2 p"] | None = None,
     ) -> Float[Array, "m p"]:
-        """Residuals after a step of each part, at the given depths and, if any, pixels in the host."""
-        relative = lie.move(view.relative, parts[0])
+        """Residuals after a step of each part, which is zero, at the given depths and, if any, pixels in the host."""
+        relative = lie.move_at_zero(view.relative, parts[0])
         host, camera = view.cameras.along(view.ends, parts[1:])
 
         def one(data: dict, pixel: Array, inverse_depth: Array) -> Array:
@@ -307,44 +311,82 @@ class ImageTerm(EdgeTerm):
         if view.fast is None or view.projection is None:
             return super().gradient(view)
         a, b = self._force(view, view.projection)
-        row = pinhole.row(view.fast, view.projection, a, b)
-        own = jnp.stack([a - row[_CENTRE], b - row[_CENTRE + 1]]) if view.free_pixels else None
-        return Gradient(jnp.stack([jnp.sum(column) for column in view.tied(row[:-1])]), row[-1], own)
+        found = pinhole.energy_gradient(view.fast, view.projection, a, b)
+        return Gradient(
+            jnp.stack(view.tied(list(found.shared))), found.depth, found.pixel if view.free_pixels else None
+        )
 
     def model(self, view: EdgeView) -> LocalModel:
-        if view.fast is None or view.projection is None or view.free_pixels:
+        if view.fast is None or view.projection is None:
             return super().model(view)
         edge, at = view.fast, view.projection
-        residual, normal = self._image(view, at)
-        squared = self.weights * squared_norm(residual)
+        entries, normals = self._image(view, at)
+        squared = self.weights * squared_norm(entries)
         pull = self.weights * self.kernel.weight(squared)
         bend = 2 * self.weights**2 * self.kernel.curvature(squared)
-        rows = [pinhole.row(edge, at, *of) for of in zip(*normal, strict=True)]
-        force = tuple(pull * sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal)
-        third = pinhole.row_of_third(edge, at)
-        added, mixed = pinhole.second_order(edge, at, (force[0], force[1]), third)
-        # The residual times its derivative: `D / (w rho')`.
-        along = [sum(r * row[k] for r, row in zip(residual, rows, strict=True)) for k in range(len(third))]
-        shared = range(len(third) - 1)
+        # Whole arrays, not entry by entry as in `columns`: a hundred separate sums take seconds to compile.
+        residual = jnp.stack(entries)
+        normal = jnp.stack([jnp.stack(of) for of in normals])
+        rows = jnp.stack(pinhole.row(edge, at, *normal), 1)
+        third = jnp.stack(pinhole.row_of_third(edge, at))
+        along = jnp.sum(residual[:, None] * rows, 0)  # the residual times its derivative: `D / (w rho')`
+        force = pull * jnp.sum(normal * residual, 1)
+        added, mixed = pinhole.second_order(edge, at, (force[0], force[1]), list(third))
         # Half of what these rows make with the plain ones is `sum w rho' J'J + 2 w^2 rho'' (J'r)(J'r)' - P D'`.
-        bent = [bend * along[k] - 2 * pull * third[k] for k in shared]
-        left = [
-            jnp.stack([*(pull * row[k] + r * bent[k] for k in shared), pull * r])
-            for r, row in zip(residual, rows, strict=True)
-        ]
-        right = [jnp.stack(row[:-1]) for row in rows]
-        both = jax.lax.optimization_barrier((jnp.concatenate(left, 1), jnp.concatenate(right, 1)))
-        products = both[0] @ both[1].T
+        bent = bend * along[:-1] - 2 * pull * third[:-1]
+        left = jnp.concatenate([pull * rows[:, :-1] + residual[:, None] * bent, (pull * residual)[:, None]], 1)
+        products = jnp.einsum("map,mbp->ab", left, rows[:, :-1])
         half, gradient = products[:-1] / 2, products[-1]
         gram = jnp.pad(half + half.T + added, (0, 1)).at[-1, :-1].set(gradient).at[:-1, -1].set(gradient)
-        depth = [pull * row[-1] for row in rows]
         pulled, inverse = bend * along[-1] - pull * third[-1], -pull * along[-1]
-        coupled = [
-            sum(d * row[k] for d, row in zip(depth, rows, strict=True)) + pulled * along[k] + inverse * third[k] + extra
-            for k, extra in enumerate(mixed)
+        coupled = jnp.sum(pull * rows[:, -1:] * rows, 0) + pulled * along + inverse * third + jnp.stack(mixed)
+        own = (pull * along[-1])[None]
+        model = LocalModel(gram, jnp.concatenate([coupled[:-1], own, coupled[-1:]]))
+        if view.free_pixels:
+            pixels = self._pixel_model(view, (residual, normal, rows), (pull, bend), third)
+            model = model._replace(pixels=pixels)
+        return _tied_model(view, model)
+
+    def _pixel_model(
+        self,
+        view: EdgeView,
+        derivatives: tuple[Float[Array, "m p"], Float[Array, "2 m p"], Float[Array, "m 11 p"]],
+        weights: tuple[Float[Array, " p"], Float[Array, " p"]],
+        third: Float[Array, "11 p"],
+    ) -> PixelModel:
+        """Exact second derivatives by the pixels in the host, see `fast/pinhole.py`.
+
+        derivatives: residuals, their derivatives by the projected pixel, and by shared coordinates and inverse depth.
+        weights: `w rho'` and `2 w^2 rho''`. third: `P`.
+        """
+        assert view.fast is not None
+        assert view.projection is not None
+        (residual, normal, rows), (pull, bend) = derivatives, weights
+        centre = slice(_CENTRE, _CENTRE + 2)
+        # The centre moves the pixel in the target and, the other way, the ray in the host.
+        pixel, third_of = normal - jnp.swapaxes(rows[:, centre], 0, 1), -third[centre]
+        along, of_pixel = jnp.sum(residual[:, None] * rows, 0), jnp.sum(pixel * residual, 1)
+        force, gradient = pull * jnp.sum(normal * residual, 1), pull * of_pixel
+        drawn = (pull * along).at[centre].add(-force)
+        extra = [
+            pinhole.second_order_of_pixel(view.fast, view.projection, (force[0], force[1]), gradient[axis], axis)
+            for axis in range(2)
         ]
-        own = sum(d * r for d, r in zip(depth, residual, strict=True))
-        return _tied_model(view, LocalModel(gram, jnp.stack([*coupled[:-1], own, coupled[-1]])))
+        mixed = (
+            pull * jnp.einsum("amp,mkp->kap", pixel, rows)
+            + bend * along[:, None] * of_pixel
+            - drawn[:, None] * third_of
+            - third[:, None] * gradient
+            + jnp.stack([jnp.stack(of) for of in extra], 1)
+        )
+        coupled = jnp.stack([*view.tied(list(mixed[:-1])), gradient, mixed[-1]])
+        first, second = np.array([0, 1, 0]), np.array([0, 1, 1])
+        blocks = (
+            pull * jnp.sum(pixel[first] * pixel[second], 1)
+            + bend * of_pixel[first] * of_pixel[second]
+            - (third_of[first] * gradient[second] + gradient[first] * third_of[second])
+        )
+        return PixelModel(coupled, blocks)
 
     def _image(self, view: EdgeView, at: Projection) -> tuple[Rows, tuple[Rows, Rows]]:
         """Residuals, and their derivatives by the projected pixel's coordinates, row by row."""
@@ -374,7 +416,8 @@ def _tied_model(view: EdgeView, model: LocalModel) -> LocalModel:
     if view.cameras.kind is Pinhole:
         return model
     once = jnp.stack(view.tied(list(model.gram)))
-    return LocalModel(jnp.stack(view.tied(list(once.T))), jnp.stack(view.tied(list(model.coupled))))
+    coupled = jnp.stack(view.tied(list(model.coupled)))
+    return LocalModel(jnp.stack(view.tied(list(once.T))), coupled, model.pixels)
 
 
 def products(left: Float[Array, "... mp"], right: Float[Array, "... mp"], slots: int) -> Float[Array, "... p"]:
