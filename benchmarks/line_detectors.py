@@ -1,4 +1,4 @@
-"""OpenCV's LSD, the trained network M-LSD and no lines in a run: the second table of docs/exporting.md.
+"""OpenCV's LSD, the trained network M-LSD and no lines in a run.
 
     .venv/bin/python benchmarks/line_detectors.py runs/networks/mlsd.onnx [--data ../shared/data/redkitchen]
         [--out runs/lines] [--end 200]

@@ -1,4 +1,4 @@
-"""Measure what a mesh costs that is kept up to date during a run (`vg.callbacks.SurfaceFusion`), see docs/maps.md.
+"""Measure what a mesh costs that is kept up to date during a run (`vg.callbacks.SurfaceFusion`).
 
     .venv/bin/python benchmarks/live_surface.py ../shared/data/corridor-office [--end 60]
 

@@ -1,4 +1,4 @@
-"""Dense maps against truth: the table of docs/maps.md.
+"""Dense maps against truth: the table of docs/guides/dense-maps.md.
 
     .venv/bin/python benchmarks/maps.py [--only office] [--data ../shared/data] [--out runs/maps] [--frames 100]
 

@@ -1,4 +1,4 @@
-"""Every network, exported with random weights (M-LSD with its own) and run: the table of docs/exporting.md.
+"""Every network, exported with random weights (M-LSD with its own) and run: the table of docs/guides/networks.md.
 
     .venv/bin/python benchmarks/networks.py --checkouts FOLDER [--out runs/networks] [--only dinov3] [--threads 1]
     .venv/bin/python benchmarks/networks.py --checkouts FOLDER --out runs/gpu --provider cuda --views 10 [--half]

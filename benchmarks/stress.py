@@ -1,7 +1,7 @@
 """Degraded clips with the default settings: how many come out right, how many say that they do not, how many lie.
 
     .venv/bin/python benchmarks/stress.py [--clips corridor-office building-walk] [--scenes office] [--frames 60]
-        [--groups a b] [--variants overlay30 ...] [--jobs 1] [--timeout 240] [--out runs/stress] [--page docs/stress.md]
+        [--groups a b] [--variants overlay30 ...] [--jobs 1] [--timeout 240] [--out runs/stress] [--page FILE.md]
 
 Clips are degraded by `../shared/stress/make_variants.py` and are skipped where that is not there; simulated scenes by
 `vggtgeo/simulation/degradations.py`. Each run is one `vggtgeo run` in a process of its own, which cannot see the truth.

@@ -1,7 +1,7 @@
 """Puts the tables of finished suites into the documents, between their marks.
 
-.venv/bin/python docs/write_tables.py [RUN_FOLDER]     (of the suite `paper`; runs/paper if left out)
-.venv/bin/python docs/write_tables.py --clips [RUN_FOLDER]     (suite `clips`, into docs/results/clips.md)
+.venv/bin/python docs/write_tables.py [RUN_FOLDER]     (`paper`, into docs/results/paper.md; runs/paper)
+.venv/bin/python docs/write_tables.py --clips [RUN_FOLDER]     (`clips`, into docs/results/clips.md; runs/clips)
 """
 
 from __future__ import annotations
@@ -25,6 +25,12 @@ def with_tables(page: str, tables: str) -> str:
     return head + BEGIN + "\n" + tables.strip() + "\n" + END + rest.split(END)[1]
 
 
+def accuracy(tables: str) -> str:
+    """The table of the ATE after SE(3) of `tables.md`, with its caption."""
+    caption = "ATE RMSE after SE(3)"
+    return caption + tables.partition(caption)[2].partition("ATE RMSE after Sim(3)")[0]
+
+
 def load_rows(file: Path) -> list[dict[str, Any]]:
     """The rows of `runs.csv`, numbers as numbers."""
     with file.open(encoding="utf-8") as stream:
@@ -44,7 +50,7 @@ def main() -> None:
         good = [row for row in rows if row["status"] == "ok"]
         page, tables = DOCS / "results" / "clips.md", "\n\n".join(markdown.details(suite, good))
     else:
-        page, tables = DOCS / "paper-tables.md", (folder / "tables.md").read_text().partition("\n\n")[2]
+        page, tables = DOCS / "results" / "paper.md", accuracy((folder / "tables.md").read_text())
         with atomic_path(DOCS / "paper-tables.png") as temporary:
             figures.ablation_figure(suite, rows).savefig(temporary, dpi=130, format="png", facecolor="white")
     write_text(page, with_tables(page.read_text(), tables))

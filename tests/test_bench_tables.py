@@ -76,6 +76,18 @@ def test_the_tables_of_the_documents_can_be_written(tmp_path: Path, monkeypatch:
     assert "old" not in text
 
 
+def test_the_page_of_the_paper_takes_the_accuracy_alone() -> None:
+    # Proves that of a batch's tables `docs/write_tables.py` takes the ATE after SE(3), and nothing else. Oracle: text.
+    accuracy = runpy.run_path(str(ROOT / "docs" / "write_tables.py"))["accuracy"]
+    text = markdown.page(tiny.suite(), ROWS)
+    found = accuracy(text)
+    assert found in text
+    assert found.startswith("ATE RMSE after SE(3) alignment, cm")
+    assert "| full system |" in found
+    assert "Sim(3)" not in found
+    assert "#" not in found
+
+
 def test_what_has_no_result_is_told() -> None:
     # Proves that crashes and recordings that are not there are in the page, and in no mean.
     rows = [*ROWS[:2], row("walk", "full", 2, None, status="crash", message="ended by SIGSEGV")]

@@ -8,7 +8,10 @@ import pytest
 from conftest import ROOT
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-PAGES = ["docs/extending.md", "README.md", "docs/own-residual.md", "docs/gradients.md"]
+PAGES = [
+    *("README.md", "docs/start/solve.md", "docs/start/gradients.md"),
+    *("docs/guides/own-residuals.md", "docs/guides/extend.md"),
+]
 
 
 @pytest.mark.long

@@ -1,5 +1,6 @@
 """The documents agree with the repository."""
 
+import ast
 import re
 import runpy
 from pathlib import Path
@@ -63,7 +64,7 @@ def test_code_beside_the_mathematics_exists(hooks: dict[str, Any]) -> None:
         named = [hooks["source_of"](found["file"], found["name"]) for found in hooks["CODE"].finditer(text)]
         assert all("def " in code or "class " in code for code in named)
         assert len(named) == len(re.findall(r"^Code: ", text, re.MULTILINE)), page
-    assert len(hooks["CODE"].findall((ROOT / "docs" / "mathematics.md").read_text())) > 30
+    assert len(hooks["CODE"].findall((ROOT / "docs" / "concepts" / "mathematics.md").read_text())) > 30
 
 
 def test_the_reference_has_every_public_name_once() -> None:
@@ -74,11 +75,41 @@ def test_the_reference_has_every_public_name_once() -> None:
     assert len(set(listed)) == len(listed)
 
 
+def test_messages_of_the_troubleshooting_page_are_those_of_the_program() -> None:
+    # Proves that whoever looks up a message finds it. Oracle: the texts in the sources; `...` stands for what varies.
+    page = (ROOT / "docs" / "troubleshooting.md").read_text().splitlines()
+    rows = [line.split(" | ")[0].removeprefix("| ") for line in page if re.match(r"\| (?!message|reason)", line)]
+    texts = {
+        text for folder in ("vggtgeo", "models") for file in (ROOT / folder).rglob("*.py") for text in _texts(file)
+    }
+    missing = [row for row in rows if not any(_holds(text, row) for text in texts)]
+    assert len(rows) >= 25
+    assert missing == []
+
+
+def _texts(file: Path) -> list[str]:
+    nodes = list(ast.walk(ast.parse(file.read_text())))
+    plain = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    parts = [node.values for node in nodes if isinstance(node, ast.JoinedStr)]
+    return plain + [
+        "".join(str(getattr(part, "value", "")) if isinstance(part, ast.Constant) else "..." for part in one)
+        for one in parts
+    ]
+
+
+def _holds(text: str, message: str) -> bool:
+    for part in filter(None, map(str.strip, message.split("..."))):
+        _, found, text = text.partition(part)
+        if not found:
+            return False
+    return True
+
+
 def test_checksums_of_the_weights_are_those_that_fetch_checks() -> None:
     # Proves that the page and the program speak of the same files. Oracle: the registry; the length of a SHA-256.
     from vggtgeo.models.onnx.registry import NETWORKS
 
-    page = (ROOT / "docs" / "models.md").read_text()
+    page = (ROOT / "docs" / "guides" / "networks.md").read_text()
     rows = [line for line in page.splitlines() if line.startswith("|") and "`model.onnx`" in line]
     published = [network.hub for network in NETWORKS.values() if network.hub]
     found = {re.findall(r"`([0-9a-f]{64})`", row)[0]: re.findall(r"\[([^\]]+)\]", row)[0] for row in rows}

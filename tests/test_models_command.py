@@ -247,7 +247,8 @@ def test_another_content_is_not_kept(tmp_path: Path, entry: Network) -> None:
 
 
 def test_a_file_is_carried_to_a_machine_without_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves the steps of docs/models.md: fetched on one machine, copied, checked and used on another, where nobody
+    # Proves the steps of docs/guides/networks.md: fetched on one machine, copied, checked and used on another, where
+    # nobody
     # answers; a file that was damaged on the way is not taken for the right one. Oracle: a server that is gone.
     content = tiny.moge2(tmp_path / "published.onnx").read_bytes()
     hub_file = HubFile("someone/something", "model.onnx", hashlib.sha256(content).hexdigest())

@@ -21,7 +21,7 @@ SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05, seed=7)
 
 
 def arrays_of(scene: Scene) -> dict[str, np.ndarray]:
-    """A scene in the layout of docs/problem-file.md."""
+    """A scene in the layout of docs/reference/problem-file.md."""
     seen = scene.observations
     return {
         "edges": seen.edges.astype(np.int32),
@@ -63,13 +63,13 @@ def test_a_file_is_the_problem(tmp_path: Path) -> None:
 @pytest.mark.parametrize("missing", LAYOUT)
 def test_a_missing_array_is_named(tmp_path: Path, missing: str) -> None:
     # Proves that each required array is asked for by name, with where the layout is written.
-    with pytest.raises(InputError, match=rf"lacks the arrays {missing}; .*docs/problem-file.md"):
+    with pytest.raises(InputError, match=rf"lacks the arrays {missing}; .*docs/reference/problem-file.md"):
         load_problem(write(tmp_path, **{missing: None}))
 
 
 def test_the_layout_is_documented() -> None:
     # Proves that the page named in the error describes every array that is asked for.
-    page = (Path(__file__).parent.parent / "docs" / "problem-file.md").read_text()
+    page = (Path(__file__).parent.parent / "docs" / "reference" / "problem-file.md").read_text()
     assert [name for name in LAYOUT if f"`{name}`" not in page] == []
 
 

@@ -1,4 +1,4 @@
-"""The table of `docs/gradients.md` on what goes through which transformation is what happens."""
+"""The table of `docs/start/gradients.md` on what goes through which transformation is what happens."""
 
 import dataclasses
 import re
@@ -100,7 +100,7 @@ def facts(function: Function) -> list[str]:
 
 def table() -> dict[str, list[str]]:
     """The rows of the page."""
-    text = (ROOT / "docs" / "gradients.md").read_text()
+    text = (ROOT / "docs" / "start" / "gradients.md").read_text()
     start = text.index(f"| of | {' | '.join(COLUMNS)} |")
     rows = [line.strip("| \n").split(" | ") for line in text[start:].split("\n\n")[0].splitlines()[2:]]
     return {row[0]: row[1:] for row in rows}

@@ -60,7 +60,7 @@ def load_problem(
     """Read a problem: flat lists as other programs write them, or what `save_problem` wrote.
 
     Args:
-        path: `.npz`; docs/problem-file.md has both layouts.
+        path: `.npz`; docs/reference/problem-file.md has both layouts.
         dtype: float type of all arrays, as `vggtgeo.pack` takes it.
         terms: classes of your own that a saved problem holds: terms, kernels, a camera. A file only names them; no code
             in it is run.
@@ -186,7 +186,7 @@ def _saved_or_flat(archive: Archive) -> dict[str, np.ndarray]:
     missing = [name for name in LAYOUT if name not in archive]
     if missing:
         raise InputError(
-            f"`{archive.path}` lacks the arrays {', '.join(missing)}; the layout is in docs/problem-file.md"
+            f"`{archive.path}` lacks the arrays {', '.join(missing)}; the layout is in docs/reference/problem-file.md"
         )
     optional = [name for name in OPTIONAL if name in archive]
     return archive.read([*LAYOUT, *optional], lambda headers: _check_flat(archive.path, headers))
@@ -228,7 +228,8 @@ def _check_flat(path: Path, found: Mapping[str, ArrayHeader]) -> None:
         expected = tuple(sizes.get(axis, axis) for axis in layout)
         if header.shape != expected:
             raise InputError(
-                f"array `{name}` of `{path}` has shape {header.shape}; expected {expected}, see docs/problem-file.md"
+                f"array `{name}` of `{path}` has shape {header.shape}; expected {expected}, see "
+                "docs/reference/problem-file.md"
             )
         kinds, words = ("iu", "whole numbers") if name in INDICES else ("iufb", "numbers")
         if header.dtype.kind not in kinds:

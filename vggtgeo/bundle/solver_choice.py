@@ -23,7 +23,7 @@ BAND_LIMIT = 24
 """Longest reach of a band: a group of `2 * 24` keyframes has 288 coordinates."""
 MUCH_DENSE = 300
 """Keyframes above which a dense factor inside `jit` is worth a warning: at 200 an iteration takes twice as long as with
-a band (docs/solver.md), and its cost grows with the cube."""
+a band (docs/results/solver.md), and its cost grows with the cube."""
 ORDERED_LIMIT = 12
 """Longest reach for which no other order is looked for, and the longest of a band that only preconditions."""
 SHORT_SHARE = 0.5

@@ -19,7 +19,9 @@ class Precision(enum.StrEnum):
 
 
 def solve(
-    problem: Annotated[Path, typer.Argument(metavar="PROBLEM", help="Problem (.npz), see docs/problem-file.md.")],
+    problem: Annotated[
+        Path, typer.Argument(metavar="PROBLEM", help="Problem (.npz), see docs/reference/problem-file.md.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Solution (.npz): T, k, d.")],
     max_steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Most iterations (tried steps).")] = 50,
     dtype: Annotated[Precision, typer.Option(help="Precision of the solve.")] = Precision.float64,

@@ -68,8 +68,8 @@ def drawn_to(found: Motion, prior: Motion) -> Motion:
 def wanting(found: Motion) -> bool:
     """Whether, in some direction, a motion is known worse than to within what no number of samples removes.
 
-    Elsewhere neither lines nor the points of other keyframes change anything for the better (docs/lines.md), and
-    finding lines costs as much as the alignment.
+    Elsewhere neither lines nor the points of other keyframes change anything for the better
+    (docs/results/clips.md), and finding lines costs as much as the alignment.
     """
     floor = _floor(found.motion)
     return bool(np.linalg.eigvalsh(found.information * np.outer(floor, floor))[0] < 1.0)

@@ -41,7 +41,7 @@ four clips as they are (6 to 161 keyframes) have at most 0.031 of the lens, and 
 which is four standard deviations (building-walk); 0.027 of the unit, and redkitchen as a whole 0.058. Noise of 3 % a
 metre, holes, depth cut off at 3 m, that of 40 x 30 pixels have at most 0.034. Depth that is 1.15 times as long at the
 end of 125 frames of corridor-office has 0.10 (11 cm off), over fifty of them 0.15, 1.2 times from the middle on 0.20
-(21 cm); docs/stress.md has a table."""
+(21 cm); docs/results/stress.md has a table."""
 SIGMAS = 5.0
 NOISE = 0.003
 """Standard deviation of the log factor of a pair beyond that of its matches: errors of depth that they share."""
