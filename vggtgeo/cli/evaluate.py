@@ -104,21 +104,21 @@ def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
     that are written without any.
     """
     from vggtgeo.datasets.trajectory_files import load_trajectory
-    from vggtgeo.results.summary_file import check_count
-    from vggtgeo.results.unfinished import check_finished
+    from vggtgeo.results.summary_file import warn_if_truncated
+    from vggtgeo.results.unfinished import unfinished_message
 
-    unfinished = check_finished(path)
+    unfinished = unfinished_message(path)
     if unfinished:
         warnings.warn(unfinished, InputWarning, stacklevel=2)
     file = path / "trajectory.txt" if path.is_dir() else path
-    return check_count(file, load_trajectory(file, truth))
+    return warn_if_truncated(file, load_trajectory(file, truth))
 
 
 def load_scale(path: Path) -> str | None:
     """What the summary of a run says of its scale, the run's folder or a file of poses in it; None for any other file,
     whose scale nobody knows, and with a warning where the summary cannot be used.
     """
-    from vggtgeo.results.summary_file import lack
+    from vggtgeo.results.summary_file import describe_error
 
     file = (path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path) / "summary.json"
     if not file.is_file():
@@ -126,7 +126,7 @@ def load_scale(path: Path) -> str | None:
     try:
         return str(json.loads(whole_text(file, errors="strict"))["scale"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        text = f"`{file}` cannot be used ({lack(error)}): what it says of scale and verdict is not known"
+        text = f"`{file}` cannot be used ({describe_error(error)}): what it says of scale and verdict is not known"
         warnings.warn(InputWarning(text), stacklevel=2)
         return None
 

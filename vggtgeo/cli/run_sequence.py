@@ -27,7 +27,7 @@ from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
-from vggtgeo.results.run_folder import RESERVE, RunFolder, taken
+from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -88,7 +88,7 @@ def run_and_write(
     console = Console(stderr=False, quiet=silent)
     start, end, stride = selection
     # From the first frame to the last file a signal only ends the work early; what is there is written as a whole.
-    with interruption() as stop, taken(output.folder, output.source, RESERVE, output.resume) as folder:
+    with interruption() as stop, open_run_folder(output.folder, output.source, RESERVE, output.resume) as folder:
         checkpoints = Checkpoints(folder.checkpoint, bool(output.resume), output.checkpoint_every)
         if output.resume and not folder.checkpoint.is_file():
             typer.echo(f"there is nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)

@@ -31,9 +31,11 @@ def scene_of(source: Path) -> Scene:
     if not known:
         return scene
     times = np.concatenate([poses.timestamps for poses in known])
-    differs = scene.differs(times, np.concatenate([poses.positions for poses in known]))
-    if differs:
-        text = f"`{source / 'scene.npz'}` and the poses beside it are not of one run, or were changed since: {differs}"
+    mismatch = scene.mismatch(times, np.concatenate([poses.positions for poses in known]))
+    if mismatch:
+        text = (
+            f"`{source / 'scene.npz'}` does not match the pose files beside it (edited, or of another run): {mismatch}"
+        )
         warnings.warn(f"{text}; those of `scene.npz` are exported", InputWarning, stacklevel=4)
     return scene
 

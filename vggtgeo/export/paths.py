@@ -6,13 +6,13 @@ from pathlib import Path
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
-from vggtgeo.results.summary_file import poses_in
+from vggtgeo.results.summary_file import load_poses
 
 
 def write_tum(source: Path, target: Path) -> dict[str, float]:
     """`trajectory.txt` and `keyframes.txt`: `time x y z qx qy qz qw` a line, camera -> world."""
     for name in ("trajectory.txt", "keyframes.txt"):
-        poses_in(source, name).save_tum(target / name)
+        load_poses(source, name).save_tum(target / name)
     return {"poses": len(Trajectory.load_tum(target / "trajectory.txt"))}
 
 
@@ -21,7 +21,7 @@ def write_kitti(source: Path, target: Path) -> dict[str, float]:
 
     The format has no place for a frame without a pose: such frames are left out of both files.
     """
-    trajectory = poses_in(source, "trajectory.txt")
+    trajectory = load_poses(source, "trajectory.txt")
     rows = [" ".join(f"{value:.9e}" for value in pose[:3].reshape(-1)) for pose in trajectory.poses]
     write_text(target / "poses.txt", "".join(f"{row}\n" for row in rows))
     write_text(target / "times.txt", "".join(f"{time:.6f}\n" for time in trajectory.timestamps))

@@ -14,7 +14,7 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
-from vggtgeo.results.summary_file import poses_in
+from vggtgeo.results.summary_file import load_poses
 from vggtgeo.results.unfinished import check_can_be_shown
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import STAND_IN
@@ -46,10 +46,10 @@ def log_folder(stream: Any, folder: Path) -> None:
     import rerun as rr
 
     check_can_be_shown(folder)
-    trajectory = poses_in(folder, "trajectory.txt")
+    trajectory = load_poses(folder, "trajectory.txt")
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.set_time("frame", sequence=0)
-    entities.log_path(stream, trajectory, poses_in(folder, "keyframes.txt"))
+    entities.log_path(stream, trajectory, load_poses(folder, "keyframes.txt"))
     entities.log_map(stream, PointCloud.load_ply(folder / "map.ply"))
     if (folder / "mesh.ply").is_file():
         entities.log_mesh(stream, Mesh.load_ply(folder / "mesh.ply"))
