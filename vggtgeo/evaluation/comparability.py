@@ -1,10 +1,10 @@
-"""Whether an estimate and a truth are of one sequence at all.
+"""Check that an estimate and a ground truth belong to one sequence, so that errors are meaningful.
 
-Times alone do not tell: most sequences begin at zero and have 30 frames a second. Nor does the ATE in metres, which an
-alignment of two straight walks makes small; over the extent of the path it does. Rotations do, too: over a tenth of the
-sequence, an estimate of the same camera has less error than the camera has motion, and one of another camera has more,
-sqrt(2) times as much if the two move alike. Where the camera hardly turns over a tenth, over up to a half, which is
-told and no more: there, an estimate of the same camera may have drifted as far.
+Times do not show it: most sequences begin at zero and have 30 frames per second. The ATE in metres is small for any two
+straight paths after alignment; relative to the extent of the path it is significant. So are rotations: over a tenth of
+the sequence, a correct estimate has less rotation error than the camera has motion, an unrelated one has sqrt(2) times
+as much if both move alike. If the camera hardly rotates over a tenth, up to a half is used, for a doubt only: over such
+times a correct estimate may have drifted as far.
 """
 
 from dataclasses import dataclass
@@ -18,30 +18,28 @@ from vggtgeo.evaluation.report import ABSURD_SCALE, FEW_MATCHES
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 
-LEAST_TURN = np.radians(2.0)
-"""RMS rotation of the truth below which nothing can be said."""
-FEW = 0.5
-"""Share of the poses of the shorter trajectory that should have a partner in time."""
-LEAST_SPREAD = 0.1
-"""Metres, RMS, of the true places about their mean, below which nothing can be said."""
-WORST_SHARE = 0.4
-"""Of that spread. The truths of corridor-office, building-walk, icl-office and redkitchen, one against another from
-their first poses on, are 0.43 to 0.85 of it apart after Sim(3)."""
-
-AGREEING = 0.1
-"""Of that spread: places that are the same."""
-WIDE = 0.05
-"""Of the path's spread along its main direction, across it: a straight one may be turned about itself."""
-MOST = 0.5
-"""Share of an error that is left where something else explains most of it."""
-MOST_TURNED = np.radians(30.0)
-"""Between orientations where places agree. An estimate that follows the path is not so far off."""
+MIN_ROTATION = np.radians(2.0)
+"""RMS rotation of the ground truth below which rotations are not compared."""
+MIN_MATCHED = 0.5
+"""Expected share of matched poses, of the shorter trajectory."""
+MIN_SPREAD = 0.1
+"""RMS distance of the true positions from their mean, metres, below which positions are not compared."""
+MAX_MISFIT = 0.4
+"""Of the ATE after Sim(3), as share of that spread; ground truths of different sequences differ by more."""
+GOOD_MISFIT = 0.1
+"""Misfit below which the positions agree."""
+MIN_WIDTH = 0.05
+"""Spread of a path across its main direction, as share of that along it; less leaves a rotation about it free."""
+MAX_LEFT = 0.5
+"""Share of an error that is left if something else explains most of it."""
+MAX_ORIENTATION_GAP = np.radians(30.0)
+"""Between orientations of trajectories whose positions agree."""
 
 
 @dataclass(frozen=True)
 class Comparability:
-    """reasons: why the errors of two trajectories mean nothing, a sentence each; none where they do. doubts: what else
-    should be looked at.
+    """reasons: why errors of the two trajectories are meaningless, as sentences; empty if they are comparable. doubts:
+    what the user should check.
     """
 
     reasons: tuple[str, ...] = ()
@@ -51,88 +49,92 @@ class Comparability:
 def comparability(
     estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE, metric: bool = False
 ) -> Comparability:
-    """Whether the errors of the two mean something.
+    """Check whether errors of the two trajectories are meaningful.
 
-    They do not where too few poses match for an alignment, where rotations or places are explained no better than by a
-    camera that stands still, where the inverse poses fit better, or where an estimate that is known to be in metres
-    (`metric`) has another size altogether. InputError where no poses match within `max_dt` seconds.
+    They are not if too few poses match for an alignment, if rotations or positions fit no better than a static camera,
+    if the inverse poses fit better, or if a metric estimate has a very different scale. InputError if no poses match
+    within `max_dt` seconds.
     """
     matched, reference = associate(estimate, truth, max_dt)
     reasons: list[str] = []
     doubts: list[str] = []
     shorter = min(len(estimate), len(truth))
-    if len(matched) < FEW * shorter:
+    if len(matched) < MIN_MATCHED * shorter:
         text = f"only {len(matched)} of {shorter} poses match within {max_dt:g} s: are both of one sequence?"
         (reasons if len(matched) < FEW_MATCHES else doubts).append(text)
     ratio = rotation_misfit(matched, reference)
     if ratio is not None and ratio >= 1.0:
         reasons.append(
-            f"the estimate explains the true rotations no better than a camera that stands still (error / motion "
-            f"{ratio:.2f}): it is of another sequence, or it failed"
+            f"estimated rotations do not match the ground truth (error / motion {ratio:.2f}): wrong sequence, or "
+            "tracking failed"
         )
     longer = rotation_misfit(matched, reference, longest=0.5) if ratio is None else None
     if longer is not None and longer >= 1.0:
         doubts.append(
-            f"the camera hardly turns, and what it turns the estimate explains no better than one that stands still "
-            f"(error / motion {longer:.2f}): are both of one sequence, with poses camera to world?"
+            f"the camera hardly rotates, and the estimated rotations do not match the ground truth (error / motion "
+            f"{longer:.2f}): are both of one sequence, with poses camera to world?"
         )
-    share = place_misfit(matched, reference)
-    if share is not None and share >= WORST_SHARE:
+    share = position_misfit(matched, reference)
+    if share is not None and share >= MAX_MISFIT:
         reasons.append(
-            f"the estimate explains the true path hardly better than a camera that stands still (error after Sim(3) "
-            f"{share:.2f} of the path's spread): it is of another sequence, or it failed"
+            f"estimated positions do not match the ground truth (error after Sim(3) {share:.2f} of the path's spread): "
+            "wrong sequence, or tracking failed"
         )
-    inverse = place_misfit(Trajectory(matched.timestamps, rigid.invert(matched.poses)), reference)
-    if share is not None and inverse is not None and inverse < MOST * share:
+    inverse = position_misfit(Trajectory(matched.timestamps, rigid.invert(matched.poses)), reference)
+    if share is not None and inverse is not None and inverse < MAX_LEFT * share:
         reasons.append(
             f"the inverse of the estimated poses fits better (error after Sim(3) {inverse:.3f} of the path's spread, "
-            f"and {share:.3f} as given): they are world to camera, and must be camera to world"
+            f"{share:.3f} as given): they are world to camera, and must be camera to world"
         )
-    apart = orientation_gap(matched, reference) if share is not None and share < AGREEING else None
-    if apart is not None and apart > MOST_TURNED:
+    gap = orientation_gap(matched, reference) if share is not None and share < GOOD_MISFIT else None
+    if gap is not None and gap > MAX_ORIENTATION_GAP:
         doubts.append(
-            f"places agree, and orientations are {np.degrees(apart):.0f} deg apart: are the quaternions of both files "
-            "`qx qy qz qw`, and their poses those of the same camera? RPE says nothing here"
+            f"positions agree, but orientations differ by {np.degrees(gap):.0f} deg: are the quaternions of both files "
+            "`qx qy qz qw`, and the poses of the same camera? The RPE is not meaningful"
         )
     scale = absolute_error(matched, reference, "sim3").alignment.scale if len(matched) >= FEW_MATCHES else 1.0
     if metric and not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE:
         reasons.append(
-            f"the estimate is in metres, and the truth {scale:.3g} times as large: it is of another sequence, or unit"
+            f"the estimate is in metres, but the ground truth is {scale:.3g} times as large: wrong sequence, or unit"
         )
     return Comparability(tuple(reasons), tuple(doubts))
 
 
-def place_misfit(matched: Trajectory, reference: Trajectory) -> float | None:
-    """ATE after Sim(3) over the RMS distance of the true places from their mean; None where the camera hardly moves,
-    or the poses are too few for an alignment to leave an error.
+def position_misfit(matched: Trajectory, reference: Trajectory) -> float | None:
+    """Return the ATE after Sim(3) over the RMS distance of the true positions from their mean.
+
+    None if the camera hardly moves, or the poses are too few for an alignment to leave an error.
     """
     spread = float(np.sqrt(np.mean(np.sum((reference.positions - reference.positions.mean(axis=0)) ** 2, axis=1))))
-    if spread < LEAST_SPREAD or len(matched) < FEW_MATCHES:
+    if spread < MIN_SPREAD or len(matched) < FEW_MATCHES:
         return None
     return absolute_error(matched, reference, "sim3").statistics.rmse / spread
 
 
 def orientation_gap(matched: Trajectory, reference: Trajectory) -> float | None:
-    """Median angle between orientations after the Sim(3) alignment of the places, radians; None where these lie on a
-    line, and leave the turn about it open.
+    """Return the median angle between orientations after Sim(3) alignment of the positions, radians.
+
+    None for a straight path, about which the rotation is free.
     """
     along, across, _ = np.linalg.svd(reference.positions - reference.positions.mean(axis=0), compute_uv=False)
-    if across <= WIDE * along:
+    if across <= MIN_WIDTH * along:
         return None
     aligned = absolute_error(matched, reference, "sim3").alignment.trajectory(matched)
     return float(np.median(rotation_angle(aligned.rotations.swapaxes(1, 2) @ reference.rotations)))
 
 
 def rotation_misfit(matched: Trajectory, reference: Trajectory, longest: float = 0.1) -> float | None:
-    """RMS rotation error over RMS rotation of the truth, over pairs a tenth of the sequence apart, or twice as far, and
-    so on up to the share `longest`, where the camera turns enough; None where it never does.
+    """Return RMS rotation error over RMS rotation of the ground truth.
+
+    Pairs are a tenth of the sequence apart, doubled up to the share `longest` until the camera rotates enough; None if
+    it never does.
     """
     delta = max(len(matched) // 10, 1)
     while delta < len(matched):
         first = np.arange(len(matched) - delta)
-        turned = rotation_angle(reference.rotations[first].swapaxes(1, 2) @ reference.rotations[first + delta])
-        motion = float(np.sqrt(np.mean(turned**2)))
-        if motion >= LEAST_TURN:
+        angles = rotation_angle(reference.rotations[first].swapaxes(1, 2) @ reference.rotations[first + delta])
+        motion = float(np.sqrt(np.mean(angles**2)))
+        if motion >= MIN_ROTATION:
             error = relative_error(matched, reference, delta, all_pairs=True).rotation
             return float(np.sqrt(np.mean(error**2))) / motion
         delta *= 2
