@@ -28,11 +28,11 @@ from vggtgeo.viewing.target import check_target, has_screen
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("view", "nowhere", "--rerun", "a.rrd"), "`nowhere` is no folder"),
-        (("view", ".", "--rerun", "a.rrd"), "has no `trajectory.txt`"),
-        (("view", ".", "--rerun", "spawn"), "has no `trajectory.txt`"),
-        (("view", ".", "--rerun", "picture.png"), "it must be `spawn`"),
-        (("run", "nowhere", "--rerun", "show"), "it must be `spawn`"),
+        (("view", "nowhere", "--rerun", "a.rrd"), "`nowhere` is not a folder"),
+        (("view", ".", "--rerun", "a.rrd"), "`trajectory.txt` is missing"),
+        (("view", ".", "--rerun", "spawn"), "`trajectory.txt` is missing"),
+        (("view", ".", "--rerun", "picture.png"), "`--rerun` must be `spawn`"),
+        (("run", "nowhere", "--rerun", "show"), "`--rerun` must be `spawn`"),
     ],
 )
 def test_what_is_wrong_is_said_first(

@@ -14,9 +14,9 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from vggtgeo.datasets.frame import Sequence
+from vggtgeo.figures.map_view import result_figure
 from vggtgeo.figures.plot import check_truth, plot
 from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
-from vggtgeo.figures.result_figure import result_figure
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
