@@ -13,7 +13,7 @@ import tiny_sequences
 from recorded_run import RecordedRun, recorded_run
 
 import vggtgeo as vg
-from vggtgeo.cli.run_sequence import _once_more
+from vggtgeo.cli.run_sequence import _reopen
 from vggtgeo.datasets import open_sequence
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.consistency import PosedDepth
@@ -143,10 +143,10 @@ def test_a_lost_frame_has_its_own_depth_alone(run: RecordedRun) -> None:
     assert dict(depth_of_frames(slam, maps))[lost.frame] is None
 
 
-def test_the_command_reads_every_frame_once_more(tmp_path: Path) -> None:
+def test_the_command_reads_every_frame_reopen(tmp_path: Path) -> None:
     # Proves that pictures of frames without depth are kept, too, and that depth which no role used is not read.
     images = tiny_layouts.quietly_opened(tiny_sequences.images(tmp_path / "images"))
     both = open_sequence(tiny_sequences.tum(tmp_path / "tum"))
-    assert len(list(_once_more(images, default_roles(False), SlamSettings()).frames())) == len(images)
-    assert _once_more(both, default_roles(True), SlamSettings()).has_depth
-    assert not _once_more(both, default_roles(False), SlamSettings()).has_depth
+    assert len(list(_reopen(images, default_roles(False), SlamSettings()).frames())) == len(images)
+    assert _reopen(both, default_roles(True), SlamSettings()).has_depth
+    assert not _reopen(both, default_roles(False), SlamSettings()).has_depth

@@ -97,7 +97,7 @@ def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None
     said = {
         "free (no metric depth): lengths have no unit": "in the unit of GT, which is not the metre",
         "metric": None,
-        None: "in the unit of GT, which its file does not say",
+        None: "in the unit of GT, which is not known",
     }
     for scale, words in said.items():
         (tmp_path / "run" / "summary.json").unlink(missing_ok=True)
@@ -137,7 +137,7 @@ def test_what_the_user_gave_wrong_is_an_input_error(tmp_path: Path) -> None:
     # Proves that bad input leaves as `InputError`, which the program's entry turns into one line, not a traceback.
     estimate, _ = _files(tmp_path)
     tiny.images(tmp_path / "images")
-    for truth, message in ((tmp_path / "no.txt", "is not there"), (tmp_path / "images", "has no truth")):
+    for truth, message in ((tmp_path / "no.txt", "is not there"), (tmp_path / "images", "has no ground truth")):
         result = CliRunner().invoke(app, [str(estimate), str(truth)])
         assert isinstance(result.exception, InputError)
         assert message in str(result.exception)
@@ -210,7 +210,7 @@ def test_lengths_in_another_unit_are_told_where_they_are_compared() -> None:
         poses[:, :3, 3] /= factor
         report = evaluate_trajectory(Trajectory(truth.timestamps, poses), truth)
         line = errors_line({**report.as_dict(), "in_metres": True}, free=False)
-        assert ("takes lengths 5 times: are depth and truth in one unit?" in line) == (factor == 5.0)
+        assert ("with scale 5: are depth and ground truth in the same unit?" in line) == (factor == 5.0)
         assert ("the scale is 5: the units differ" in str(report)) == (factor == 5.0)
 
 

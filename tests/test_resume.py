@@ -289,5 +289,5 @@ def test_the_command_says_what_it_does(tmp_path: Path) -> None:
     assert call("--no-resume").exit_code == 3
     begun = call("--resume")
     assert begun.exit_code == 3
-    assert f"there is nothing to resume in `{tmp_path / 'out'}`: the run begins at its first frame" in begun.stderr
+    assert f"nothing to resume in `{tmp_path / 'out'}`: the run begins at its first frame" in begun.stderr
     assert "resume" not in (tmp_path / "out/settings.toml").read_text()

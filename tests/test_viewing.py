@@ -100,7 +100,7 @@ def test_view_names_the_recording_where_there_is_no_screen(tmp_path: Path, monke
     (tmp_path / "run.rrd").write_bytes(b"")
     result = CliRunner().invoke(make_app(), ["view", str(tmp_path)])
     assert result.exit_code == 2
-    assert "look at it with `rerun" in result.stderr
+    assert "with `rerun" in result.stderr
 
 
 @pytest.mark.parametrize(
