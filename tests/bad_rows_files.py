@@ -20,7 +20,7 @@ from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem_file import load_problem
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.results.source import opened
+from vggtgeo.results.source import open_source
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 
 PICTURE = bad.picture(1)
@@ -212,7 +212,7 @@ DEPTH = rows(
     ],
     call=read_frames,
 )
-OPENED: dict[str, Any] = {"call": lambda made: opened(made, None, SlamSettings())}
+OPENED: dict[str, Any] = {"call": lambda made: open_source(made, None, SlamSettings())}
 """As a run opens a sequence: a truth that cannot be read costs the comparison only."""
 LISTS = rows(
     "Lists and poses",

@@ -10,7 +10,7 @@ import tiny_sequences as tiny
 from bad_row import good, nothing, rows, run_with
 from bad_rows_results import folder_of_run, write
 
-from vggtgeo.results.run_folder import taken
+from vggtgeo.results.run_folder import open_run_folder
 
 
 def output(make: Any, name: str) -> dict[str, Any]:
@@ -59,13 +59,13 @@ def result_with_images(folder: Path) -> Path:
 
 def locked(folder: Path) -> None:
     """A run into a folder that another run holds."""
-    with taken(folder / "out"), taken(folder / "out"):
+    with open_run_folder(folder / "out"), open_run_folder(folder / "out"):
         pass
 
 
 def laid_in(folder: Path) -> None:
     """A run in whose `unfinished` somebody lays a file; it is still there behind it."""
-    with taken(folder / "out") as run:
+    with open_run_folder(folder / "out") as run:
         (run.stage / "trajectory.txt").write_text("")
         (run.stage / "mine.txt").write_text("of the user")
         run.publish()

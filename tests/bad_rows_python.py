@@ -31,7 +31,7 @@ from vggtgeo.export import export
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.results.source import opened
+from vggtgeo.results.source import open_source
 from vggtgeo.simulation import Sensor
 from vggtgeo.slam.run import in_order
 
@@ -181,7 +181,7 @@ class OneArray:
 
 def as_they_are_in_a_run(_: Path) -> None:
     """Frames of such a sequence keep their own images."""
-    frames = list(opened(OneArray(), None, vg.SlamSettings()).frames.frames())
+    frames = list(open_source(OneArray(), None, vg.SlamSettings()).frames.frames())
     assert all((frame.image == image).all() for frame, image in zip(frames, IMAGES, strict=True))
 
 

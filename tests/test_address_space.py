@@ -8,7 +8,7 @@ from pathlib import Path
 import bad_files as bad
 import pytest
 
-from vggtgeo.cli.address_space import LEAST, check_address_space
+from vggtgeo.cli.address_space import MIN_GB, check_address_space
 from vggtgeo.cli.main import COMMANDS
 
 
@@ -23,8 +23,8 @@ def test_a_command_that_would_be_aborted_does_not_begin(tmp_path: Path) -> None:
     done = limited(1500, "demo", "-o", tmp_path / "out")
     assert done.returncode == 2
     assert done.stderr == (
-        "error: the address space is limited to 1.5 GB (`ulimit -v`); `demo` needs 3 GB at least: raise the limit, or "
-        "lift it\n"
+        "error: the address space is limited to 1.5 GB (`ulimit -v`); `demo` needs at least 3 GB: raise or remove "
+        "the limit\n"
     )
     assert list(tmp_path.iterdir()) == []
     assert limited(500, "run", "--help").returncode == 0
@@ -49,12 +49,12 @@ from vggtgeo.cli import main; main()"""
     command = [sys.executable, "-c", script, "run", str(tmp_path / "frames"), "-o", "out"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "error: the folder that this command was started in is gone; change to another (`cd`)\n"
+    assert done.stderr == "error: the working folder no longer exists; change to another (`cd`)\n"
 
 
 def test_each_command_of_the_table_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """And without a limit nothing is asked of any."""
-    assert set(LEAST) <= {entry.name for entry in COMMANDS}
+    assert set(MIN_GB) <= {entry.name for entry in COMMANDS}
     monkeypatch.setattr("resource.getrlimit", lambda kind: (resource.RLIM_INFINITY,) * 2)
     for entry in COMMANDS:
         check_address_space(entry.name)

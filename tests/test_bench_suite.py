@@ -14,7 +14,7 @@ from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.provenance import input_hash, source_digest
 from vggtgeo.benchmark.published import published
 from vggtgeo.benchmark.store import Store
-from vggtgeo.benchmark.suite import limited, load_suite, read_suite, shipped
+from vggtgeo.benchmark.suite import load_suite, read_suite, restrict, shipped
 from vggtgeo.io.errors import InputError, InputWarning
 
 WANTED = {"paper", "tum", "7scenes", "euroc", "replica", "tanks", "simulated", "stress", "quick", "clips"}
@@ -94,14 +94,14 @@ def test_a_fingerprint_changes_with_what_a_result_depends_on(tmp_path: Path) -> 
         (("title =", "titel ="), r"`tiny.toml` has the key `titel`; it may have name, title"),
         (('scene = "room", frames = 4 }', 'scene = "room" }\npath = "x"'), "either a `path` or a table `simulate`"),
         (("use_lines", "use_line"), r"\[\[setting\]\] 2: `line.use_line` is no setting; the nearest is"),
-        (('baseline = "full"', 'baseline = "best"'), "`baseline` is 'best', which is no setting"),
-        (('name = "bare"', 'name = "full"'), "setting full: each name may be there once"),
-        (('name = "walk"', 'name = "../walk"'), "`name` is '../walk'"),
+        (('baseline = "full"', 'baseline = "best"'), "`baseline` is 'best'"),
+        (('name = "bare"', 'name = "full"'), "`setting` has the name full"),
+        (('name = "walk"', 'name = "../walk"'), r"`name` .*'../walk'"),
         (('name = "hall"', 'name = "hall"\nprotocol = "orb"'), "`protocol` is 'orb'; it must be one of every-frame"),
-        (('name = "bare"', 'name = "bare"\nsequences = ["attic"]'), r"names the sequences \['attic'\]"),
+        (('name = "bare"', 'name = "bare"\nsequences = ["attic"]'), r"`sequences` .*\['attic'\]"),
         (('name = "bare"', 'name = "bare"\nstart_of_pose = "window"'), "`start_of_pose` is 'window'"),
         (("seeds = 3", "seeds = 0"), "`seeds` is 0; it must be positive"),
-        (("seeds = 3", "seeds = "), "is no TOML"),
+        (("seeds = 3", "seeds = "), "TOML"),
         (("seeds = 3", "seeds = 2.5"), "`seeds` is 2.5; it must be a whole number"),
         (("seeds = 3", "seeds = 'three'"), "`seeds` is 'three'; it must be a whole number"),
         (("seeds = 3", "seeds = 3\ntimeout_minutes = 'long'"), "`timeout_minutes` is 'long'; it must be a number"),
@@ -124,7 +124,7 @@ def test_a_fingerprint_changes_with_what_a_result_depends_on(tmp_path: Path) -> 
             ('name = "hall"', 'name = "hall"\nreferences = ["a.txt"]'),
             r"`references` is \['a.txt'\]; it must be a table",
         ),
-        (('name = "hall"', f'name = "{"h" * 101}"'), "`name` is of 101 letters, hhhhhhhhhhhhhhhhhhhh...; it must be"),
+        (('name = "hall"', f'name = "{"h" * 101}"'), r"`name` .*101"),
         (('name = "bare"', 'name = "bare"\nsequences = "walk"'), "`sequences` is 'walk'; it must be a list of texts"),
         (('name = "bare"', 'name = "bare"\ndepth_errors = -1'), "`depth_errors` is -1"),
         (("[setting.set.line]\nuse_lines = false", "set = 3"), "`set` is 3; it must be a table of groups"),
@@ -132,9 +132,9 @@ def test_a_fingerprint_changes_with_what_a_result_depends_on(tmp_path: Path) -> 
             ("[setting.set.line]\nuse_lines = false", "[setting.set]\nline = 3"),
             "`set` is .*; it must be a table of groups",
         ),
-        (("seeds = 3", "seeds = 100000000"), "are 400,000,000 runs; at most 1,000,000 can be"),
-        (("seeds = 3", "seeds = 3\nfirst_seed = 99999999999999999999"), "seeds go to 100000000000000000001"),
-        (("seeds = 3", 'seeds = 3\npublished = ["tmu"]'), "there is no published table `tmu`; there are 7scenes"),
+        (("seeds = 3", "seeds = 100000000"), "400,000,000"),
+        (("seeds = 3", "seeds = 3\nfirst_seed = 99999999999999999999"), "`seeds` go to 100000000000000000001"),
+        (("seeds = 3", 'seeds = 3\npublished = ["tmu"]'), r"`published` .*7scenes.*`tmu`"),
         (
             ("[[sequence]]", '[[external]]\nname = "o"\nfiles = "{scene}.txt"\n[[sequence]]'),
             "`files` has `{scene}`; it may",
@@ -169,12 +169,12 @@ def test_the_hash_of_a_recording_bears_any_name_and_what_goes_away(tmp_path: Pat
 
 def test_a_part_of_a_suite_keeps_what_belongs_together() -> None:
     # Proves the choice of sequences, settings, seeds and frames, and the refusal of a name that is not there.
-    part = limited(tiny.suite(), ("hall",), ("bare",), seeds=1, first_seed=5, frames=2)
+    part = restrict(tiny.suite(), ("hall",), ("bare",), seeds=1, first_seed=5, frames=2)
     (job,) = jobs_of(part, ())
     assert (job.name, job.spec["simulate"]["frames"], part.base) == ("hall.bare.5", 2, "bare")
-    with pytest.raises(InputError, match=r"`settings` holds \['E'\]; choose among full, bare"):
-        limited(tiny.suite(), settings=("E",))
-    hall = limited(load_suite("paper"), ("hall",))
+    with pytest.raises(InputError, match=r"`settings` .*full, bare.*\['E'\]"):
+        restrict(tiny.suite(), settings=("E",))
+    hall = restrict(load_suite("paper"), ("hall",))
     assert {job.setting for job in jobs_of(hall, ())} == {"full"}
 
 
@@ -188,7 +188,7 @@ def test_a_recording_is_found_below_any_data_folder(tmp_path: Path) -> None:
     assert find_sequences("xyz", folders) == []
     text = tiny.TEXT.replace('simulate = { scene = "hall", frames = 4 }', 'path = "desk"')
     with pytest.warns(
-        InputWarning, match=rf"found below the folders of recordings: hall in `{tmp_path}/b/tum/fr1/desk`$"
+        InputWarning, match=rf"recordings found in subfolders of `data`: hall in `{tmp_path}/b/tum/fr1/desk`$"
     ):
         jobs = jobs_of(read_suite(text, "t", "t"), folders)
     assert jobs[-1].present
@@ -213,10 +213,10 @@ def test_a_recording_that_is_not_there_is_told_where_it_was_looked_for(tmp_path:
     text = tiny.TEXT.replace('simulate = { scene = "hall", frames = 4 }', 'path = "desk"')
     job = jobs_of(read_suite(text, "t", "t"), [tmp_path])[-1]
     assert not job.present
-    expected = f"no `desk` in `{tmp_path}`, nor one or two folders below"
+    expected = f"`desk` not found in `{tmp_path}`, nor in subfolders two levels deep"
     assert Store(tmp_path / "out", "t", "s").absent(job)["message"] == expected
     alone = Store(tmp_path / "out", "t", "s").absent(tiny.jobs(text)[-1])
-    assert alone["message"] == "no `desk`, as no folder of recordings is known: give `--data FOLDER`"
+    assert alone["message"] == "`desk` not found, no folder of recordings is known: give `--data FOLDER`"
 
 
 def test_protocols_say_whose_they_are() -> None:

@@ -94,7 +94,7 @@ def test_what_has_no_result_is_told() -> None:
     rows.append(row("hall", "full", 0, None, status="absent"))
     text = markdown.page(tiny.suite(), rows)
     assert "| walk | full | 2 | crash | ended by SIGSEGV |" in text
-    assert "Not there: hall" in text
+    assert "Missing recordings: hall" in text
     assert "## Provenance" not in text, "an empty table"
     assert "## Provenance" in markdown.page(tiny.suite(), [row("walk", "full", 0, 2.0, version="0.1.0")])
     assert "| full system | 3.00 ± 1.41 (2 of 3) |" in text
@@ -138,7 +138,7 @@ def test_the_tables_say_what_makes_a_row_doubtful() -> None:
     text = markdown.page(tiny.suite(), [good, gone, other])
     assert "## Warnings" in text
     assert "| walk | full | 0 | the scale is 7 |" in text
-    assert "1 run, 1 more whose recording is not there, 1 of other systems." in text
+    assert "1 run, 1 more without their recording, 1 of other systems." in text
     assert "## Warnings" not in markdown.page(tiny.suite(), ROWS)
 
 

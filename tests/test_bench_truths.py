@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.benchmark.inputs import Input, open_input
 from vggtgeo.benchmark.jobs import jobs_of
 from vggtgeo.benchmark.map_errors import pooled_depth_errors, thinned
-from vggtgeo.benchmark.measure import measured
+from vggtgeo.benchmark.measure import measure
 from vggtgeo.evaluation import Similarity, pose_consistency
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
@@ -69,16 +69,16 @@ def test_a_scene_of_tanks_and_temples_is_compared_with_its_scan(tmp_path: Path) 
     own = Similarity(turn, np.array([3.0, 1.0, -2.0]), 0.37)
     half = inside[::2]
     made = np.concatenate([half, half + [0.0, 0.3, 0.0], outside[:7]])
-    row = measured(_result(own.trajectory(truth), own.points(made), metric=False), given, spec)
+    row = measure(_result(own.trajectory(truth), own.points(made), metric=False), given, spec)
     assert row["ate_sim3_m"] == pytest.approx(0.0, abs=1e-9)
     assert row["precision"] == pytest.approx(0.5, abs=0.01)
     assert row["recall"] == pytest.approx(0.5, abs=0.01)
     assert row["f_score"] == pytest.approx(0.5, abs=0.01)
-    far = measured(_result(own.trajectory(truth), own.points(outside), metric=False), given, spec)
+    far = measure(_result(own.trajectory(truth), own.points(outside), metric=False), given, spec)
     assert (far["f_score"], far["precision"], far["recall"]) == (0.0, 0.0, 0.0)
     (folder / "Ignatius_trans.txt").unlink()  # the poses are not in the frame of the scan
     unknown, spec = _given(folder, "")
-    assert "f_score" not in measured(_result(own.trajectory(truth), own.points(made), metric=False), unknown, spec)
+    assert "f_score" not in measure(_result(own.trajectory(truth), own.points(made), metric=False), unknown, spec)
 
 
 def test_a_reference_is_read_before_the_run(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_reference_is_read_before_the_run(tmp_path: Path) -> None:
     assert truth is not None
     Similarity(np.eye(3), np.zeros(3), 2.0).trajectory(truth).save_tum(folder / "twice.txt")
     given, spec = _given(folder, line)
-    row = measured(_result(truth, np.zeros((1, 3)), metric=False), given, spec)
+    row = measure(_result(truth, np.zeros((1, 3)), metric=False), given, spec)
     assert row["ate_sim3_twice_m"] == pytest.approx(0.0, abs=1e-6)
 
 
@@ -123,16 +123,16 @@ def test_a_recording_whose_depth_is_exact_has_errors_of_depth_map_and_mesh(tmp_p
     mesh = Mesh(world, np.array([[0, 1, 2], [1, 3, 2]], np.int32), np.zeros((4, 3)), np.zeros((4, 3), np.uint8))
     # what the pixels (20, 16) and (24, 16) show
     seen = np.array([[1 / 35, 3 / 36, 2], [9 / 35, 3 / 36, 2]]) @ pose[:3, :3].T + pose[:3, 3]
-    row = measured(_result(truth, seen, True, saved_mesh=mesh), given, spec)
+    row = measure(_result(truth, seen, True, saved_mesh=mesh), given, spec)
     assert row["precision"] == 1.0
     assert 0.0 < row["recall"] < 0.1
     assert row["mesh_completeness_m"] < row["completeness_m"]
-    assert "mesh_f_score" not in measured(_result(truth, seen, True, saved_mesh=mesh), given, {**spec, "pages": False})
+    assert "mesh_f_score" not in measure(_result(truth, seen, True, saved_mesh=mesh), given, {**spec, "pages": False})
     alone, _ = _given(tiny_sequences.images(tmp_path / "images"), "exact_depth = true")
     assert alone.exact is None  # nothing to compare with is no reason to run nothing
     wide = tiny_sequences.tum(tmp_path / "wide")
     tiny_sequences.write_calibration(wide, (*tiny_sequences.INTRINSICS, -0.3, 0.1, 0.0, 0.0))
-    with pytest.raises(InputError, match="`exact_depth` is true of `wide`, whose lens distorts"):
+    with pytest.raises(InputError, match=r"`exact_depth` .*`wide`"):
         _given(wide, "exact_depth = true")
 
 
@@ -155,7 +155,7 @@ def test_nees_tells_whether_stated_deviations_are_those_of_the_errors(factor: fl
     place, rotation = pose_consistency(Trajectory(times, off), truth, sigma, turned, scale)
     assert place.mean / 3 == pytest.approx(factor**2, rel=0.15)
     assert rotation.mean / 3 == pytest.approx(factor**2, rel=0.15)
-    with pytest.raises(InputError, match="expected as many standard deviations"):
+    with pytest.raises(InputError, match="`place_sigma`"):
         pose_consistency(truth, truth, sigma[1:], turned[1:])
 
 
@@ -168,7 +168,7 @@ def test_a_run_that_states_deviations_has_its_nees_in_the_row(tmp_path: Path) ->
     own = Similarity(np.eye(3), np.zeros(3), 0.5).trajectory(truth)
     own.poses[3, 0, 3] += 0.05
     stated = PoseUncertainty(own.timestamps, np.full(8, 0.05), np.full(8, 0.01))
-    row = measured(_result(own, np.zeros((0, 3)), False, saved_uncertainty=stated), given, spec)
+    row = measure(_result(own, np.zeros((0, 3)), False, saved_uncertainty=stated), given, spec)
     assert row["nees_place"] == pytest.approx(1 / 24, rel=0.2)
     assert row["nees_rotation"] == pytest.approx(0.0, abs=1e-9)
-    assert "nees_place" not in measured(_result(own, np.zeros((0, 3)), False), given, spec)
+    assert "nees_place" not in measure(_result(own, np.zeros((0, 3)), False), given, spec)

@@ -296,7 +296,9 @@ def test_a_solve_without_compilation_does_not_begin(tmp_path: Path, monkeypatch:
     monkeypatch.setenv("JAX_DISABLE_JIT", "1")
     result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
     assert result.exit_code == 2
-    assert result.stderr == "error: the environment variable `JAX_DISABLE_JIT` is set; `solve` is compiled: unset it\n"
+    assert (
+        result.stderr == "error: the environment variable `JAX_DISABLE_JIT` is set, but `solve` needs JIT: unset it\n"
+    )
     assert not (tmp_path / "solution.npz").exists()
     assert invoke("data", "list").exit_code == 0
 

@@ -54,7 +54,7 @@ def test_nothing_is_wrong_with_a_good_recording(tmp_path: Path) -> None:
     assert outcome.exit_code == 0, outcome.output
     for text in ("reader: TumRgbd", "6 frames of 40 x 30", "10.0 frames a second", "truth: 12 poses, path 0.11 m"):
         assert text in outcome.stdout
-    assert outcome.stdout.rstrip().endswith("nothing wrong found")
+    assert outcome.stdout.rstrip().endswith("no problem found")
 
 
 @pytest.mark.parametrize(

@@ -63,9 +63,7 @@ def test_a_run_in_metres_of_another_size_is_of_another_sequence(tmp_path: Path) 
     Trajectory(small.timestamps, poses).save_tum(tmp_path / "trajectory.txt")
     assert CliRunner().invoke(app, [str(tmp_path / "trajectory.txt"), str(truth)]).exit_code == 0
     (tmp_path / "summary.json").write_text(json.dumps({"scale": "metric, by the depth"}))
-    with pytest.warns(
-        InputWarning, match="in metres, and the truth 4 times as large: it is of another sequence, or unit"
-    ):
+    with pytest.warns(InputWarning, match="in metres, but the ground truth is 4 times as large"):
         found = CliRunner().invoke(app, [str(tmp_path), str(truth)])
     assert found.exit_code == 3
     assert "NOT COMPARABLE" in found.output
@@ -99,7 +97,7 @@ def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None
     said = {
         "free (no metric depth): lengths have no unit": "in the unit of GT, which is not the metre",
         "metric": None,
-        None: "in the unit of GT, which its file does not say",
+        None: "in the unit of GT, which is not known",
     }
     for scale, words in said.items():
         (tmp_path / "run" / "summary.json").unlink(missing_ok=True)
@@ -139,7 +137,7 @@ def test_what_the_user_gave_wrong_is_an_input_error(tmp_path: Path) -> None:
     # Proves that bad input leaves as `InputError`, which the program's entry turns into one line, not a traceback.
     estimate, _ = _files(tmp_path)
     tiny.images(tmp_path / "images")
-    for truth, message in ((tmp_path / "no.txt", "is not there"), (tmp_path / "images", "has no truth")):
+    for truth, message in ((tmp_path / "no.txt", "is not there"), (tmp_path / "images", "has no ground truth")):
         result = CliRunner().invoke(app, [str(estimate), str(truth)])
         assert isinstance(result.exception, InputError)
         assert message in str(result.exception)
@@ -157,8 +155,8 @@ def _walk(seed: int, turning: bool, begin: float = 0.0) -> Trajectory:
 @pytest.mark.parametrize(
     ("truth", "said"),
     [
-        (_walk(2, turning=True), "explains the true rotations no better than a camera that stands still"),
-        (_walk(2, turning=False), "explains the true path hardly better than a camera that stands still"),
+        (_walk(2, turning=True), "estimated rotations do not match"),
+        (_walk(2, turning=False), "estimated positions do not match"),
         (_walk(1, turning=True, begin=6.5), "only 5 of 200 poses match"),
         (_walk(1, turning=True, begin=9.0), None),
     ],
@@ -199,7 +197,7 @@ def test_a_camera_that_hardly_turns_tells_of_strangers_over_longer_times(tmp_pat
         warnings.simplefilter("always")
         outcome = CliRunner().invoke(app, [str(tmp_path / "trajectory.txt"), str(tmp_path / "truth.txt")])
     assert outcome.exit_code == (3 if inverted else 0), outcome.output
-    assert [True for one in warned if "hardly turns" in str(one.message)] == [True] * inverted
+    assert [True for one in warned if "hardly rotates" in str(one.message)] == [True] * inverted
     assert [True for one in warned if "they are world to camera" in str(one.message)] == [True] * inverted
 
 
@@ -212,8 +210,8 @@ def test_lengths_in_another_unit_are_told_where_they_are_compared() -> None:
         poses[:, :3, 3] /= factor
         report = evaluate_trajectory(Trajectory(truth.timestamps, poses), truth)
         line = errors_line({**report.as_dict(), "in_metres": True}, free=False)
-        assert ("takes lengths 5 times: are depth and truth in one unit?" in line) == (factor == 5.0)
-        assert ("the scale is 5: the two are not in one unit" in str(report)) == (factor == 5.0)
+        assert ("with scale 5: are depth and ground truth in the same unit?" in line) == (factor == 5.0)
+        assert ("the scale is 5: the units differ" in str(report)) == (factor == 5.0)
 
 
 def test_an_estimate_without_scale_or_of_a_part_is_a_success(tmp_path: Path) -> None:

@@ -227,12 +227,12 @@ def test_doubtful_numbers_are_named() -> None:
     good = Trajectory(truth.timestamps, _estimate(truth).poses)
     assert evaluate_trajectory(good, truth).warnings == ()
     assert "only 5 poses match" in evaluate_trajectory(good.select(slice(0, 5)), truth).warnings[0]
-    assert "follows 25 %" in evaluate_trajectory(good.select(slice(0, 31)), truth).warnings[0]
+    assert "covers 25 %" in evaluate_trajectory(good.select(slice(0, 31)), truth).warnings[0]
     scaled = Trajectory(truth.timestamps, _scaled(good.poses, 9.0))
     assert "the scale is 0.111" in evaluate_trajectory(scaled, truth).warnings[0]
     assert evaluate_trajectory(good, truth, delta=119).warnings == ()
-    assert "no two of them are 120 poses apart" in evaluate_trajectory(good, truth, delta=120).warnings[0]
-    assert "no two of them are 1e+06 metres" in evaluate_trajectory(good, truth, delta=1e6, unit="metres").warnings[0]
+    assert "no two poses are 120 poses apart" in evaluate_trajectory(good, truth, delta=120).warnings[0]
+    assert "no two poses are 1e+06 metres" in evaluate_trajectory(good, truth, delta=1e6, unit="metres").warnings[0]
     shifted = Trajectory(truth.timestamps + np.where(np.arange(120) % 3, 0.012, 0.0), good.poses)
     assert "only 40 of 120 poses match" in evaluate_trajectory(shifted, truth, max_dt=1e-4).warnings[0]
 
@@ -360,7 +360,7 @@ def test_a_scale_that_means_nothing_is_said(still: str) -> None:
     moving = _truth()
     fixed = Trajectory(moving.timestamps, np.repeat(moving.poses[:1], len(moving), axis=0))
     found = vg.evaluate(fixed, moving) if still == "estimate" else vg.evaluate(moving, fixed)
-    assert found.warnings == (f"all poses of the {still} are at one place: the scale says nothing",)
+    assert found.warnings == (f"all positions of the {still} are equal: the scale is undefined",)
     assert not vg.evaluate(moving, moving).warnings
 
 
@@ -399,9 +399,9 @@ def test_what_cannot_be_compared_is_said() -> None:
         associate(truth, later)
     with pytest.raises(InputError, match=r"2 poses match.*at least 3"):
         evaluate_trajectory(truth.select(slice(0, 2)), truth)
-    with pytest.raises(InputError, match="`max_dt` is nan"):
+    with pytest.raises(InputError, match=r"`max_dt` .*nan"):
         associate(truth, truth, max_dt=np.nan)
-    with pytest.raises(InputError, match="`delta` is 0"):
+    with pytest.raises(InputError, match=r"`delta` .*0"):
         relative_error(truth, truth, delta=0)
     with pytest.raises(InputError, match="match them first"):
         absolute_error(truth, truth.select(slice(0, 5)))

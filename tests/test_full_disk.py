@@ -22,7 +22,7 @@ VIEW = """
 import resource, sys
 from vggtgeo.cli.main import main
 from vggtgeo.viewing import target
-target._STANDSTILL = 0.5
+target._STALL_TIMEOUT = 0.5
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)), -1))
 main()
 """
@@ -56,7 +56,7 @@ def test_a_file_that_grows_is_waited_for(tmp_path: Path, monkeypatch: pytest.Mon
     """A slow disk is no full one: while the file grows, the flush is asked for again; one that stands still is given
     up. Oracle: the number of flushes by hand.
     """
-    monkeypatch.setattr(target, "_leave_open", lambda stream: None)
+    monkeypatch.setattr(target, "_abandon", lambda stream: None)
     file = tmp_path / "run.rrd"
     stream = MagicMock()
     left = [b"a", b"b", b"c"]
@@ -71,14 +71,14 @@ def test_a_file_that_grows_is_waited_for(tmp_path: Path, monkeypatch: pytest.Mon
     assert target.flush(stream, file) == ""
     assert stream.flush.call_count == 4
     stream.flush.side_effect = RuntimeError("Flush timed out")
-    assert "run.rrd` is cut short: Flush timed out" in target.flush(stream, file)
+    assert "run.rrd` is incomplete: Flush timed out" in target.flush(stream, file)
     assert stream.flush.call_count == 6
 
 
 @pytest.mark.parametrize("file", [None, Path("run.rrd")])
 def test_a_recording_that_fails_costs_a_run_a_warning(file: Path | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the end of a run the reason is told, and only a file counts as cut short; oracle: the stream's error."""
-    monkeypatch.setattr(target, "_leave_open", lambda stream: None)
+    monkeypatch.setattr(target, "_abandon", lambda stream: None)
     stream = MagicMock()
     stream.flush.side_effect = RuntimeError("it is gone")
     run = recorded_run()

@@ -17,7 +17,7 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.fusion import SurfaceFusion, fused_mesh
-from vggtgeo.mapping.tsdf import View, blocks_of, joined
+from vggtgeo.mapping.tsdf import View, blocks_of, merge_meshes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 RADIUS, AWAY, VOXEL = 0.5, 2.0, 0.04
@@ -134,7 +134,7 @@ def test_a_second_view_changes_what_one_view_is_enough_for() -> None:
     assert len(fusion.mesh.faces)
     fusion.update(*opposite)
     same(fusion.mesh, fused_mesh(*opposite, INTRINSICS, VOXEL))
-    with pytest.raises(InputError, match="`bound` is -1"):
+    with pytest.raises(InputError, match=r"`bound` .*-1"):
         SurfaceFusion(INTRINSICS, VOXEL, bound=-1)
 
 
@@ -143,7 +143,7 @@ def test_the_mesh_of_a_building_is_joined() -> None:
     keyframes, depth_maps = sphere_views()
     part = fused_mesh(keyframes[:4], depth_maps[:4], INTRINSICS, VOXEL, 1)
     far = replace(part, vertices=part.vertices + np.float32([150, 120, 50]))
-    whole = joined([part, far, part, far], VOXEL)
+    whole = merge_meshes([part, far, part, far], VOXEL)
     assert len(part.vertices) > 500
     assert len(whole.vertices) == 2 * len(part.vertices)
     assert len(whole.faces) == 4 * len(part.faces)
@@ -196,7 +196,7 @@ def test_no_depth_is_no_mesh(tmp_path: Path) -> None:
     again = Mesh.load_ply(tmp_path / "mesh.ply")
     for name in ("vertices", "faces", "normals", "colours"):
         np.testing.assert_array_equal(getattr(again, name), getattr(mesh, name))
-    with pytest.raises(InputError, match="`voxel` is 0"):
+    with pytest.raises(InputError, match=r"`voxel` .*0"):
         fused_mesh(keyframes, depth_maps, INTRINSICS, 0.0)
     with pytest.raises(InputError, match="`faces` names vertex"):
         Mesh(mesh.vertices[:2], mesh.faces, mesh.normals[:2], mesh.colours[:2])

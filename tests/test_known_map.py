@@ -205,7 +205,7 @@ def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
     ):
         with pytest.raises(vg.InputError, match=sentence):
             next(vg.run(sequence().frames(), ROLES, SETTINGS, camera=other, known_map=known))
-    with pytest.raises(vg.InputError, match=r"localise_only` needs a map to place frames in: give `known_map`"):
+    with pytest.raises(vg.InputError, match=r"localise_only` .*`known_map`"):
         vg.reconstruct(sequence(), ROLES, FIXED)
     save_state(tmp_path / "state", first_half())
     with pytest.raises(vg.InputError, match="is a state; expected a map"):
@@ -214,7 +214,7 @@ def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
         save_map(tmp_path / "map", replace(first_half(), keyframes=()))
     read = object.__new__(Result)
     object.__setattr__(read, "record", None)
-    with pytest.raises(vg.InputError, match="this one was read from a folder"):
+    with pytest.raises(vg.InputError, match="`save_map`"):
         read.save_map(tmp_path / "map")
 
 
@@ -232,7 +232,7 @@ def test_a_map_without_a_unit_serves_with_and_without_depth(localise_only: bool,
     assert not known.metric
     given = {"settings": settings, "dense": "none", "end": HALF + 7, "known_map": known}
     alone = vg.reconstruct(without_depth(sequence()), roles, **given)
-    with pytest.warns(InputWarning, match="the depth of these frames, in metres, is not used"):
+    with pytest.warns(InputWarning, match="`known_map` .*depth"):
         with_depth = vg.reconstruct(sequence(), ROLES, **given)
     for result in (alone, with_depth):
         assert not result.metric

@@ -18,7 +18,7 @@ from vggtgeo.datasets.seven_scenes import _TO_COLOUR
 from vggtgeo.datasets.tanks import inside_crop
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
-from vggtgeo.results.source import opened
+from vggtgeo.results.source import open_source
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 
 
@@ -178,7 +178,7 @@ def test_a_truth_in_a_unit_of_its_own_is_told(tmp_path: Path) -> None:
         sequence = tiny.quietly_opened(folder)
         assert not sequence.truth_in_metres
         with pytest.warns(NoteWarning, match="are in a unit of their own, and errors against them in the same"):
-            assert not opened(sequence, None, SlamSettings()).truth_in_metres
+            assert not open_source(sequence, None, SlamSettings()).truth_in_metres
 
 
 @pytest.mark.parametrize("lists", ["rgb.txt depth.txt associated.txt", "rgb.txt depth.txt", "associated.txt"])

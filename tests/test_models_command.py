@@ -47,7 +47,7 @@ def test_every_network_is_listed_with_its_terms(tmp_path: Path) -> None:
         terms = f"{row['licence']}: {row['allows']}"
         assert "\n    ".join((row["paper"], terms, row["get"], f"vggtgeo run PATH {row['use']}")) in text
     assert "vggtgeo models fetch moge2\n" in text
-    assert "letr  present, random weights: its answers mean nothing" in text
+    assert "letr  present, random weights: its outputs are meaningless" in text
     assert [row["name"] for row in found["networks"] if row["random"]] == ["letr"]
 
 
@@ -105,7 +105,7 @@ def test_a_report_can_be_read(check: Callable, tmp_path: Path) -> None:
     # Proves what a user sees: contract, random weights, ranges, latency. Oracle: the constants.
     text = check(tiny.vggt(tmp_path / "vggt.onnx")).output
     for line in (
-        "keeps the contract of vggt",
+        "fulfils the contract of vggt",
         "its weights are random",
         "output depth_conf [2, 28, 42]: 3 to 3, all finite",
     ):
@@ -133,9 +133,9 @@ def test_what_is_not_fit_ends_with_a_reason(check: Callable, tmp_path: Path) -> 
     bad = tiny.constant(tmp_path / "bad.onnx", "letr", {"image": (1, 3, 28, 42)}, outputs)
     other = tiny.constant(tmp_path / "other.onnx", "other", {"image": (1, 3, 28, 42)}, {"y": np.zeros(3)})
     for arguments, message in (
-        ((bad,), "is not fit for use: `pred_logits` holds 4 values that are not finite"),
+        ((bad,), "is not usable: `pred_logits` has 4 values that are not finite"),
         ((bad, "--network", "vggt"), "is not a file of `vggt`"),
-        ((other,), "keeps the contract of no network that is known"),
+        ((other,), "matches no known network"),
         ((tmp_path / "none.onnx",), "is not there"),
         ((bad, "--image", bad), "not an image"),
     ):

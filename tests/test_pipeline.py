@@ -22,7 +22,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.results.files import write_trajectories
-from vggtgeo.results.summary import pieces
+from vggtgeo.results.summary import list_submaps
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import compile_global, expected_keyframes
@@ -399,7 +399,7 @@ def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
     assert len(slam.frames) == 22
     (tmp_path / "trajectory-5.txt").write_text("of a piece that was joined since")
     write_trajectories(tmp_path, slam)
-    told = pieces(slam)
+    told = list_submaps(slam)
     assert [piece["trajectory"] for piece in told] == ["trajectory.txt", "trajectory-2.txt"]
     assert sorted(file.name for file in tmp_path.glob("traj*")) == ["trajectory-2.txt", "trajectory.txt"]
     times = [Trajectory.load_tum(tmp_path / piece["trajectory"]).timestamps for piece in told]

@@ -149,5 +149,5 @@ def test_plot_draws_by_the_kind_of_the_value() -> None:
     for mine, other in zip(drawn.axes, direct.axes, strict=True):
         for line, same in zip(mine.lines, other.lines, strict=True):
             np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
-    with pytest.raises(InputError, match=r"`plot` has no picture of a `list`; it draws .*Observability, .*Solution"):
+    with pytest.raises(InputError, match=r"`value` .*Observability, .*Solution.*`list`"):
         vg.plot([1.0])

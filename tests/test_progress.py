@@ -47,7 +47,7 @@ def test_a_line_is_due_each_tenth_or_each_minute(
 def test_a_pipe_gets_whole_lines_at_once(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The stage and the frames stand there before the run is over, and a terminal keeps its bar. Oracle: the text."""
     run, file = recorded_run(), io.StringIO()
-    monkeypatch.setattr(progress, "LONGEST_PAUSE", 0.0)
+    monkeypatch.setattr(progress, "MAX_PAUSE", 0.0)
     with ProgressBar(Console(file=file, force_terminal=terminal, width=100)) as bar:
         bar.on_begin("clip", len(run.states))
         bar.on_stage("compiling")

@@ -127,10 +127,10 @@ def test_a_keyframe_that_moves_takes_its_cloud_along(run: RecordedRun, tmp_path:
     """Points are logged once, as the final map has them; a keyframe that is half a metre wrong and then put right has
     its transform logged again, and no other keyframe has. Oracle: the poses, and the true depth's bounds.
     """
-    from vggtgeo.viewing.live_map import AT_ONCE, MOST_POINTS
+    from vggtgeo.viewing.live_map import MAX_CLOUDS, MAX_POINTS
 
     slam = run.slam
-    assert 3 <= len(slam.keyframes) <= AT_ONCE
+    assert 3 <= len(slam.keyframes) <= MAX_CLOUDS
     path = logged([moved(slam, 1, (0.5, 0, 0)), moved(slam, 1, (0.5, 0, 0)), slam], tmp_path / "live.rrd")
     found = [components_of(path, f"/world/live/{k}", "Transform3D:translation") for k in range(3)]
     assert [sorted(one) for one in found] == [[0], [0, 1, 2], [0]]
@@ -140,7 +140,7 @@ def test_a_keyframe_that_moves_takes_its_cloud_along(run: RecordedRun, tmp_path:
     clouds = components_of(path, "/world/live/1", "Points3D:positions")
     assert sorted(clouds) == [0]
     points = np.array(clouds[0])
-    assert 0.5 * MOST_POINTS < len(points) <= MOST_POINTS
+    assert 0.5 * MAX_POINTS < len(points) <= MAX_POINTS
     depth = slam.keyframes[1].depth
     assert np.nanmin(depth) <= points[:, 2].min() <= points[:, 2].max() <= np.nanmax(depth)
 
@@ -198,8 +198,8 @@ def test_the_blueprint_shows_what_is_logged(recording: Path) -> None:
     """Every view's origin holds something, and the file carries the arrangement; oracle: the entities, the reader."""
     import rerun as rr
 
-    from vggtgeo.viewing.blueprint import ORIGINS, blueprint
     from vggtgeo.viewing.entities import ENTITIES
+    from vggtgeo.viewing.target import ORIGINS, blueprint
 
     assert [origin for origin in ORIGINS if not any(path.startswith(origin) for path in ENTITIES)] == []
     assert blueprint().root_container is not None
@@ -241,7 +241,7 @@ def test_a_run_folder_becomes_a_recording(run: RecordedRun, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("name", "image", "message"),
     [
-        ("first.depth.png", np.zeros((4, 4), np.uint16), "is no depth of a run: expected the number of a frame"),
+        ("first.depth.png", np.zeros((4, 4), np.uint16), "must be named by a frame number"),
         ("000001.depth.png", np.zeros((4, 4, 3), np.uint8), r"is uint8 \(4, 4, 3\); expected uint16"),
     ],
 )

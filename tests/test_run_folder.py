@@ -24,8 +24,8 @@ from vggtgeo.io.locks import LockedError, locked
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.results.files import write_depth
 from vggtgeo.results.result import Result
-from vggtgeo.results.run_folder import RESERVE, taken
-from vggtgeo.results.unfinished import check_finished
+from vggtgeo.results.run_folder import RESERVE, open_run_folder
+from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 pytestmark = [
@@ -189,7 +189,7 @@ def test_a_second_signal_ends_at_once_and_the_old_run_stays(
     assert {name: after[name] for name in before} == before
     assert "unfinished/trajectory.txt" in after
     assert not (out / ".lock").exists()
-    with pytest.warns(InputWarning, match="goes on or was killed"), pytest.raises(InputError):
+    with pytest.warns(InputWarning, match="unfinished"), pytest.raises(InputError):
         Result.load(out)
 
 
@@ -200,7 +200,7 @@ def test_two_runs_into_one_folder(frames: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     before = old_run(out)
     (tmp_path / "link").symlink_to(out)
-    with taken(out):
+    with open_run_folder(out):
         for name in ("out", "link"):
             done = call(frames, tmp_path / name)
             assert done.exit_code == 2
@@ -215,19 +215,19 @@ def test_the_lock_of_a_killed_run_is_given_back(tmp_path: Path) -> None:
     """
     out = tmp_path / "out"
     code = f"""
-from vggtgeo.results.run_folder import taken
-with taken({str(out)!r}) as run:
+from vggtgeo.results.run_folder import open_run_folder
+with open_run_folder({str(out)!r}) as run:
     (run.stage / "trajectory.txt").write_text("half")
     print("taken", flush=True)
     input()
 """
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout.readline() == b"taken\n"
-        with pytest.raises(InputError, match=f"process {other.pid}"), taken(out):
+        with pytest.raises(InputError, match=f"process {other.pid}"), open_run_folder(out):
             pass
         other.kill()
-    assert "is in" in check_finished(out)
-    with taken(out) as run:
+    assert str(out) in unfinished_message(out)
+    with open_run_folder(out) as run:
         assert [path.name for path in run.stage.iterdir()] == ["README.txt"]
     assert not out.exists() or contents(out) == {}
 
@@ -351,8 +351,8 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     ]
     found = cv2.imread(str(tmp_path / "depth/000007.depth.png"), cv2.IMREAD_UNCHANGED)
     assert found.tolist() == [[5000, 0], [0, 2500]]
-    assert "which is no metre" in (tmp_path / "depth/README.txt").read_text()
-    with pytest.warns(InputWarning, match="there is none to save"):
+    assert "scale of this run is free" in (tmp_path / "depth/README.txt").read_text()
+    with pytest.warns(InputWarning, match="`depth`"):
         write_depth(tmp_path / "none", [keyframe], [None])
     assert not (tmp_path / "none").exists()
 
@@ -376,7 +376,7 @@ def test_a_folder_that_is_taken_away_while_a_run_writes_is_an_error(becomes: str
     place = tmp_path / "out"
 
     def run_while_it_goes() -> None:
-        with taken(place) as run:
+        with open_run_folder(place) as run:
             place.rename(tmp_path / "before")
             if becomes == "a file":
                 place.write_text("")
@@ -384,13 +384,13 @@ def test_a_folder_that_is_taken_away_while_a_run_writes_is_an_error(becomes: str
                 place.mkdir()
             run.publish()
 
-    with pytest.raises(InputError, match=r"out` was moved, removed or replaced while"):
+    with pytest.raises(InputError, match=r"out` was moved, removed or replaced"):
         run_while_it_goes()
 
 
 def test_hidden_files_of_a_file_manager_are_no_results(tmp_path: Path) -> None:
     """A `.DS_Store` beside the results harms nothing, and does not come with them. Oracle: what is there."""
-    with taken(tmp_path / "out") as run:
+    with open_run_folder(tmp_path / "out") as run:
         (run.stage / "trajectory.txt").write_text("")
         (run.stage / ".DS_Store").write_text("")
         run.publish()

@@ -113,18 +113,18 @@ def test_what_is_written_gives_the_same_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("rgb_only = true", "`rgb_only` is no setting of this command; the nearest is `rgb-only`"),
-        ("cuont = 4", "`cuont` is no setting of this command; the nearest is `count`"),
-        ("zzz = 4", "`zzz` is no setting of this command; the nearest is"),
-        ('settings = "x"', "`settings` is no setting"),
+        ("rgb_only = true", "`rgb_only` is not a setting of this command; the nearest is `rgb-only`"),
+        ("cuont = 4", "`cuont` is not a setting of this command; the nearest is `count`"),
+        ("zzz = 4", "`zzz` is not a setting of this command; the nearest is"),
+        ('settings = "x"', "`settings` is not a setting"),
         ('count = "4"', "`count` is '4'; it must be a whole number"),
         ("count = true", "`count` is True; it must be a whole number"),
         ("count = 1.5", "`count` is 1.5; it must be a whole number"),
         ("scale = true", "`scale` is True; it must be a number"),
         ("rgb-only = 1", "`rgb-only` is 1; it must be true or false"),
-        ("lines = true\nno-lines = true", "`lines` and `no-lines` are one setting; give one of them"),
+        ("lines = true\nno-lines = true", "`lines` and `no-lines` are the same setting; give one of them"),
         ("mode = 3", "`mode` is 3; it must be text in quotes"),
-        ("count = ", "is no TOML file"),
+        ("count = ", "is not valid TOML"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, text: str, message: str) -> None:

@@ -207,18 +207,18 @@ def test_pictures_fill_the_holes_of_measured_depth() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     # Proves the errors of an unknown mode, of measured depth where there is none, and of impossible settings.
-    with pytest.raises(vg.InputError, match="`dense` is 'magic'"):
+    with pytest.raises(vg.InputError, match=r"`dense` .*'magic'"):
         check_dense("magic", True)
-    with pytest.raises(vg.InputError, match="`dense` is 'sensor', but no depth was measured"):
+    with pytest.raises(vg.InputError, match="`dense` is 'sensor'"):
         check_dense("sensor", False)
-    with pytest.raises(vg.InputError, match="`dense` is 'network', but no network plays the role of depth; choose one"):
+    with pytest.raises(vg.InputError, match="`dense` is 'network'"):
         check_dense("network", True, SensorDepth())
-    with pytest.raises(vg.InputError, match="`dense` is 'sensor', but depth is a network's; take `network`"):
+    with pytest.raises(vg.InputError, match="`dense` is 'sensor'"):
         check_dense("sensor", True, DepthOfANetwork())
     check_dense("network", True, DepthOfANetwork())
-    with pytest.raises(vg.InputError, match="`window` must be odd"):
+    with pytest.raises(vg.InputError, match=r"`window` .*4"):
         StereoSettings(window=4)
-    with pytest.raises(vg.InputError, match="`planes` is 2"):
+    with pytest.raises(vg.InputError, match=r"`planes` .*2"):
         StereoSettings(planes=2)
 
 

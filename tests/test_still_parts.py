@@ -15,8 +15,8 @@ from vggtgeo.models.roles import Segments
 
 import vggtgeo as vg
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.results.source import opened
-from vggtgeo.results.still_search import StillSearch
+from vggtgeo.results.source import open_source
+from vggtgeo.results.static_overlay import StaticOverlaySearch
 from vggtgeo.simulation.tum_folder import write_tum_folder
 from vggtgeo.slam.camera.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.clock import Clock
@@ -150,13 +150,13 @@ def test_of_a_stream_it_is_told(count: int, every: int) -> None:
     """Frames that come once cannot be looked at before the first is tracked; at the end the verdict knows. Oracle: text
     that was painted into every picture, or into one in thirteen, which nobody can take for a part of the camera.
     """
-    search, pictures, slam = StillSearch(), moving(19, (25, 20)), begin(CAMERA, vg.Roles(), vg.SlamSettings())
+    search, pictures, slam = StaticOverlaySearch(), moving(19, (25, 20)), begin(CAMERA, vg.Roles(), vg.SlamSettings())
     for row in range(count):
         picture = pictures[row % 19].copy()
         if row % every == 0:
             text(picture)
         search.on_frame(slam, vg.data.Frame(row, row / 30, picture, None, str(row)))
-    assert len(search._pictures) <= 40
+    assert len(search._images) <= 40
     found = [finding.text for finding in search.findings()]
     assert search.found is None
     assert len(found) == int(count > 11 and every == 1)
@@ -269,13 +269,13 @@ def test_which_frames_are_looked_at(tmp_path: Path) -> None:
     for row in range(10):
         tiny.write_image(folder / f"{row}.png", np.full((48, 64, 3), 10 * row, np.uint8))
     (folder / "calibration.txt").write_text("55 55 31.5 23.5\n")
-    seen = opened(folder, None, vg.SlamSettings()).some_pictures(1, 10, 2, 3, 12)
+    seen = open_source(folder, None, vg.SlamSettings()).sample_images(1, 10, 2, 3, 12)
     assert [int(picture[0, 0, 0]) for picture in seen] == [10, 30, 50]
-    seen = opened(folder, None, vg.SlamSettings()).some_pictures(0, None, 1, 3, 2)
+    seen = open_source(folder, None, vg.SlamSettings()).sample_images(0, None, 1, 3, 2)
     assert [int(picture[0, 0, 0]) for picture in seen] == [0, 20, 40]
-    assert opened(folder, None, vg.SlamSettings()).comes_again((0, None, 1))
-    assert not opened(vg.simulate("room", 9, size=(64, 48)), None, vg.SlamSettings()).comes_again((0, 9, 1))
-    assert not opened(iter(moving(9)), CAMERA, vg.SlamSettings()).comes_again((0, 9, 1))
+    assert open_source(folder, None, vg.SlamSettings()).repeatable((0, None, 1))
+    assert not open_source(vg.simulate("room", 9, size=(64, 48)), None, vg.SlamSettings()).repeatable((0, 9, 1))
+    assert not open_source(iter(moving(9)), CAMERA, vg.SlamSettings()).repeatable((0, 9, 1))
 
 
 @pytest.mark.long  # two runs of 24 frames
@@ -289,7 +289,7 @@ def test_a_run_with_text_in_the_picture_is_as_good_as_one_without(tmp_path: Path
         for row in (40, 120, 200):
             cv2.putText(picture, "REC 12:03 CAM 3", (10, row), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255,) * 3, 2)
         cv2.imwrite(str(file), picture)
-    with pytest.warns(InputWarning, match="% of the picture stays in its place while the rest moves"):
+    with pytest.warns(InputWarning, match="% of the image is a static overlay"):
         result = vg.reconstruct(tmp_path / "room", dense="none")
     assert 0.1 < result.summary["still_parts"] < 0.35
     off = vg.SlamSettings(camera=vg.settings.CameraSettings(still_parts=False))

@@ -12,7 +12,7 @@ import pytest
 
 FULL = Path("/dev/full")
 PROGRAM = (sys.executable, "-c", "from vggtgeo.cli import main; main()")
-LOST = "error: standard output cannot be written (No space left on device): what is printed there is lost, files are"
+LOST = "error: standard output cannot be written (No space left on device): printed text is lost, files are"
 pytestmark = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
 
 

@@ -28,11 +28,11 @@ from vggtgeo.viewing.target import check_target, has_screen
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("view", "nowhere", "--rerun", "a.rrd"), "`nowhere` is no folder"),
-        (("view", ".", "--rerun", "a.rrd"), "has no `trajectory.txt`"),
-        (("view", ".", "--rerun", "spawn"), "has no `trajectory.txt`"),
-        (("view", ".", "--rerun", "picture.png"), "it must be `spawn`"),
-        (("run", "nowhere", "--rerun", "show"), "it must be `spawn`"),
+        (("view", "nowhere", "--rerun", "a.rrd"), "`nowhere` is not a folder"),
+        (("view", ".", "--rerun", "a.rrd"), "`trajectory.txt` is missing"),
+        (("view", ".", "--rerun", "spawn"), "`trajectory.txt` is missing"),
+        (("view", ".", "--rerun", "picture.png"), "`--rerun` must be `spawn`"),
+        (("run", "nowhere", "--rerun", "show"), "`--rerun` must be `spawn`"),
     ],
 )
 def test_what_is_wrong_is_said_first(
@@ -100,7 +100,7 @@ def test_view_names_the_recording_where_there_is_no_screen(tmp_path: Path, monke
     (tmp_path / "run.rrd").write_bytes(b"")
     result = CliRunner().invoke(make_app(), ["view", str(tmp_path)])
     assert result.exit_code == 2
-    assert "look at it with `rerun" in result.stderr
+    assert "with `rerun" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Numbers as they stand in a table, the same for Markdown and the page."""
+"""Table cells: numbers as text and their ranks, for Markdown and the HTML report."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from vggtgeo.benchmark.table import Row, number
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: a number of the rows, in the unit of its head. better: -1 where less is better, 1 where
-    more is, 0 where neither.
+    """A column of a table. name: of the row's value; factor: to the unit of the head; better: -1 if less is better, 1
+    if more is better, 0 if not ranked.
     """
 
     head: str
@@ -66,14 +66,12 @@ GROUPS: dict[str, tuple[Column, ...]] = {
         Column("memory GB", "peak_memory_gb", 1.0, 2, 0),
     ),
 }
-"""The numbers of each sequence and setting, a table a group; a column is left out where no run has a number."""
+"""Columns of each table of details; columns without any number are left out."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A text, its place among those it is compared with (1 the best, 2 the second, 0 all others), and the median of
-    what it is the mean of; empty where that would say nothing new.
-    """
+    """A text, its rank (1 best, 2 second, 0 others), and the median beside the mean; empty for few numbers."""
 
     text: str
     place: int = 0
@@ -81,26 +79,26 @@ class Cell:
 
 
 def number_cell(summary: Summary, digits: int) -> str:
-    """Mean and standard deviation; one number alone; nothing where there is none."""
+    """Return mean and standard deviation as text; the number itself if there is one, empty if there is none."""
     if not summary.count:
         return ""
     mean = f"{summary.mean:.{digits}f}"
     return mean if np.isnan(summary.deviation) else f"{mean} ± {summary.deviation:.{digits}f}"
 
 
-LEAST_FOR_MEDIAN = 3
-"""Numbers: of two, the median is the mean."""
+MIN_FOR_MEDIAN = 3
+"""Numbers: the median of two is their mean."""
 
 
 def median_text(summary: Summary, column: Column) -> str:
-    """The median, which published tables often have in place of the mean; empty for too few numbers, and for a column
-    that is not compared.
+    """Return the median, which published tables often have instead of the mean; empty for few numbers or an unranked
+    column.
     """
-    return f"{summary.median:.{column.digits}f}" if column.better and summary.count >= LEAST_FOR_MEDIAN else ""
+    return f"{summary.median:.{column.digits}f}" if column.better and summary.count >= MIN_FOR_MEDIAN else ""
 
 
 def interval_cell(summary: Summary, digits: int) -> str:
-    """A mean difference with its 95 % interval; without one where one pair is all there is."""
+    """Return a mean difference with its 95 % interval, without interval for a single pair."""
     if not summary.count:
         return ""
     mean = f"{summary.mean:+.{digits}f}"
@@ -108,51 +106,51 @@ def interval_cell(summary: Summary, digits: int) -> str:
 
 
 FREE = "free"
-"""In the place of an error at true scale of runs that do not claim one."""
+"""Shown instead of an SE(3) error for runs of free scale."""
 
 
 def comparable(rows: Sequence[Row], column: Column) -> list[Row]:
-    """The rows whose number in a column means something: an error after SE(3) of a scale that is free does not."""
+    """Return the rows whose value is meaningful: an SE(3) error of a free scale is not."""
     return [row for row in rows if column is not SE3 or row.get("metric") is not False]
 
 
 def summary_of(rows: Sequence[Row], column: Column) -> Summary:
-    """The summary of a column in its unit, over the runs that ended with a result."""
+    """Return the summary of a column in its unit, over the runs with a result."""
     return Summary.of(column.factor * values(comparable(finished(rows), column), column.name))
 
 
 def finished(rows: Iterable[Row]) -> list[Row]:
-    """The rows of runs that ended with a result."""
+    """Return the rows of runs with a result."""
     return [row for row in rows if row["status"] == "ok"]
 
 
 def is_whole(rows: Sequence[Row], column: Column) -> bool:
-    """Whether every run has a number: a mean over those that came through favours who loses the hard ones."""
+    """Return whether every run has a number: without failed runs, a mean favours settings that fail on hard ones."""
     return bool(rows) and summary_of(rows, column).count == len(rows)
 
 
-LEAST_COVERAGE = 0.9
-"""Share of the truth's duration; with less the error is that of another, mostly easier, part of the sequence."""
+MIN_COVERAGE = 0.9
+"""Share of the ground truth's duration; with less, the error is of another, mostly easier, part of the sequence."""
 
 
 def is_covered(rows: Sequence[Row]) -> bool:
-    """Whether no run is known to cover less than `LEAST_COVERAGE`."""
-    return not (values(rows, "coverage") < LEAST_COVERAGE).any()
+    """Return whether no run is known to cover less than `MIN_COVERAGE`."""
+    return not (values(rows, "coverage") < MIN_COVERAGE).any()
 
 
 def is_ranked(rows: Sequence[Row], column: Column) -> bool:
-    """Whether the mean may be compared with others."""
+    """Return whether the mean may be ranked."""
     return is_whole(rows, column) and (column.name == "coverage" or is_covered(rows))
 
 
 def at_coverage(rows: Sequence[Row]) -> str:
-    """At which mean coverage the numbers of runs are, rounded down; empty where that is not known."""
+    """Return the mean coverage of runs as text, rounded down; empty if unknown."""
     mean = Summary.of(values(finished(rows), "coverage")).mean
     return f" at {np.floor(100 * mean + 1e-9):.0f} %" if np.isfinite(mean) else ""
 
 
 def text_of(rows: Sequence[Row], column: Column) -> str:
-    """`summary_of` as text, and of how many of the runs it is where some have no number; empty where none has."""
+    """Return `summary_of` as text, with the number of runs if some have no value; empty if none has."""
     good = finished(rows)
     if good and not comparable(good, column):
         return FREE
@@ -161,34 +159,34 @@ def text_of(rows: Sequence[Row], column: Column) -> str:
 
 
 def measured(groups: Sequence[Sequence[Row]], columns: Iterable[Column]) -> list[Column]:
-    """The columns that some run has a number for."""
+    """Return the columns for which some run has a number."""
     return [column for column in columns if any(summary_of(own, column).count for own in groups)]
 
 
 def heading(title: str, groups: Iterable[Sequence[Row]]) -> str:
-    """The title of a group of numbers; that of the map with the distance that its scores are within."""
+    """Return the title of a group of columns; for the map with the distance threshold of its scores."""
     known = [number(row, "threshold_m") for own in groups for row in own]
     within = ", ".join(f"{100 * one:g}" for one in sorted({one for one in known if np.isfinite(one)}))
     return f"{title}, scores within {within} cm" if within and title == "Map" else title
 
 
 def cell_of(rows: Sequence[Row], column: Column) -> Cell:
-    """`text_of` the runs that ended with a result, with its median, not compared with others."""
+    """Return the cell of the runs with a result, unranked."""
     good = finished(rows)
     return Cell(text_of(good, column), 0, median_text(summary_of(good, column), column))
 
 
 def _text_or_ending(rows: Sequence[Row], column: Column) -> str:
-    """Where no run has a number, how those ended that failed."""
+    """The text of a cell; without any number, how the runs failed."""
     lost = [row for row in rows if row["status"] != "ok" or row.get("verdict") == "failed"]
     text = text_of(rows, column)
     return f"{text}{at_coverage(rows)}" if text and text != FREE else text or verdicts(lost)
 
 
 def ranked(groups: Sequence[Sequence[Row]], column: Column, beside_count: bool = False) -> list[Cell]:
-    """A cell of a column for each group of rows; those that some runs have no number of, or that do not cover the
-    sequence, are not compared. beside_count: `runs_text` and the coverage stand beside, so that the cells need not say
-    of how many runs and of what part of the sequence they are.
+    """Return a cell for each group of rows; groups with missing numbers or too little coverage are not ranked.
+
+    beside_count: whether the table has columns for the number of runs and the coverage, so that cells omit them.
     """
     whole = [summary_of(own, column) if is_ranked(own, column) else Summary.of(np.array([])) for own in groups]
     texts = [text_of(finished(own), column) if beside_count else _text_or_ending(own, column) for own in groups]
@@ -197,13 +195,13 @@ def ranked(groups: Sequence[Sequence[Row]], column: Column, beside_count: bool =
 
 
 def runs_text(rows: Sequence[Row]) -> str:
-    """How many runs ended with a result, and of how many, where that is not all."""
+    """Return the number of runs with a result, and of all runs if it differs."""
     good = len(finished(rows))
     return str(good) if good == len(rows) else f"{good} of {len(rows)}"
 
 
 def placed(numbers: Sequence[float], texts: Sequence[str], column: Column, medians: Sequence[str]) -> list[Cell]:
-    """Cells with the best and the second best marked, where there are two or more numbers to compare."""
+    """Return cells with the best and the second best ranked, if there are two or more different numbers."""
     known = sorted({round(one, column.digits) for one in numbers if np.isfinite(one)}, reverse=column.better > 0)
     compared = column.better and len(known) >= 2
     place = lambda one: known.index(round(one, column.digits)) + 1 if compared and np.isfinite(one) else 0
@@ -212,20 +210,20 @@ def placed(numbers: Sequence[float], texts: Sequence[str], column: Column, media
 
 
 def settings_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
-    """Settings and other systems with a row, in the order of the suite."""
+    """Return the settings and other systems with a row, in the order of the suite."""
     there = {row["setting"] for row in rows}
     return [table.name for table in (*suite.setting, *suite.external) if table.name in there]
 
 
 def sequences_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
-    """Sequences with a row, in the order of the suite."""
+    """Return the sequences with a row, in the order of the suite."""
     there = {row["sequence"] for row in rows}
     return [table.name for table in suite.sequence if table.name in there]
 
 
 def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str, list[Cell]]]:
-    """A row a setting, a column a sequence, and over the sequences that all of them are ranked on (see `_common`) the
-    mean, with the mean of the medians over seeds beside it, and the median. rows: those without a result, too.
+    """Return a row per setting: a cell per sequence, then mean (with the mean of the medians over seeds) and median
+    over the sequences on which all settings are ranked (see `_common`). rows: include those without a result.
     """
     settings, sequences = settings_of(suite, rows), sequences_of(suite, rows)
     groups = {name: [select(rows, name, setting) for setting in settings] for name in sequences}
@@ -237,12 +235,12 @@ def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str,
             for row in range(len(settings))
         ]
         pooled = [Summary.of(np.array([one.mean for one in own])) for own in lists]
-        # Means of medians, as published: only where each sequence has enough seeds.
-        seeds = [min((one.count for one in own), default=0) >= LEAST_FOR_MEDIAN for own in lists]
+        # Means of medians, as in publications, if each sequence has enough seeds.
+        seeds = [min((one.count for one in own), default=0) >= MIN_FOR_MEDIAN for own in lists]
         medians = [f"{np.mean([one.median for one in own]):.{column.digits}f}" if own else "" for own in lists]
         shown = [text if enough else "" for text, enough in zip(medians, seeds, strict=True)]
         by_column.append(_placed_alone([one.mean for one in pooled], column, shown))
-        if len(common) >= LEAST_FOR_MEDIAN:
+        if len(common) >= MIN_FOR_MEDIAN:
             by_column.append(_placed_alone([one.median for one in pooled], column, [""] * len(pooled)))
     return [(suite.title_of(setting), [cells[row] for cells in by_column]) for row, setting in enumerate(settings)]
 
@@ -252,7 +250,7 @@ def _placed_alone(numbers: Sequence[float], column: Column, medians: Sequence[st
 
 
 def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """The sequences on which every setting is ranked that is ranked on any."""
+    """Sequences on which every setting that is ranked at all is ranked."""
     names = sequences_of(suite, rows)
     groups = [[select(rows, name, setting) for name in names] for setting in settings_of(suite, rows)]
     ranks = [[is_ranked(own, column) for own in line] for line in groups]
@@ -260,16 +258,16 @@ def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
 
 
 def matrix_heads(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """The heads of `matrix`."""
+    """Return the heads of `matrix`."""
     sequences, common = sequences_of(suite, rows), _common(suite, rows, column)
     of = "" if len(common) == len(sequences) else f" of {len(common)}"
-    pooled = [f"mean{of}"] * (len(common) > 1) + [f"median{of}"] * (len(common) >= LEAST_FOR_MEDIAN)
+    pooled = [f"mean{of}"] * (len(common) > 1) + [f"median{of}"] * (len(common) >= MIN_FOR_MEDIAN)
     return [*sequences, *pooled]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What a setting changes, run by run. sequence: its name, or "all". cells: one a column."""
+    """Paired differences of a setting to the baseline. sequence: its name, or "all". cells: one per column."""
 
     setting: str
     sequence: str
@@ -281,8 +279,8 @@ COMPARED = (SE3, SIM3, RRE, DEPTH_RMSE, F_SCORE)
 
 
 def differences(suite: Suite, rows: Sequence[Row]) -> list[Difference]:
-    """Setting minus baseline on the same sequence and seed; a place of 1 (better) or 2 (worse) where the 95 % interval
-    leaves zero out. Over all sequences a recording counts once, a rendered world once for each seed, which walks anew.
+    """Return setting minus baseline on the same sequence and seed; rank 1 (better) or 2 (worse) if the 95 % interval
+    excludes zero. Over all sequences, a recording is one sample, a rendered world one per seed (each is a new walk).
     """
     found = []
     rendered = {one.name for one in suite.sequence if one.simulate}
@@ -309,19 +307,19 @@ def _difference(summary: Summary, column: Column) -> Cell:
 
 
 def verdicts(rows: Sequence[Row]) -> str:
-    """How runs ended: their verdicts, and what ended without one, with counts where there are several."""
+    """Return verdicts, or statuses of runs without a result, with counts if there are several."""
     words = [str((row["status"] == "ok" and row.get("verdict")) or row["status"]) for row in rows]
     counts = {word: words.count(word) for word in dict.fromkeys(words)}
     return ", ".join(word if len(words) == 1 else f"{count} {word}" for word, count in counts.items())
 
 
 def tracked(rows: Sequence[Row]) -> str:
-    """Frames tracked of frames read, all runs together."""
+    """Return tracked and read frames of all runs together."""
     known = [row for row in rows if row.get("frames")]
     return f"{sum(row['tracked'] for row in known)}/{sum(row['frames'] for row in known)}" if known else ""
 
 
 def protocol_text(rows: Sequence[Row]) -> str:
-    """The protocols in words."""
+    """Return the protocols with their descriptions."""
     names = dict.fromkeys(str(row["protocol"]) for row in rows)
     return "; ".join(f"{name}: {PROTOCOLS[name].about}" for name in names)

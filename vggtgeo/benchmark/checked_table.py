@@ -1,4 +1,4 @@
-"""Tables of a TOML file as dataclasses: keys that are not there and values of a wrong kind are named at once."""
+"""Tables of a TOML file as dataclasses, with validation of keys and value types."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vggtgeo.io.errors import InputError
 
 
 def _of(*kinds: type) -> Callable[[Any], bool]:
-    """Exactly of one of the `kinds`: to Python, True is a whole number."""
+    """Exact type check: in Python, `isinstance(True, int)`."""
     return lambda value: type(value) in kinds
 
 
@@ -38,7 +38,7 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "Mapping[str, str]": (_table_of(_of(str)), "a table of texts"),
     "Tables": (_table_of(_ANY_TABLE), "a table of groups of settings, as `[setting.set.line]` makes one"),
 }
-"""What a field may hold, by its annotation, and that in words."""
+"""Check and description of the allowed values, by the field's annotation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,16 +47,16 @@ class CheckedTable:
 
     @classmethod
     def read(cls, where: str, values: Any) -> Self:
-        """From plain values; InputError naming `where` for a key that is not there, or a value of a wrong kind."""
+        """Return the table of plain values; raise InputError with `where` for an unknown key or an invalid value."""
         known = {entry.name: entry for entry in dataclasses.fields(cls)}
         if not isinstance(values, Mapping):
             raise InputError(f"{where} is {values!r}; it must be a table")
         for key in values:
             if key not in known:
                 raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
-        lacks = [f"`{name}`" for name, entry in known.items() if name not in values and _is_required(entry)]
-        if lacks:
-            raise InputError(f"{where} lacks {', '.join(lacks)}")
+        missing = [f"`{name}`" for name, entry in known.items() if name not in values and _is_required(entry)]
+        if missing:
+            raise InputError(f"{where}: {', '.join(missing)} missing")
         for key, value in values.items():
             allowed, words = _KINDS.get(str(known[key].type), (lambda _: True, ""))
             if not allowed(value):

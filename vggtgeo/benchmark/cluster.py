@@ -1,8 +1,8 @@
-"""Runs on a Ray cluster (extra `cluster`): a run is a task with processors and, if asked for, a GPU.
+"""Run a suite on a Ray cluster (extra `cluster`): each run is a task with processors and, optionally, a GPU.
 
-A task starts the same process with the same limits as `scheduling` does, and hands back its row and its small files,
-which the driver writes into the store: a result is taken once, whatever was tried how often. Ray starts a task again
-whose worker or node is gone. Recordings must lie under the same path on every node. A driver that dies is called again.
+A task starts the same process with the same limits as `scheduling`, and returns its row and its small files, which the
+driver writes into the store. Ray restarts tasks whose worker or node is lost; each result is stored once. Recordings
+must have the same path on every node. If the driver dies, call it again.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.jobs import Job
-from vggtgeo.benchmark.processes import Limits, claimed, run_limited
+from vggtgeo.benchmark.processes import Limits, claim_cores, run_limited
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.scheduling import Command, Finished, check_space, described, worker_command
+from vggtgeo.benchmark.scheduling import Command, Finished, check_space, describe_ending, worker_command
 from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import JOB, LOG, ROW
 from vggtgeo.io.errors import InputError
@@ -28,16 +28,14 @@ from vggtgeo.io.files import atomic_path
 from vggtgeo.models.extras import install_hint
 
 RETRIES = 3
-"""Of a task whose worker or node is gone."""
-LARGEST_FILE = 2**24
-"""Bytes: larger ones (maps, recordings) stay where they were made, and go with them."""
+"""Of a task whose worker or node is lost."""
+MAX_FILE_SIZE = 2**24
+"""Bytes: larger files (maps, recordings) are not returned, and are deleted on the node."""
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """address: of the cluster's head, "auto" for the one of this machine, "local" to start one here for this batch.
-    cpus, gpus: of each run.
-    """
+    """address: of the cluster's head; "auto" for the one of this machine, "local" to start one. cpus, gpus: per run."""
 
     address: str = "auto"
     cpus: float = 1.0
@@ -52,24 +50,24 @@ def run_jobs_on_cluster(
     finished: Finished | None = None,
     command: Command = worker_command,
 ) -> None:
-    """Run `jobs` wherever the cluster has room, and store their rows as they come.
+    """Run `jobs` on the cluster, and store their rows as they finish.
 
-    InputError where Ray is not installed, no cluster answers at the address, or a node has no space left.
+    InputError if Ray is not installed, no cluster answers at the address, or the disk of a node is full.
     """
     if not jobs:
         return
-    ray = _connected(cluster)
+    ray = _connect(cluster)
     task = ray.remote(num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=RETRIES)(run_remotely)
     try:
         waiting = {}
         for job in jobs:
-            text = json.dumps(store.described(job))
+            text = json.dumps(store.describe(job))
             waiting[task.remote(text, limits, command, cluster.cpus)] = job
         while waiting:
             done, _ = ray.wait(list(waiting), num_returns=1)
             for reference in done:
                 job = waiting.pop(reference)
-                row = _taken(ray, reference, job, store)
+                row = _store_result(ray, reference, job, store)
                 if finished is not None:
                     finished(job, row)
     finally:
@@ -77,31 +75,29 @@ def run_jobs_on_cluster(
 
 
 def run_remotely(job: str, limits: Limits, command: Command, cpus: float) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """One run on the node that this is called on: how it ended, and its files by name."""
+    """Run a job on this node; return how it ended, and its files by name."""
     with tempfile.TemporaryDirectory(prefix="vggtgeo-bench-") as made:
         place, scratch = Path(made) / json.loads(job)["name"], Path(made) / "scratch"
         place.mkdir()
         scratch.mkdir()
         (place / JOB).write_text(job, encoding="utf-8")
         began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        with claimed(math.ceil(cpus)) as cores:  # Ray counts processors, and gives none
+        with claim_cores(math.ceil(cpus)) as cores:  # Ray counts processors, but does not assign them
             ending = run_limited(command(place, scratch), place / LOG, limits, cores)
-        files = [path for path in sorted(place.iterdir()) if path.is_file() and path.stat().st_size <= LARGEST_FILE]
+        files = [path for path in sorted(place.iterdir()) if path.is_file() and path.stat().st_size <= MAX_FILE_SIZE]
         contents = {path.name: path.read_bytes() for path in files if not path.name.startswith(".")}
-    return {**described(ending, contents.get(LOG, b"")), "started": began, "cpus": cpus}, contents
+    return {**describe_ending(ending, contents.get(LOG, b"")), "started": began, "cpus": cpus}, contents
 
 
-def _taken(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[str, Any]:
-    """The result of a task in the store; a row that says so where Ray gave it up."""
+def _store_result(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[str, Any]:
+    """Store the result of a task, or a row with the status "crash" if Ray lost it; return the row."""
     place = store.begin(job)
     try:
         ending, contents = ray.get(reference)
     except ray.exceptions.RayError as error:
         lines = str(error).strip().splitlines()
-        message = f"the cluster gave it up: {lines[0] if lines else error!r}"
-        return store.complete(
-            job, status="crash", message=message, **{**provenance(), "machine": "a node that is gone"}
-        )
+        message = f"the cluster lost the task: {lines[0] if lines else error!r}"
+        return store.complete(job, status="crash", message=message, **{**provenance(), "machine": "a lost node"})
     for name, content in contents.items():
         if name not in (JOB, ROW):
             with atomic_path(place / name) as temporary:
@@ -114,13 +110,13 @@ def _taken(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[str, Any
 
 
 def _check_answers(address: str) -> None:
-    """OSError where nobody listens at `host:port`: Ray itself would try for minutes."""
+    """Raise OSError if `host:port` does not answer: Ray itself would try for minutes."""
     host, colon, port = address.rpartition(":")
     if colon and port.isdigit() and "://" not in address:
         socket.create_connection((host, int(port)), timeout=5.0).close()
 
 
-def _connected(cluster: Cluster) -> Any:
+def _connect(cluster: Cluster) -> Any:
     try:
         import ray
     except ImportError:

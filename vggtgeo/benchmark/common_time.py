@@ -1,5 +1,6 @@
-"""Errors of a setting less those of the baseline over the time that both follow: whoever is lost where the recording is
-hard has no better number by that.
+"""Differences to the baseline over the time that both runs cover.
+
+Without this, a run that loses track in the difficult parts would have a smaller error than one that does not.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
 
-def less_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row]:
-    """The rows, each with its differences to the baseline's of the same sequence and seed. runs: the runs' folder.
+def subtract_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row]:
+    """Return the rows with their differences to the baseline of the same sequence and seed. runs: the runs' folder.
 
-    Errors of poses are those over the common time; others, of depth and map, have no difference where one of the two
-    does not cover the sequence.
+    Pose errors are over the common time. Errors of depth and map have no difference if one of the two runs does not
+    cover the sequence.
     """
     other = {(row["sequence"], row["seed"]): row for row in finished(rows) if row["setting"] == suite.base}
     found = []
@@ -34,13 +35,13 @@ def less_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row]:
             found.append(row)
             continue
         whole: dict[str, Any] = {} if is_covered([row, base]) else {column.name: None for column in COMPARED}
-        less = whole | _poses(row, base, runs)
-        found.append({**row, **{f"{name}{LESS_BASELINE}": value for name, value in less.items()}})
+        differences = whole | _pose_differences(row, base, runs)
+        found.append({**row, **{f"{name}{LESS_BASELINE}": value for name, value in differences.items()}})
     return found
 
 
-def _poses(row: Row, base: Row, runs: Path) -> dict[str, Any]:
-    """Nothing where the trajectories are not there."""
+def _pose_differences(row: Row, base: Row, runs: Path) -> dict[str, Any]:
+    """Differences of the pose errors; empty if a trajectory is missing."""
     truth = _place(base, runs) / "truth.txt"
     files = _estimate(row, runs), _estimate(base, runs)
     if not all(file.is_file() for file in (truth, *files)):
@@ -50,18 +51,17 @@ def _poses(row: Row, base: Row, runs: Path) -> dict[str, Any]:
     try:
         first = _errors(ours.select(followed(ours.timestamps, theirs, true)), true)
         second = _errors(theirs.select(followed(theirs.timestamps, ours, true)), true)
-    except InputError:  # they have less than three poses in common
+    except InputError:  # fewer than three poses in common
         return dict.fromkeys(("ate_se3_m", "ate_sim3_m", "rre_1s_deg"))
     return {name: first[name] - second[name] for name in first}
 
 
 def _errors(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
     report = evaluate_trajectory(estimate, truth, delta=1.0, unit="seconds")
-    turned = float(np.degrees(report.relative.rotation_statistics.mean))
     return {
         "ate_se3_m": report.se3.statistics.rmse,
         "ate_sim3_m": report.sim3.statistics.rmse,
-        "rre_1s_deg": turned,
+        "rre_1s_deg": float(np.degrees(report.relative.rotation_statistics.mean)),
     }
 
 

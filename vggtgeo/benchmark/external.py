@@ -1,4 +1,4 @@
-"""Trajectories that other systems wrote, measured as the suite's own."""
+"""Trajectories of other systems, evaluated like the suite's own runs."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from vggtgeo.io.errors import InputError, InputWarning
 
 
 def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> list[Row]:
-    """A row for each file of `[[external]]` that is there; `files` is relative to the folder `base`.
+    """Return a row for each existing file of `[[external]]`; `files` is relative to the folder `base`.
 
-    The truth is that of a run on the same sequence and seed (`runs`), or of the recording.
+    The ground truth is that of a run on the same sequence and seed (in `runs`), or of the recording.
     """
     found: list[Row] = []
     for table in suite.external:
@@ -33,13 +33,13 @@ def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> 
     return found
 
 
-def tell_missing(suite: Suite, jobs: Sequence[Job], base: Path) -> None:
-    """An InputWarning for each `[[external]]` that has no file at all: said before the runs, not after a night."""
+def warn_of_missing(suite: Suite, jobs: Sequence[Job], base: Path) -> None:
+    """Warn of each `[[external]]` without any file, before the runs begin."""
     for table in suite.external:
         files = list(dict.fromkeys(base / table.file(job.sequence, job.seed) for job in jobs))
         if files and not any(map(_is_file, files)):
-            more = f", nor any other of {len(files)}" if len(files) > 1 else ""
-            text = f"no trajectory of `{table.name}` is there: no `{files[0]}`{more}"
+            more = f", nor any other of {len(files)} files" if len(files) > 1 else ""
+            text = f"external `{table.name}` has no trajectory: `{files[0]}` does not exist{more}"
             warnings.warn(text, InputWarning, stacklevel=2)
 
 
@@ -57,7 +57,7 @@ def _row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -
     try:
         truth = _truth(job, runs)
         if truth is None:
-            return {**row, "status": "error", "message": "there is no truth to compare with"}
+            return {**row, "status": "error", "message": "the sequence has no ground truth"}
         errors, _ = trajectory_errors(load_trajectory(file, truth), truth, table.metric, vertical=job.spec["vertical"])
     except InputError as error:
         return {**row, "status": "error", "message": str(error)}

@@ -1,4 +1,4 @@
-"""What a run looks at: the recording or the rendered walk, and the roles that perceive it."""
+"""The input of a benchmark run: a recording or a rendered walk, and the perception roles."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from vggtgeo.slam.settings.slam_settings import Roles
 
 DATA_VARIABLE = "VGGTGEO_DATA"
 _LEVELS = ("", "*", "*/*")
-"""Folders between a data folder and a sequence in it: a benchmark's own, and a scene's."""
+"""Subfolders between a data folder and a sequence: that of the benchmark, and that of the scene."""
 
 
 def data_folders(given: Iterable[str | os.PathLike[str]] | None) -> tuple[Path, ...]:
-    """The folders that hold recordings: those given, else those of `$VGGTGEO_DATA` (with `:`), else `data`."""
+    """Return the folders of recordings: those given, else those of `$VGGTGEO_DATA` (separated by `:`), else `data`."""
     if given is not None:
         folders = tuple(Path(path).expanduser() for path in given)
         for folder in folders:
             if not folder.is_dir():
-                raise InputError(f"`data` is `{folder}`, which is no folder")
+                raise InputError(f"`data` is `{folder}`, which is not a folder")
         return folders
     named = os.environ.get(DATA_VARIABLE, "data").split(os.pathsep)
     return tuple(Path(name).expanduser() for name in named if name and Path(name).expanduser().is_dir())
 
 
 def find_sequences(path: str, folders: Iterable[Path]) -> list[Path]:
-    """All of `folder / path` that are there, also with one or two folders in between, the one to take first."""
+    """Return all existing `folder / path`, also with up to two folders in between, the preferred one first."""
     wanted = Path(path).expanduser()
     if wanted.is_absolute():
         return [wanted.resolve()] if _is_there(wanted) else []
@@ -65,15 +65,17 @@ def find_sequences(path: str, folders: Iterable[Path]) -> list[Path]:
 def _is_there(path: Path) -> bool:
     try:
         return path.exists()
-    except OSError:  # a name that is too long
+    except OSError:  # for example a name that is too long
         return False
 
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """sequence: what the run reads. perception: who looks at it. exact: the depth and poses that its surfaces are known
-    by, of a walk that is read as it was rendered, or of a recording whose depth is exact. scan: of a scene that was
-    scanned, too. simulated: nothing was recorded. references: other truths, by their names.
+    """The input of a run.
+
+    Fields: sequence; perception; exact, depth and poses of the true surfaces, of an undegraded rendered walk or a
+    recording with exact depth; scan, of a scanned scene; simulated, whether the sequence is rendered; references, other
+    ground truths by name.
     """
 
     sequence: Sequence
@@ -85,14 +87,14 @@ class Input:
 
     @property
     def truth(self) -> Trajectory | None:
-        """The true poses, where they are known."""
+        """The ground truth; None if unknown."""
         return self.sequence.ground_truth()
 
 
 def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) -> Input:
-    """The input of a job (`Job.spec`). InputError where it cannot be read, or a network's file is missing.
+    """Open the input of a job (`Job.spec`); raise InputError if it is invalid, or a network's file is missing.
 
-    scratch: a folder of this user alone, where a walk that is rendered is kept for the next run on it.
+    scratch: private folder that keeps rendered walks for other runs.
     """
     if not spec["simulate"]:
         with_depth = spec["exact_depth"] or not spec["rgb_only"]
@@ -100,7 +102,7 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
         sequence = _without(recorded, spec)
         exact = RecordedFrames.of(recorded) if spec["exact_depth"] else None
         scan = recorded if isinstance(recorded, TanksAndTemples) else None
-        # What is wrong with these would be found behind the run, which may take hours.
+        # Read scan and references now: an error after the run would cost hours.
         if scan is not None:
             scan.scanned_points()
         references = {name: Trajectory.load_tum(Path(spec["path"]) / file) for name, file in spec["references"].items()}
@@ -109,7 +111,8 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
     if spec["perception"] == "simulated":
         if spec["degrade"] != "base":
             raise InputError(
-                "simulated roles know the images that were rendered; leave `degrade` out, or use real ones"
+                f"`degrade` is {spec['degrade']!r}, but simulated roles use the undegraded images; leave it out, or "
+                "use other roles"
             )
         return Input(
             rendered, Perception(simulated_roles(rendered.oracle, spec, seed), {}), rendered.oracle, simulated=True
@@ -122,16 +125,16 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
 
 
 def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
-    """The name of a rendered walk's file in the scratch folder."""
+    """Return the file name of a rendered walk in the scratch folder."""
     return hashlib.sha256(json.dumps([dict(simulate), seed], sort_keys=True).encode()).hexdigest()[:16] + ".walk"
 
 
 def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> RenderedWalk:
-    """The walk of a suite's table `simulate`; a quarter of a second a frame where it is not in the scratch folder."""
+    """The walk of a suite's table `simulate`, from the scratch folder or rendered (a quarter of a second per frame)."""
     kept = None if scratch is None else scratch / walk_name(table, seed)
     if kept is not None and kept.is_file():
         with kept.open("rb") as stream:
-            walk: RenderedWalk = pickle.load(stream)  # written below, in a folder that no other user may write to
+            walk: RenderedWalk = pickle.load(stream)  # safe: written below, in a folder private to this user
         return walk
     options = {**table}
     scene, frames = options.pop("scene", "office"), options.pop("frames", 60)
@@ -149,7 +152,7 @@ def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> Rend
 
 @dataclass(frozen=True, eq=False)
 class RenderedWalk:
-    """A `Sequence` whose frames lie ready, so that rendering is no part of the run. 3 MB a frame of 320 x 240."""
+    """A `Sequence` of frames in memory, so that a run's time excludes rendering. 3 MB per frame of 320 x 240."""
 
     oracle: SimulatedOracle
     rendered: tuple[Frame, ...]
@@ -180,7 +183,7 @@ class RenderedWalk:
 
 @dataclass(frozen=True, eq=False)
 class DegradedWalk:
-    """A rendered walk to which something happened; its camera is what a user would believe it to be."""
+    """A rendered walk after a degradation; its camera is the one that a user would assume."""
 
     name: str
     recording: Recording
@@ -206,14 +209,14 @@ class DegradedWalk:
 
 
 def degraded(walk: RenderedWalk, name: str, seed: int) -> DegradedWalk:
-    """The walk after the degradation `name`; its noise follows from the seed."""
+    """Return the walk after the degradation `name`, with noise from the seed."""
     recording = Recording(list(walk.rendered), walk.camera, walk.ground_truth())
     changed = DEGRADATIONS[name](recording, np.random.default_rng([seed, 23]))
     return DegradedWalk(f"{walk.name}, {name}", changed)
 
 
 def simulated_roles(oracle: SimulatedOracle, spec: Mapping[str, Any], seed: int) -> Roles:
-    """The five stubs with their standard error models; the depth's errors times what the setting says."""
+    """Return the five stubs with their standard error models; depth errors are scaled by the setting's factor."""
     moge, factor = SimulatedMoge(oracle, seed), spec["depth_errors"]
     return Roles(
         points=SimulatedMast3r(oracle, seed, count=spec["key_points"]),
@@ -221,7 +224,7 @@ def simulated_roles(oracle: SimulatedOracle, spec: Mapping[str, Any], seed: int)
         depth=replace(moge, error=factor * moge.error, wobble=factor * moge.wobble),
         confidence=SimulatedDino(oracle, seed),
         geometry=_start(spec["start_of_pose"], SimulatedVggt(oracle, seed)),
-        alignment=None,  # the paper has none, and the ablation of its start would be none beside one
+        alignment=None,  # not in the paper, and it would hide the effect of the initial pose in the ablation
     )
 
 
@@ -232,7 +235,7 @@ def _start(name: str, vggt: SimulatedVggt) -> InitialGeometry:
 
 
 def _without(sequence: Sequence, spec: Mapping[str, Any]) -> Sequence:
-    """The sequence without what the spec hides."""
+    """The sequence without the depth or the calibration that the spec hides."""
     if spec["rgb_only"]:
         sequence = without_depth(sequence)
     if not spec["calibrated"]:

@@ -1,4 +1,4 @@
-"""From a suite to runs: each with everything it depends on, as plain values."""
+"""Expand a suite into runs, each with everything its result depends on, as plain values."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from vggtgeo.slam.settings.table import Tables, changed, updated
 
 @dataclass(frozen=True)
 class Job:
-    """One run. spec: what it depends on, plain values; `path` in it is None where the recording is not there. absent:
-    says so, and where it was looked for.
+    """One run. spec: everything it depends on, plain values; its `path` is None if the recording is missing. absent:
+    message with the folders that were searched.
     """
 
     sequence: str
@@ -40,26 +40,26 @@ class Job:
 
     @property
     def present(self) -> bool:
-        """Whether there is something to run on."""
+        """Whether the recording exists, or the sequence is simulated."""
         return bool(self.spec["simulate"]) or self.spec["path"] is not None
 
     def fingerprint(self, source: str) -> str:
-        """Changes with all that the result depends on; source: digest of the code."""
-        spec = {key: value for key, value in self.spec.items() if key != "path"}  # data may move
+        """Return a digest of everything that the result depends on; source: digest of the code."""
+        spec = {key: value for key, value in self.spec.items() if key != "path"}  # recordings may be moved
         parts = [self.sequence, self.setting, self.seed, spec, self.input_hash, source]
         text = json.dumps(parts, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
-    """All runs of a suite, sequence by sequence; recordings are looked for in the folders `data`, and an InputWarning
-    says which of them were found in folders below those.
+    """Return all runs of a suite, sequence by sequence, with recordings from the folders `data`; warn of recordings
+    that were found in subfolders.
     """
     roots = tuple(data)
-    # An archive that was unpacked into a folder of its own name has the recording one folder further down.
+    # An archive unpacked into a folder of its own name has the recording one level deeper.
     first_readable = lambda places: sorted(places, key=lambda place: not is_readable(place))
     places = {one.name: first_readable(find_sequences(one.path, roots) if one.path else []) for one in suite.sequence}
-    _tell_deeper(suite, places, roots)
+    _warn_of_subfolders(suite, places, roots)
     found = []
     for sequence in suite.sequence:
         place = next(iter(places[sequence.name]), None)
@@ -75,26 +75,26 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
     return found
 
 
-def _tell_deeper(suite: Suite, places: Mapping[str, Sequence[Path]], roots: Iterable[Path]) -> None:
-    """A folder of the same name, deep in others, may be another recording than the one that was meant."""
-    told = []
+def _warn_of_subfolders(suite: Suite, places: Mapping[str, Sequence[Path]], roots: Iterable[Path]) -> None:
+    """Warn of recordings found in subfolders: they may be others of the same name."""
+    found = []
     for one in suite.sequence:
         there = places[one.name]
         wanted = Path(one.path).expanduser()
         if not there or wanted.is_absolute() or there[0] in [(root / wanted).resolve() for root in roots]:
             continue
         rest = ", ".join(f"`{other}`" for other in there[1:])
-        told.append(f"{one.name} in `{there[0]}`" + (f" (the first of {len(there)}, with {rest})" if rest else ""))
-    if told:
-        warnings.warn(f"found below the folders of recordings: {'; '.join(told)}", InputWarning, stacklevel=3)
+        found.append(f"{one.name} in `{there[0]}`" + (f" (the first of {len(there)}, with {rest})" if rest else ""))
+    if found:
+        warnings.warn(f"recordings found in subfolders of `data`: {'; '.join(found)}", InputWarning, stacklevel=3)
 
 
 def _absent(path: str, roots: Sequence[Path]) -> str:
     if Path(path).expanduser().is_absolute():
-        return f"`{path}` is not there"
+        return f"`{path}` does not exist"
     if not roots:
-        return f"no `{path}`, as no folder of recordings is known: give `--data FOLDER`"
-    return f"no `{path}` in {', '.join(f'`{root}`' for root in roots)}, nor one or two folders below"
+        return f"`{path}` not found, no folder of recordings is known: give `--data FOLDER`"
+    return f"`{path}` not found in {', '.join(f'`{root}`' for root in roots)}, nor in subfolders two levels deep"
 
 
 def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: Path | None) -> dict[str, Any]:

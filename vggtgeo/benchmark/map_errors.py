@@ -1,4 +1,4 @@
-"""Errors of depth, map and surface of a run, where the true surfaces are known: exact depth, or a scan."""
+"""Errors of depth, point cloud and mesh of a run against exact depth or a laser scan."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from vggtgeo.benchmark.inputs import Input
 from vggtgeo.evaluation import CloudError, Similarity, cloud_error, depth_error, surface_points
 from vggtgeo.results.result import Result
 
-_DEPTH_MAPS = 40  # keyframes whose dense depth is compared, evenly spaced: more changes the mean by little
-_MOST = 200_000
-"""Points of each cloud: distances to a tenth of the map differ in the third digit."""
+_DEPTH_MAPS = 40  # keyframes whose depth is compared, evenly spaced: more change the mean little
+_MAX_POINTS = 200_000
+"""Of each cloud: a tenth of the points changes the distances in the third digit."""
 
 
 def depth_errors(result: Result, given: Input, alignment: Similarity) -> dict[str, Any]:
-    """Errors of the keyframes' dense depth, and of that before the adjustment, against the exact depth."""
+    """Return errors of the keyframes' dense depth, and of their depth before the adjustment."""
     if given.exact is None or result.record is None:
         return {}
     keyframes, maps = result.record.slam.keyframes, result.record.dense.depth_maps
@@ -35,10 +35,10 @@ _Depths = Sequence[tuple[int, np.ndarray | None]]
 
 
 def pooled_depth_errors(fused: _Depths, before: _Depths, exact: ExactFrames, scale: float) -> dict[str, Any]:
-    """Errors over all pixels of pairs of a frame's position and its depth, times `scale`.
+    """Return errors over all pixels of (frame index, depth) pairs, with depth multiplied by `scale`.
 
-    `depth_prior_rmse_m` is that of `before`. Depth of fewer pixels (`camera.most_pixels`) takes the nearest of the
-    exact ones.
+    `depth_prior_rmse_m` is that of `before`. Exact depth is reduced to the size of the depth by nearest neighbour
+    (`camera.most_pixels`).
     """
     found, prior = (
         [
@@ -68,7 +68,7 @@ def _as_large(truth: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def map_errors(result: Result, given: Input, alignment: Similarity, spec: Mapping[str, Any]) -> dict[str, Any]:
-    """The map, and the mesh where the run keeps one, against the true surfaces, after the alignment of the path."""
+    """Return errors of the cloud, and of the mesh if the run saves it, after the alignment of the trajectory."""
     if not len(result.cloud):
         return {}
     threshold = spec["threshold"]
@@ -89,9 +89,10 @@ def map_errors(result: Result, given: Input, alignment: Similarity, spec: Mappin
 
 
 def scan_errors(points: Float[np.ndarray, "n 3"], given: Input, threshold: float) -> dict[str, Any]:
-    """The map (in the scan's frame) against a laser scan, both within the scan's volume and thinned to half of the
-    threshold, as the benchmark Tanks and Temples does it; without its refinement of the alignment. Nothing without a
-    scan.
+    """Return errors of the map (in the scan's frame) against a laser scan; empty without a scan.
+
+    Both are cropped to the scan's volume and thinned to half the threshold, as in the benchmark Tanks and Temples, but
+    without its refinement of the alignment.
     """
     truth = None if given.scan is None else given.scan.scanned_points()
     if given.scan is None or truth is None:
@@ -103,13 +104,13 @@ def scan_errors(points: Float[np.ndarray, "n 3"], given: Input, threshold: float
 
 
 def thinned(points: Float[np.ndarray, "n 3"], size: float) -> Float[np.ndarray, "m 3"]:
-    """One point of each cube of `size` metres that holds any."""
+    """Return one point of each occupied cube of `size` metres."""
     _, rows = np.unique(np.floor(points / size).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(rows)]
 
 
 def _sparse(points: np.ndarray) -> np.ndarray:
-    return points[:: max(len(points) // _MOST, 1)]
+    return points[:: max(len(points) // _MAX_POINTS, 1)]
 
 
 def _columns(found: CloudError) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The tables of a suite as Markdown: best in bold, second best underlined."""
+"""Tables of a suite as Markdown: best in bold, second best underlined."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vggtgeo.benchmark.table import Row
 
 
 def page(suite: Suite, rows: Sequence[Row]) -> str:
-    """All of them."""
+    """Return all tables."""
     good = cells.finished(rows)
     there = [row for row in rows if row["status"] != "absent"]
     parts = [f"# {' '.join(suite.title.split())}", *([suite.about.strip()] if suite.about else []), notice(suite, rows)]
@@ -34,7 +34,7 @@ def page(suite: Suite, rows: Sequence[Row]) -> str:
 
 
 _COVERED = (
-    f", at the share of the truth's duration that is covered: below {100 * cells.LEAST_COVERAGE:.0f} % an error is not "
+    f", at the share of the truth's duration that is covered: below {100 * cells.MIN_COVERAGE:.0f} % an error is not "
     "ranked."
 )
 _DIFFERENCES = (
@@ -44,7 +44,7 @@ _DIFFERENCES = (
 
 
 def notice(suite: Suite, rows: Sequence[Row]) -> str:
-    """What kind of numbers these are."""
+    """Return a paragraph on the kind of numbers: simulated or recorded, seeds, protocol."""
     kinds = {bool(row.get("simulated")) for row in rows if row["status"] == "ok"}
     kind = {
         frozenset({True}): "Simulated: rendered worlds with exact truth. ",
@@ -54,29 +54,29 @@ def notice(suite: Suite, rows: Sequence[Row]) -> str:
     stubs = roles if any(row.get("perception") == "simulated" for row in rows) else ""
     seeds = f"Seeds from {suite.first_seed}; mean ± standard deviation over seeds"
     most = max((len(select(rows, row["sequence"], row["setting"])) for row in rows), default=0)
-    seeds += " / median." if most >= cells.LEAST_FOR_MEDIAN else "."
+    seeds += " / median." if most >= cells.MIN_FOR_MEDIAN else "."
     return f"{kind}{stubs}Suite `{suite.name}`, {_count(rows)}. {seeds} Protocol {cells.protocol_text(rows)}."
 
 
 def _count(rows: Sequence[Row]) -> str:
-    """How many runs there are, and what else the rows are."""
+    """Number of runs, missing recordings and rows of other systems."""
     others = sum("external" in row for row in rows)
     absent = sum(row["status"] == "absent" for row in rows)
     runs = len(rows) - others - absent
     parts = [f"{runs} runs" if runs != 1 else "1 run"]
-    parts += [f"{absent} more whose recording is not there"] * bool(absent)
+    parts += [f"{absent} more without their recording"] * bool(absent)
     parts += [f"{others} of other systems"] * bool(others)
     return ", ".join(parts)
 
 
 def accuracy(suite: Suite, rows: Sequence[Row], column: cells.Column) -> str:
-    """A row a setting, a column a sequence."""
+    """Return a table with a row per setting and a column per sequence."""
     body = [[title, *map(_marked, line)] for title, line in cells.matrix(suite, rows, column)]
     return table(["setting", *cells.matrix_heads(suite, rows, column)], body)
 
 
 def differences(suite: Suite, rows: Sequence[Row]) -> str:
-    """Each setting against the baseline."""
+    """Return the table of differences to the baseline."""
     heads = ["setting", "sequence", "pairs", *(column.head for column in cells.COMPARED)]
     lines = [
         [one.setting, one.sequence, str(one.pairs), *(f"**{c.text}**" if c.place else c.text for c in one.cells)]
@@ -86,7 +86,7 @@ def differences(suite: Suite, rows: Sequence[Row]) -> str:
 
 
 def details(suite: Suite, rows: Sequence[Row]) -> list[str]:
-    """Every number of each sequence and setting that has a result, a table for each group of them."""
+    """Return a table for each group of numbers, with a row per sequence and setting."""
     runs = [
         ((sequence, suite.title_of(setting), cells.runs_text(own)), own)
         for sequence in cells.sequences_of(suite, rows)
@@ -112,7 +112,7 @@ _NAMES = ("sequence", "setting", "runs")
 
 
 def _poses(runs: Sequence[tuple[Sequence[str], Sequence[Row]]], references: Sequence[cells.Column]) -> str:
-    """That of the poses, with the verdicts; there is one of each run."""
+    """The table of the poses, with the verdicts."""
     shown = cells.measured([own for _, own in runs], (*cells.GROUPS["Poses"], *references))
     lines = [
         [*names, cells.tracked(own), *(_marked(cells.cell_of(own, column)) for column in shown), cells.verdicts(own)]
@@ -122,13 +122,13 @@ def _poses(runs: Sequence[tuple[Sequence[str], Sequence[Row]]], references: Sequ
 
 
 def doubts(rows: Sequence[Row]) -> str:
-    """What makes the errors of a run doubtful: few poses that match, a scale that cannot be."""
+    """Return the table of warnings about errors: few matched poses, an implausible scale."""
     names = ("sequence", "setting", "seed", "warnings")
     return table(names, [[str(row[name]) for name in names] for row in rows if row.get("warnings")])
 
 
 def failures(rows: Sequence[Row]) -> str:
-    """The runs that left no numbers, and why; those without data in one line."""
+    """Return the table of runs without a result and their reasons; runs without data in one line."""
     absent = sorted({str(row["sequence"]) for row in rows if row["status"] == "absent"})
     broken = [row for row in rows if row["status"] not in ("ok", "absent")]
     parts = []
@@ -139,12 +139,12 @@ def failures(rows: Sequence[Row]) -> str:
         ]
         parts.append(table(["sequence", "setting", "seed", "status", "message"], lines))
     if absent:
-        parts.append(f"Not there: {', '.join(absent)} (`vggtgeo data list` tells where to get them).")
+        parts.append(f"Missing recordings: {', '.join(absent)} (`vggtgeo data list` shows where to get them).")
     return "\n\n".join(parts)
 
 
 def published_table(given: PublishedTable) -> str:
-    """Figures of others, apart from the suite's own."""
+    """Return a table of published figures, separate from the suite's own."""
     note = " `*`: not given the intrinsics." if given.uncalibrated else ""
     note += " `-`: not published." if given.has_gaps else ""
     return (
@@ -154,7 +154,7 @@ def published_table(given: PublishedTable) -> str:
 
 
 def provenance(rows: Sequence[Row]) -> str:
-    """Versions and machines behind the rows."""
+    """Return the table of versions and machines."""
     lines = []
     for name in ("version", "commit", "source", "machine", "version_jax", "version_numpy", "version_python"):
         found = [str(value) for value in dict.fromkeys(row.get(name) for row in rows) if value]
@@ -164,7 +164,7 @@ def provenance(rows: Sequence[Row]) -> str:
 
 
 def table(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     row = lambda cells: "| " + " | ".join(text.replace("|", "\\|").replace("\n", " ") for text in cells) + " |"
     return "\n".join([row(heads), "|" + "---|" * len(heads), *map(row, lines)])
 

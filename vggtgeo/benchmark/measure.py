@@ -1,4 +1,4 @@
-"""The errors and costs of a finished run, as one flat row of a table: SI units, degrees; None where there is none."""
+"""Errors and costs of a finished run as one row: SI units, degrees; None if undefined."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.results.result import Result
 
 DELTAS: tuple[tuple[str, float, str], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0, "metres"))
-"""Of RTE and RRE: the name in the columns, how far, and its unit."""
+"""Of RTE and RRE: column suffix, delta and its unit."""
 NOT_COMPARABLE = "not comparable"
-"""The status of a row whose errors mean nothing, for the reasons in its message."""
-_AROUND = 0.02
-"""Seconds before the first and after the last frame in which the truth still belongs to the run."""
+"""Status of a row whose errors are meaningless, for the reasons in its message."""
+_MARGIN = 0.02
+"""Seconds before the first and after the last frame that still belong to the run's ground truth."""
 
 
-def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str, Any]:
-    """All of it. A number that a run cannot have (an error without truth) is left out."""
+def measure(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the row of a run; numbers that it cannot have (errors without ground truth) are left out."""
     summary = result.summary
     row: dict[str, Any] = {
         "verdict": result.verdict.level,
@@ -59,15 +59,16 @@ def measured(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str,
         found, _ = trajectory_errors(estimate, reference, metric=False)
         row[f"ate_sim3_{name}_m"] = found.get("ate_sim3_m")
     if truth is not None and alignment is not None:
-        row |= honesty(result, truth, row["scale"])
+        row |= mean_nees(result, truth, row["scale"])
         row |= depth_errors(result, given, alignment) | map_errors(result, given, alignment, spec)
     return {name: _plain(value) for name, value in row.items()}
 
 
-def honesty(result: Result, truth: Trajectory, scale: float, max_dt: float = 0.01) -> dict[str, Any]:
-    """The mean NEES of places and of rotations, over their three numbers each: 1 where the deviations that the run
-    states are those of its errors, more where they are too small. scale: of the Sim(3) alignment, which lengths of a
-    run without metres are taken by.
+def mean_nees(result: Result, truth: Trajectory, scale: float, max_dt: float = 0.01) -> dict[str, Any]:
+    """Return the mean NEES of positions and of rotations, divided by its three degrees of freedom.
+
+    1 if the run's standard deviations match its errors, more if they are too small. scale: of the Sim(3) alignment,
+    applied to a run of free scale.
     """
     stated = result.uncertainty
     if stated is None:
@@ -83,7 +84,7 @@ def honesty(result: Result, truth: Trajectory, scale: float, max_dt: float = 0.0
 
 
 def truth_of_run(result: Result, truth: Trajectory | None) -> Trajectory | None:
-    """The part of the truth that lies between the first and the last frame of the run; None where there is none."""
+    """Return the ground truth between the first and the last frame of the run; None if there is none."""
     if truth is None or result.record is None:
         return truth
     frames = result.record.slam.frames
@@ -91,17 +92,18 @@ def truth_of_run(result: Result, truth: Trajectory | None) -> Trajectory | None:
 
 
 def between(truth: Trajectory, first: float, last: float) -> Trajectory:
-    """The poses from `first` to `last`, seconds; all of them where none lies in between."""
-    inside = (truth.timestamps >= first - _AROUND) & (truth.timestamps <= last + _AROUND)
+    """Return the poses from `first` to `last`, seconds; all poses if there is none."""
+    inside = (truth.timestamps >= first - _MARGIN) & (truth.timestamps <= last + _MARGIN)
     return truth.select(inside) if inside.any() else truth
 
 
 def trajectory_errors(
     estimate: Trajectory, truth: Trajectory, metric: bool = True, max_dt: float = 0.01, vertical: Axis = "z"
 ) -> tuple[dict[str, Any], Similarity | None]:
-    """ATE after each alignment, RTE and RRE at `DELTAS`; and the alignment that maps are compared after: SE(3) where
-    lengths are metres, else Sim(3). Relative errors of an estimate without scale are taken after that, too. A status
-    and a message where the errors mean nothing.
+    """Return ATE after each alignment, RTE and RRE at `DELTAS`, and the alignment for maps.
+
+    That is SE(3) for a metric estimate, else Sim(3), also for the relative errors. Meaningless errors get a status and
+    a message.
     """
     try:
         report = evaluate_trajectory(estimate, truth, max_dt, vertical=AXES[vertical])
@@ -142,7 +144,7 @@ def _relative(report: TrajectoryReport, name: str, metric: bool) -> dict[str, An
 
 
 def _plain(value: Any) -> Any:
-    """Of a type that JSON knows; None for NaN."""
+    """As a JSON type; None for NaN."""
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""`report.html` of a suite: one self-contained file; what is shown is chosen here, how it looks in `page.html.j2`."""
+"""Write `report.html` of a suite: this file selects the content, `page.html.j2` has the layout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vggtgeo.report.page import style, template
 
 
 def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> None:
-    """Writes the page, atomically. folder: of the runs, whose pages are linked where they are there."""
+    """Write the page, atomically. folder: of the suite, whose runs are linked."""
     good = cells.finished(rows)
     there = [row for row in rows if row["status"] != "absent"]
     text = template("vggtgeo.benchmark", "page.html.j2").render(
@@ -75,7 +75,7 @@ def _sequence(suite: Suite, rows: Sequence[Row], name: str, folder: Path) -> dic
 
 
 def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> list[dict[str, Any]]:
-    """A table for each group of numbers that some run has; that of the poses has the runs and their verdicts."""
+    """A table for each group of numbers; the one of the poses has the number of runs and the verdicts."""
     settings = cells.settings_of(suite, select(cells.finished(rows), sequence))
     groups = [select(rows, sequence, setting) for setting in settings]
     tables = []

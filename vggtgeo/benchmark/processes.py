@@ -1,4 +1,4 @@
-"""A command in a process of its own, with limits of time and memory, whatever becomes of it."""
+"""Run a command in its own process, with limits of time and memory."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from vggtgeo.io.locks import LockedError, locked
 
 _POLL = 0.02
 _MEMORY_POLL = 0.25
-"""Seconds between two looks; one at the memory of a process and its children takes half a millisecond."""
+"""Seconds between two polls; measuring the memory of a process and its children takes half a millisecond."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """seconds: of one try. memory_gb: of the process and its children, resident. retries: of a process that somebody
-    else ended (SIGKILL, SIGTERM, SIGHUP): a worker of a cluster that is taken away, a machine short of memory.
+    """seconds: of one try. memory_gb: resident memory of the process and its children. retries: after a signal from
+    outside (SIGKILL, SIGTERM, SIGHUP), for example a preempted cluster node, or the kernel's out-of-memory killer.
     """
 
     seconds: float
@@ -37,8 +37,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class Ending:
-    """status: "ended" (by itself: code says how), "timeout", "memory", or "killed" by somebody else's signal. code: the
-    exit status, minus the signal's number. seconds: of the last try. peak_gb: largest resident memory. tries: counted.
+    """How a process ended.
+
+    Fields: status, "ended" (by itself, see code), "timeout", "memory", or "killed" by a signal from outside; code, the
+    exit status, or minus the signal's number; seconds, of the last try; peak_gb, largest resident memory; tries.
     """
 
     status: str
@@ -49,32 +51,31 @@ class Ending:
 
     @property
     def message(self) -> str:
-        """The ending in words."""
+        """Description of the ending."""
         if self.status == "timeout":
-            return f"took too long: ended after {self.seconds:.1f} s"
+            return f"timeout: stopped after {self.seconds:.1f} s"
         if self.status == "memory":
-            return f"took more than its share of memory: {self.peak_gb:.1f} GB"
+            return f"memory limit exceeded: {self.peak_gb:.1f} GB"
         if self.code < 0:
             again = f", {self.tries} times" if self.tries > 1 else ""
             return f"ended by {signal.Signals(-self.code).name}{again}"
         return f"exit status {self.code}"
 
 
-_ELSEWHERE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
+_OUTSIDE_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 
 
 def run_limited(
     command: Sequence[str], log: Path, limits: Limits, cores: Sequence[int] = (), stop: threading.Event | None = None
 ) -> Ending:
-    """Run `command` until it ends or a limit is reached; what it prints goes to `log`.
+    """Run `command` until it ends or a limit is reached; its output is appended to `log`.
 
-    cores: the processors that it may use; by default all. stop: ends the process when it is set.
-    Raises KeyboardInterrupt after a stop.
+    cores: processors that it may use; by default all. stop: ends the process when set, with KeyboardInterrupt.
     """
     tries = 1
     while True:
         ending = _once(command, log, limits, cores, stop)
-        killed = ending.status == "ended" and ending.code < 0 and signal.Signals(-ending.code) in _ELSEWHERE
+        killed = ending.status == "ended" and ending.code < 0 and signal.Signals(-ending.code) in _OUTSIDE_SIGNALS
         if not killed:
             return Ending(ending.status, ending.code, ending.seconds, ending.peak_gb, tries)
         if tries > limits.retries:
@@ -107,7 +108,7 @@ def _once(
 
 @contextmanager
 def _started(command: Sequence[str], log: Path, cores: Sequence[int]) -> Iterator[subprocess.Popen[bytes]]:
-    """The process in a session of its own; it and its children are gone afterwards."""
+    """Start the process in its own session; kill it and its children at the end."""
     with log.open("ab") as output:
         process = subprocess.Popen(
             command,
@@ -138,8 +139,8 @@ def _resident_gb(pid: int) -> float:
 
 
 @contextmanager
-def claimed(count: int) -> Iterator[tuple[int, ...]]:
-    """`count` processors of this machine that no other process of this user has claimed so; () where fewer are free."""
+def claim_cores(count: int) -> Iterator[tuple[int, ...]]:
+    """Claim `count` processors that no other process of this user has claimed; yield () if fewer are free."""
     folder = Path(tempfile.gettempdir()) / f"vggtgeo-cores-{getattr(os, 'getuid', int)()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     with contextlib.ExitStack() as held:
@@ -156,9 +157,9 @@ def claimed(count: int) -> Iterator[tuple[int, ...]]:
 
 
 def shares(workers: int) -> list[tuple[int, ...]]:
-    """The processors of each of `workers` processes: an even share each, where there are enough to share."""
-    there = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    each = len(there) // workers
+    """Return the processors of each of `workers` processes, in equal shares; empty shares if there are too few."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    each = len(cores) // workers
     if not each:
         return [()] * workers
-    return [tuple(there[number * each : (number + 1) * each]) for number in range(workers)]
+    return [tuple(cores[number * each : (number + 1) * each]) for number in range(workers)]

@@ -1,7 +1,7 @@
-"""How systems are compared in the literature, as presets: which frames are given, and which poses are judged.
+"""Evaluation protocols of the literature: which frames are used, and which poses are evaluated.
 
-Whatever the protocol, errors are stated after SE(3) and after Sim(3), with the scale: a table after Sim(3) alone hides
-an error of scale, which for monocular systems is 2 to 10 times as large as what it shows.
+With any protocol, errors are reported after SE(3) and after Sim(3), with the scale: Sim(3) alone hides the scale error,
+which for monocular systems is 2 to 10 times as large as the error it shows.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Protocol:
-    """stride: take every n-th frame. poses: judge "all" frames or "keyframes". about: whose it is."""
+    """stride: take every n-th frame. poses: evaluate "all" frames or "keyframes". about: source and description."""
 
     stride: int
     poses: str

@@ -1,4 +1,4 @@
-"""Where a number comes from: code, machine, inputs."""
+"""Provenance of results: code, machine, inputs."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ import psutil
 from vggtgeo.results.summary import versions
 
 _PACKAGE = Path(__file__).parent.parent
-_COMPUTING = ("bundle", "datasets", "evaluation", "geometry", "simulation", "slam", "solvers", "models")
-"""Packages that a result depends on; pages and commands do not change it."""
+_PACKAGES = ("bundle", "datasets", "evaluation", "geometry", "simulation", "slam", "solvers", "models")
+"""Packages that results depend on; reports and commands do not change them."""
 _TEXT = frozenset({".txt", ".toml", ".yaml", ".yml", ".json", ".csv"})
 
 
 @cache
 def source_digest() -> str:
-    """Of the code that computes: 12 hexadecimal digits."""
+    """Return a digest of the code that results depend on: 12 hexadecimal digits."""
     digest = hashlib.sha256()
-    for name in _COMPUTING:
+    for name in _PACKAGES:
         folder = _PACKAGE / name if (_PACKAGE / name).is_dir() else _PACKAGE.parent / name
         for file in sorted(folder.rglob("*.py")):
             digest.update(file.relative_to(folder.parent).as_posix().encode())
@@ -35,7 +35,7 @@ def source_digest() -> str:
 
 @cache
 def commit() -> str:
-    """Of the checkout that the package lies in, with a `+` where files are changed; empty where it is installed."""
+    """Return the commit of the package's checkout, with `+` if files are changed; empty for an installed package."""
     git = lambda *words: subprocess.run(
         ["git", "-C", str(_PACKAGE), *words], capture_output=True, text=True, check=False, timeout=20
     )
@@ -50,7 +50,7 @@ def commit() -> str:
 
 @cache
 def machine() -> str:
-    """Processor and memory in words; no name of a host."""
+    """Describe processor and memory, without the host's name."""
     model = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -62,7 +62,7 @@ def machine() -> str:
 
 
 def provenance() -> dict[str, Any]:
-    """Columns of every row."""
+    """Return the provenance columns of a row."""
     found = versions()
     return {
         "version": found.pop("vggtgeo"),
@@ -74,15 +74,15 @@ def provenance() -> dict[str, Any]:
 
 
 def input_hash(path: Path) -> str:
-    """Of a recording: names and sizes of its files, and the content of its text files; 16 hexadecimal digits.
+    """Return a digest of a recording: names and sizes of its files, content of its text files; 16 hexadecimal digits.
 
-    Images are not read: a gigabyte would take longer than some runs.
+    Image contents are not hashed: reading a gigabyte takes longer than some runs.
     """
     digest = hashlib.sha256()
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     for file in files:
         name = file.relative_to(path.parent).as_posix()
-        with contextlib.suppress(OSError):  # gone meanwhile, or not to be read: the run will say so
+        with contextlib.suppress(OSError):  # a missing or unreadable file: the run itself reports it
             size = file.stat().st_size
             digest.update(f"{name} {size}\n".encode(errors="surrogateescape"))  # names need not be UTF-8
             if file.suffix.lower() in _TEXT and size < 2**22:

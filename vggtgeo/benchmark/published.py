@@ -1,4 +1,4 @@
-"""Figures that other groups published, as data: each table with its source and its protocol."""
+"""Figures published by others, as data: each table with its source and protocol."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LOST = "lost"
 
 
 class Printed(float):
-    """A number that is shown with the digits that its source prints: 0.050 is no 0.05."""
+    """A number that is printed with the digits of its source: 0.050, not 0.05."""
 
     def __new__(cls, text: object) -> Self:
         made = super().__new__(cls, str(text))
@@ -33,9 +33,10 @@ Figure = float | str | None
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """title, source, protocol: in words. columns: heads. rows: numbers by system, `LOST` where it lost track, None
-    where none is published. unit: of the numbers. papers: of the systems. uncalibrated: systems that were not given the
-    intrinsics.
+    """A published table.
+
+    Fields: title, source, protocol, as text; columns, their heads; rows, numbers by system, `LOST` if it lost track,
+    None if not published; unit of the numbers; papers of the systems; uncalibrated, systems without known intrinsics.
     """
 
     name: str
@@ -50,11 +51,11 @@ class PublishedTable:
 
     @property
     def has_gaps(self) -> bool:
-        """Whether a figure is not published."""
+        """Whether some figures are not published."""
         return any(None in numbers for numbers in self.rows.values())
 
     def lines(self) -> list[list[str]]:
-        """A row of texts a system: its name, with a star where it was not given the intrinsics, numbers, and paper."""
+        """Return a row of texts per system: name (with a star if uncalibrated), numbers, paper."""
         return [
             [f"{name}{'*' * (name in self.uncalibrated)}", *map(figure_text, numbers), self.papers[name]]
             for name, numbers in self.rows.items()
@@ -62,7 +63,7 @@ class PublishedTable:
 
 
 def figure_text(figure: Figure) -> str:
-    """As it stands in a table."""
+    """Return a figure as text for a table."""
     return "-" if figure is None else str(figure)
 
 
@@ -71,14 +72,14 @@ def _folder() -> Traversable:
 
 
 def check_published(name: str) -> None:
-    """InputError where there is no published table of that name."""
-    there = sorted(entry.name[:-5] for entry in _folder().iterdir() if entry.name.endswith(".toml"))
-    if name not in there:
-        raise InputError(f"there is no published table `{name}`; there are {', '.join(there)}")
+    """Raise InputError for an unknown table."""
+    known = sorted(entry.name[:-5] for entry in _folder().iterdir() if entry.name.endswith(".toml"))
+    if name not in known:
+        raise InputError(f"`published` must be of {', '.join(known)}, got `{name}`")
 
 
 def published(name: str) -> PublishedTable:
-    """The table of a file in `vggtgeo/benchmark/published`; InputError where there is none of that name."""
+    """Load a table from `vggtgeo/benchmark/published`; raise InputError for an unknown name."""
     check_published(name)
     values = tomllib.loads((_folder() / f"{name}.toml").read_text("utf-8"), parse_float=Printed)
     columns = tuple(values.pop("columns"))

@@ -1,4 +1,4 @@
-"""A suite from its file to its tables: `vggtgeo.bench`."""
+"""`vggtgeo.bench`: run a suite and write its tables."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 
 from vggtgeo.benchmark import markdown
 from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
-from vggtgeo.benchmark.common_time import less_baseline
-from vggtgeo.benchmark.external import external_rows, tell_missing
+from vggtgeo.benchmark.common_time import subtract_baseline
+from vggtgeo.benchmark.external import external_rows, warn_of_missing
 from vggtgeo.benchmark.figures import ablation_figure
 from vggtgeo.benchmark.inputs import data_folders
 from vggtgeo.benchmark.jobs import Job, jobs_of
@@ -21,7 +21,7 @@ from vggtgeo.benchmark.processes import Limits
 from vggtgeo.benchmark.provenance import source_digest
 from vggtgeo.benchmark.scheduling import run_jobs
 from vggtgeo.benchmark.store import Store
-from vggtgeo.benchmark.suite import Suite, limited, load_suite
+from vggtgeo.benchmark.suite import Suite, load_suite, restrict
 from vggtgeo.benchmark.table import Row, as_csv, write_parquet
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
@@ -31,19 +31,19 @@ from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import locked_folder
 
 OUTPUTS = ("report.html", "tables.md", "runs.csv", "runs.parquet")
-"""What a suite leaves in its folder; the last where PyArrow is there."""
+"""Files of a suite in its folder; the last one only with PyArrow."""
 _LOCK = ".bench.lock"
 Progress = Callable[[int, int, Row], None]
-"""Called after each run with the number of those that are done, the number of all, and the row."""
+"""Called after each run with the number of finished runs, the number of all runs, and the row."""
 
 
 @dataclass(frozen=True)
 class BenchReport:
-    """The rows of a suite, as `vggtgeo.bench` returns them; SI units, angles in degrees.
+    """The result of `vggtgeo.bench`; SI units, angles in degrees.
 
     Fields:
-        suite: what was to be run.
-        rows: a run each, in the order of the suite, then those of other systems; `status` says how it ended.
+        suite: the suite.
+        rows: one per run, in the order of the suite, then those of other systems; `status` is how the run ended.
         folder: of the runs.
 
     """
@@ -53,19 +53,19 @@ class BenchReport:
     folder: Path
 
     def markdown(self) -> str:
-        """The tables: means and standard deviations, differences from the baseline, what went wrong, provenance."""
+        """Return the tables: means and standard deviations, differences to the baseline, failures, provenance."""
         return markdown.page(self.suite, self.rows)
 
     def csv(self) -> str:
-        """Every run, one a line."""
+        """Return all runs as CSV."""
         return as_csv(self.rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """The name of the suite and every row, as plain values."""
+        """Return the name of the suite and all rows as plain values."""
         return {"suite": self.suite.name, "rows": [dict(row) for row in self.rows]}
 
     def write(self, folder: Path) -> None:
-        """The files of `OUTPUTS`."""
+        """Write the files of `OUTPUTS`."""
         write_text(folder / "tables.md", self.markdown())
         write_text(folder / "runs.csv", self.csv())
         write_page(folder / "report.html", self.suite, self.rows, self.folder)
@@ -100,42 +100,41 @@ def bench(
     progress: Progress | None = None,
     cluster: Cluster | None = None,
 ) -> BenchReport:
-    """Run a suite (sequences x settings x seeds) and write its tables and its page into the folder `output`.
+    """Run a suite (sequences x settings x seeds) and write its tables and its report into the folder `output`.
 
-    Each run is a process of its own with limits of time and memory: a crash or a hang is a row, not the end. Each
-    finished run lies in `output`/runs; a second call does only what is missing, and what other settings, inputs or
-    another version of the code made.
+    Each run is a process with limits of time and memory: a crash or a timeout is a row in the tables. Finished runs are
+    kept in `output`/runs; a second call runs only what is missing, or was made with other settings, inputs or code.
 
     Args:
-        suite: a TOML file, or the name of a suite that comes along: quick, simulated, paper, clips, tum, 7scenes, ...
+        suite: a TOML file, or the name of a shipped suite: quick, simulated, paper, clips, tum, 7scenes, ...
         output: folder.
-        data: folders that hold the recordings; by default those of `$VGGTGEO_DATA`, else `data`.
-        sequences: those of the suite to run.
-        settings: those of the suite to run.
-        seeds: how many, in place of the suite's own.
-        first_seed: the first of them.
-        frames: of each sequence at most.
-        workers: processes at once; the processors are shared out among them.
-        timeout_minutes: limit of one run, in place of the suite's.
-        memory_gb: limit of one run, in place of the suite's.
-        retry: run again what ended without a result.
-        recordings: whether each run leaves `run.rrd` for the Rerun viewer, in place of the suite's.
+        data: folders of recordings; by default those of `$VGGTGEO_DATA`, else `data`.
+        sequences: names of the sequences to run; by default all.
+        settings: names of the settings to run; by default all.
+        seeds: number of seeds; overrides the suite's.
+        first_seed: first seed; overrides the suite's.
+        frames: maximum number of frames of each sequence.
+        workers: number of parallel processes; each gets an equal share of the processors.
+        timeout_minutes: limit of one run; overrides the suite's.
+        memory_gb: limit of one run; overrides the suite's.
+        retry: repeat runs that ended without a result.
+        recordings: whether each run writes `run.rrd` for the Rerun viewer; overrides the suite's.
         progress: see `Progress`.
-        cluster: a Ray cluster to run on, in place of processes here.
+        cluster: Ray cluster to run on, instead of local processes.
 
     Raises:
-        InputError: a suite, a name in it or a folder that is not there.
+        InputError: an invalid suite, an unknown name, or a missing folder.
 
     Example:
         >>> import vggtgeo as vg
         >>> vg.bench("quick", "runs/quick", sequences=["ofice"])  # with "office": every setting on that sequence
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `sequences` holds ['ofice']; choose among office, corridor, redkitchen, icl-office
+        vggtgeo.io.errors.InputError: `sequences` must be of office, corridor, redkitchen, icl-office, got ['ofice']
 
     """
     chosen = suite if isinstance(suite, Suite) else load_suite(path_of("suite", suite))
-    chosen = limited(chosen, _names("sequences", sequences), _names("settings", settings), seeds, first_seed, frames)
+    chosen = restrict(chosen, _names("sequences", sequences), _names("settings", settings), seeds, first_seed, frames)
     chosen = replace(
         chosen,
         recordings=chosen.recordings if recordings is None else recordings,
@@ -145,23 +144,23 @@ def bench(
     folder = path_of("output", output)
     _check_output(folder)
     if workers < 1:
-        raise InputError(f"`workers` is {workers}; it must be at least 1")
+        raise InputError(f"`workers` must be at least 1, got {workers}")
     jobs = jobs_of(chosen, data_folders(data))
     base = Path(suite).parent if not isinstance(suite, Suite) else Path()
-    tell_missing(chosen, jobs, base)
-    with locked_folder(folder, _LOCK, "batch"):  # two would take each other's runs away
+    warn_of_missing(chosen, jobs, base)
+    with locked_folder(folder, _LOCK, "batch"):  # two batches would delete each other's runs
         store = Store(folder, chosen.name, source_digest())
         limits = Limits(60 * chosen.timeout_minutes, chosen.memory_gb)
         rows = all_rows(jobs, store, limits, workers, retry, progress, cluster)
         rows += external_rows(chosen, jobs, folder / "runs", base)
-        rows = less_baseline(chosen, rows, folder / "runs")
+        rows = subtract_baseline(chosen, rows, folder / "runs")
         report = BenchReport(chosen, tuple(rows), folder)
         report.write(folder)
     return report
 
 
 def _check_output(folder: Path) -> None:
-    """InputError where a batch would replace files that are not of one: those of a single run, say."""
+    """Raise InputError if the batch would replace files of something else, for example of a single run."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
     if whole_path(folder) == Path(whole_path(folder).anchor):
@@ -169,8 +168,8 @@ def _check_output(folder: Path) -> None:
     there = [name for name in OUTPUTS if (folder / name).exists()]
     if there and not (folder / "runs").is_dir() and not {"tables.md", "runs.csv"} <= set(there):
         raise InputError(
-            f"`{folder}` holds `{there[0]}`, which a batch replaces, and nothing else of a batch; give another folder "
-            "with `-o`"
+            f"`{folder}` contains `{there[0]}`, which the batch would replace, but no batch; give another folder with "
+            "`-o`"
         )
 
 
@@ -184,7 +183,7 @@ def all_rows(
     cluster: Cluster | None = None,
     **options: Any,
 ) -> list[Row]:
-    """The rows of `jobs` in their order, from the store or by running them, in processes here or on a cluster."""
+    """Return the rows of `jobs` in their order, from the store or by running them."""
     rows: dict[str, Row] = {}
 
     def note(job: Job, row: Row) -> None:
@@ -207,6 +206,6 @@ def all_rows(
 
 
 def _names(what: str, names: Iterable[str] | None) -> tuple[str, ...] | None:
-    if isinstance(names, str):  # a text is an iterable of its letters
-        raise InputError(f"`{what}` is {names!r}; expected a list of names, as [{names!r}]")
+    if isinstance(names, str):  # a text would be iterated by characters
+        raise InputError(f"`{what}` must be a list of names, as [{names!r}], got {names!r}")
     return None if names is None else tuple(names)

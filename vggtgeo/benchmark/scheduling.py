@@ -1,4 +1,4 @@
-"""Runs in turn or side by side, each in a process with limits."""
+"""Run jobs serially or in parallel, each in a process with limits."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from vggtgeo.benchmark.worker import LOG, NO_SPACE
 from vggtgeo.io.errors import InputError
 
 Command = Callable[[Path, Path], Sequence[str]]
-"""The command line of a run, given its folder and the scratch folder."""
+"""Returns the command line of a run for its folder and the scratch folder."""
 Finished = Callable[[Job, Row], None]
 _WAIT = 0.1
-_FULL = "no space"  # in place of a status: there will be no row
-_LAST = 2000  # characters of a log that are looked at for its last line
+_FULL = "no space"  # in place of a status: no row is written
+_TAIL = 2000  # characters at the end of a log that are searched for its last line
 
 
 def worker_command(folder: Path, scratch: Path) -> list[str]:
-    """The command line of a run."""
+    """Return the command line of a run."""
     return [sys.executable, "-m", "vggtgeo.benchmark.worker", str(folder), str(scratch), str(os.getpid())]
 
 
@@ -43,10 +43,10 @@ def run_jobs(
     finished: Finished | None = None,
     command: Command = worker_command,
 ) -> None:
-    """Run `jobs`, `workers` at a time, and store their rows; a crash, a hang, too much memory is a row.
+    """Run `jobs`, `workers` at a time, and store their rows; crashes, timeouts and memory limits give rows as well.
 
-    Walks that are rendered are kept in a folder of this batch as long as a run waits for them. After Ctrl-C, a full
-    disk, or an exception of `finished`, no process is left; what was finished is stored.
+    Rendered walks are kept in a scratch folder while other runs need them. After Ctrl-C, a full disk, or an exception
+    of `finished`, all processes are ended; finished runs are stored.
     """
     with _scratch(store.folder) as scratch:
         queue = _Queue(list(jobs), scratch)
@@ -73,7 +73,7 @@ def run_jobs(
                 if not all(future.done() and not future.exception() for future in futures):
                     stop.set()
             errors = [error for future in futures if (error := future.exception()) is not None]
-            if errors:  # those that were stopped for another one tell of no more
+            if errors:  # KeyboardInterrupt may be that of workers stopped because of another error
                 raise min(errors, key=lambda error: isinstance(error, KeyboardInterrupt))
 
 
@@ -86,26 +86,26 @@ def run_one(
     scratch: Path,
     stop: threading.Event | None = None,
 ) -> Row:
-    """One run and its row; InputError where the disk is full, and so would be for those that follow."""
+    """Run one job and return its row; raise InputError if the disk is full, which would affect all later runs."""
     place = store.begin(job)
     began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     log = place / LOG
-    ending = described(run_limited(command(place, scratch), log, limits, cores, stop), log.read_bytes())
+    ending = describe_ending(run_limited(command(place, scratch), log, limits, cores, stop), log.read_bytes())
     check_space(place, ending)
     return store.complete(job, **ending, started=began, cpus=len(cores))
 
 
 def check_space(place: Path, ending: Mapping[str, Any]) -> None:
-    """InputError where a run ended because its disk was full, and so would be for those that follow."""
+    """Raise InputError if a run ended because the disk was full."""
     if ending["status"] == _FULL:
         raise InputError(
-            f"there is no space left for the run `{place}` ({ending['message']}); give it some and call again: what is "
-            "finished is kept"
+            f"no space left for the run `{place}` ({ending['message']}); free disk space and call again: finished runs "
+            "are kept"
         )
 
 
-def described(ending: Ending, log: bytes) -> dict[str, Any]:
-    """The columns of a row that tell how its process ended, and where; the status is that of a run that left no row."""
+def describe_ending(ending: Ending, log: bytes) -> dict[str, Any]:
+    """Return the columns on how and where a process ended; their status is used if the run wrote no row."""
     message, status = ending.message, "crash" if ending.status in ("ended", "killed") else ending.status
     if ending.status == "ended" and ending.code == NO_SPACE:
         message, status = _last_line(log), _FULL
@@ -122,16 +122,16 @@ def described(ending: Ending, log: bytes) -> dict[str, Any]:
 
 
 def _last_line(log: bytes) -> str:
-    lines = log[-_LAST:].decode(errors="replace").splitlines()
+    lines = log[-_TAIL:].decode(errors="replace").splitlines()
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
-    """A new folder below that of a batch, gone afterwards; of a batch that was killed the next one takes it away."""
+    """A temporary folder in that of the batch; the one of a killed batch is removed first."""
     place = folder / ".scratch"
     shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(mode=0o700, parents=True)  # nobody else may write there: a walk is a pickle
+    place.mkdir(mode=0o700, parents=True)  # rendered walks are pickles: no other user may write them
     try:
         yield place
     finally:
@@ -139,7 +139,7 @@ def _scratch(folder: Path) -> Iterator[Path]:
 
 
 class _Queue:
-    """Jobs in order; of those that share a walk, one goes ahead and renders it, and the others wait for that."""
+    """Jobs in order; of those that share a rendered walk, the first renders it while the others wait."""
 
     def __init__(self, jobs: list[Job], scratch: Path) -> None:
         self._waiting = jobs
@@ -148,7 +148,7 @@ class _Queue:
         self.changed = threading.Condition(threading.RLock())
 
     def take(self, stop: threading.Event) -> Job | None:
-        """The next job that can run now; None where no job is left, or after a stop."""
+        """Return the next job that can run; None if no job is left, or after a stop."""
         with self.changed:
             while self._waiting and not stop.is_set():
                 for job in self._waiting:
@@ -160,7 +160,7 @@ class _Queue:
             return None
 
     def give_back(self, job: Job) -> None:
-        """The job has ended; its walk goes where nobody waits for it."""
+        """Mark a job as ended; delete its walk if no other job needs it."""
         with self.changed:
             self._running.remove(job)
             walk = self._walk(job)

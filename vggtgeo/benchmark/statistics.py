@@ -1,4 +1,4 @@
-"""Means, deviations, and differences run by run, with the intervals that few runs allow."""
+"""Means, standard deviations and paired differences, with Student intervals for few runs."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from vggtgeo.benchmark.table import Row, number
 
 LEVEL = 0.95
 LESS_BASELINE = "_less_baseline"
-"""Behind the name of a column: the difference to the baseline over what both cover, where that was measured."""
+"""Suffix of a column: the difference to the baseline over the common time."""
 SAME = 1e-6
-"""Relative spread below which numbers are the same: nothing was drawn at random."""
+"""Relative spread below which numbers are equal: the runs had no random part."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Of n numbers: mean, sample standard deviation (NaN for one), the half width of the 95 % interval of the mean by
-    Student's law (NaN for one), and median.
+    """Count, mean, sample standard deviation, half width of the mean's 95 % Student interval, median of numbers.
+
+    Deviation and half width of a single number are NaN.
     """
 
     count: int
@@ -33,7 +34,7 @@ class Summary:
 
     @classmethod
     def of(cls, values: Float[np.ndarray, " n"]) -> Self:
-        """The summary of those `values` that are numbers."""
+        """Return the summary of the finite `values`."""
         known = values[np.isfinite(values)]
         count = len(known)
         if not count:
@@ -44,14 +45,12 @@ class Summary:
 
     @property
     def differs(self) -> bool:
-        """Whether zero lies outside of the interval. Numbers that agree to the last digit have none: seeds that change
-        nothing say nothing of chance.
-        """
+        """Whether the interval excludes zero. Never for equal numbers: seeds without effect do not sample the noise."""
         return bool(abs(self.mean) > self.half > SAME * abs(self.mean))
 
 
 def select(rows: Sequence[Row], sequence: str | None = None, setting: str | None = None) -> list[Row]:
-    """Rows of a sequence and a setting, by sequence and seed."""
+    """Return the rows of a sequence and a setting, sorted by sequence and seed."""
     chosen = [
         row
         for row in rows
@@ -61,7 +60,7 @@ def select(rows: Sequence[Row], sequence: str | None = None, setting: str | None
 
 
 def values(rows: Sequence[Row], column: str) -> Float[np.ndarray, " n"]:
-    """A column, NaN where a run has no value."""
+    """Return a column as numbers, NaN where missing."""
     return np.array([number(row, column) for row in rows], float)
 
 
@@ -73,11 +72,10 @@ def paired(
     sequence: str | None = None,
     recorded: Collection[str] = (),
 ) -> Float[np.ndarray, " n"]:
-    """Setting minus baseline on the same sequence and seed, where both have a number; over what both cover, where a row
-    has that difference.
+    """Return setting minus baseline on the same sequence and seed; over the common time where a row has that.
 
-    recorded: sequences of which there is one, whatever the seed. Over several sequences such a one is one sample, the
-    mean over its seeds: ten seeds of two recordings are no twenty recordings.
+    recorded: sequences that are the same for every seed. In a mean over sequences, such a sequence is one sample (the
+    mean over its seeds): ten seeds of two recordings are not twenty independent recordings.
     """
     other = {(row["sequence"], row["seed"]): number(row, column) for row in select(rows, sequence, baseline)}
     samples: dict[tuple[str, int | None], list[float]] = {}

@@ -1,4 +1,4 @@
-"""Finished runs as folders, a row in each: what is there is not run again."""
+"""Finished runs as folders, with a row in each: they are not run again."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LARGEST = 2**63
 
 
 def _check_row(row: Row, job: Job) -> None:
-    """ValueError or KeyError for a row that is of another run, or that the tables could not be made of."""
+    """Raise ValueError or KeyError for a row of another run, or with invalid values."""
     for name, wanted in (("sequence", job.sequence), ("setting", job.setting), ("seed", job.seed)):
         if row[name] != wanted or type(row[name]) is not type(wanted):
             raise ValueError(f"its `{name}` is {row[name]!r:.40}; expected {wanted!r}")
@@ -50,13 +50,13 @@ class Store:
     source: str
 
     def place(self, job: Job) -> Path:
-        """The folder of a run."""
+        """Return the folder of a run."""
         return self.folder / "runs" / job.name
 
     def load(self, job: Job, retry: bool = False) -> Row | None:
-        """The row of a finished run; None if there is none, or one of other settings, inputs or code.
+        """Return the row of a finished run; None if it is missing, or of other settings, inputs or code.
 
-        retry: a run that ended without a result counts as none. InputError for a spoilt file.
+        retry: also None for a run that ended without a result. InputError for a damaged file.
         """
         path = self.place(job) / ROW
         if not path.is_file():
@@ -67,20 +67,20 @@ class Store:
             if same:
                 _check_row(row, job)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(f"`{path}` is no finished run ({error}); delete it and call again") from None
+            raise InputError(f"`{path}` is damaged ({error}); delete it and call again") from None
         return row if same and not (retry and status not in ("ok", NOT_COMPARABLE)) else None
 
     def begin(self, job: Job) -> Path:
-        """An empty folder with what the run is to do."""
+        """Make an empty folder with the description of the run."""
         place = self.place(job)
         shutil.rmtree(place, ignore_errors=True)
-        write_json(place / JOB, self.described(job))
+        write_json(place / JOB, self.describe(job))
         return place
 
     def complete(self, job: Job, **columns: Any) -> Row:
-        """The row that the run left, or one that says that it left none, with `columns`."""
+        """Write and return the run's row with `columns`; if the run wrote none, a row with its status."""
         path = self.place(job) / ROW
-        row = json.loads(whole_text(path, errors="strict")) if path.is_file() else identity(self.described(job))
+        row = json.loads(whole_text(path, errors="strict")) if path.is_file() else identity(self.describe(job))
         if "status" in row:
             row = {**{name: value for name, value in columns.items() if name != "message"}, **row}
         else:
@@ -89,11 +89,11 @@ class Store:
         return row
 
     def absent(self, job: Job) -> Row:
-        """The row of a run whose recording is not there; not stored, as it may be there tomorrow."""
-        return {**identity(self.described(job)), "status": "absent", "message": job.absent}
+        """Return the row of a run whose recording is missing; not stored, so that the next call looks again."""
+        return {**identity(self.describe(job)), "status": "absent", "message": job.absent}
 
-    def described(self, job: Job) -> dict[str, Any]:
-        """What a run is to do, as `job.json` holds it."""
+    def describe(self, job: Job) -> dict[str, Any]:
+        """Return the description of a run, the content of `job.json`."""
         return {
             "name": job.name,
             "suite": self.suite,

@@ -1,7 +1,7 @@
-"""A suite: which sequences are run with which settings, how often, and what they are compared with.
+"""A benchmark suite: sequences, settings, number of seeds, baseline.
 
-A suite is a TOML file; the classes below are its tables, and their fields its keys. What a key may hold is checked when
-the file is read, so that a misspelt one ends before the first run.
+A suite is a TOML file; the classes below are its tables, and their fields its keys. All values are validated when the
+file is read.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import Tables, updated
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
-_LONGEST_NAME = 100
-"""Letters: the folder of a run has two names and a seed in its own, which may have 255."""
-_MOST_RUNS = 1_000_000
+_MAX_NAME = 100
+"""Characters: the folder name of a run has two names and a seed, and at most 255 characters."""
+_MAX_RUNS = 1_000_000
 _LAST_SEED = 2**31 - 1
 _FIELDS = re.compile(r"\{(sequence|seed)\}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RowTable(CheckedTable):
-    """A table that makes rows of the report. name: short; title: as people read it."""
+    """A table that gives rows of the report. name: short identifier; title: for the report."""
 
     name: str
     title: str = ""
@@ -49,7 +49,7 @@ class RowTable(CheckedTable):
 
 @dataclass(frozen=True, kw_only=True)
 class WalkTable(CheckedTable):
-    """`simulate`: a walk through a rendered world, as `vggtgeo.simulate` takes it; speed: None for the scene's own."""
+    """`simulate`: a walk through a rendered world, as in `vggtgeo.simulate`; speed: None for the scene's own."""
 
     scene: str = "office"
     frames: int = 60
@@ -68,20 +68,20 @@ class SequenceTable(CheckedTable):
     """`[[sequence]]`: recorded (`path`) or rendered (`simulate`).
 
     Keys:
-        name: short; letters, digits, `-`, `_`.
-        path: below one of the data folders.
-        kind: reader; found by looking.
-        simulate: `{scene = "office", frames = 80, rate = 6.0, size = [320, 240]}`; the walk follows from the seed.
-        degrade: what happens to a rendered walk, see `vggtgeo/simulation/degradations.py`.
-        protocol: see `vggtgeo/benchmark/protocols.py`; in place of the suite's.
-        start, end: frames.
-        rgb_only: without its depth.
-        key_points: of the simulated matcher, a frame.
-        references: other truths by name, files of the TUM format in the sequence's folder; compared after Sim(3).
+        name: short identifier; letters, digits, `-`, `_`.
+        path: relative to one of the data folders.
+        kind: reader; by default detected.
+        simulate: `{scene = "office", frames = 80, rate = 6.0, size = [320, 240]}`; the seed determines the walk.
+        degrade: degradation of a rendered walk, see `vggtgeo/simulation/degradations.py`.
+        protocol: see `vggtgeo/benchmark/protocols.py`; overrides the suite's.
+        start, end: first frame, and frame to stop before.
+        rgb_only: ignore depth.
+        key_points: per frame, of the simulated matcher.
+        references: other ground truths by name, TUM files in the sequence's folder; compared after Sim(3).
         threshold: of precision and recall, metres.
-        vertical: axis of the truth that points up or down, for the alignment by yaw alone: "x", "y" or "z".
-        exact_depth: the recording's depth is exact (it was rendered): depth, map and mesh are compared with it.
-        set: settings of the pipeline on this sequence.
+        vertical: axis of the ground truth that is vertical, for the yaw alignment: "x", "y" or "z".
+        exact_depth: whether the recording's depth is exact (rendered): depth, map and mesh are compared with it.
+        set: settings of the pipeline for this sequence.
     """
 
     name: str
@@ -119,7 +119,7 @@ class SequenceTable(CheckedTable):
         if self.key_points < 1:
             raise InputError(f"`key_points` is {self.key_points}; it must be at least 1")
         if self.simulate and self.exact_depth:
-            raise InputError("`exact_depth` is for recordings; that of a rendered walk is known to be so")
+            raise InputError("`exact_depth` is for recordings; the depth of a rendered walk is always exact")
         _check_protocol(self.protocol)
         if not (math.isfinite(self.threshold) and self.threshold > 0):
             raise InputError(f"`threshold` is {self.threshold}; it must be positive metres")
@@ -131,15 +131,15 @@ class SettingTable(RowTable):
     """`[[setting]]`: one row of a table.
 
     Keys:
-        name, title: short, and as people read it.
-        sequences: those it runs on; by default all.
-        seeds: how many, in place of the suite's.
-        rgb_only: without depth.
-        calibrated: false hides the intrinsics: they start from a guess.
+        name, title: short identifier, and title for the report.
+        sequences: names of the sequences; by default all.
+        seeds: number of seeds; overrides the suite's.
+        rgb_only: ignore depth.
+        calibrated: false hides the intrinsics, which then start from a guess.
         perception: "classical", "light", "paper" (networks), or "simulated" (stubs of the five roles).
         features: "sift" or "orb".
-        start_of_pose: of a new frame, "pnp", "constant-velocity", or, where the roles are simulated, "window".
-        depth_errors: factor on those of the simulated depth.
+        start_of_pose: initial pose of a frame: "pnp", "constant-velocity", or, for simulated roles, "window".
+        depth_errors: factor on the errors of simulated depth.
         set: settings of the pipeline.
     """
 
@@ -159,7 +159,7 @@ class SettingTable(RowTable):
         _one_of("features", self.features, ("sift", "orb"))
         _one_of("start_of_pose", self.start_of_pose, ("pnp", "constant-velocity", "window"))
         if self.start_of_pose == "window" and self.perception != "simulated":
-            raise InputError("`start_of_pose` is 'window', which simulated roles have; networks start so by themselves")
+            raise InputError("`start_of_pose` is 'window', which is for simulated roles; networks always use it")
         if self.seeds is not None and self.seeds < 1:
             raise InputError(f"`seeds` is {self.seeds}; it must be at least 1")
         if not 0.0 <= self.depth_errors < math.inf:
@@ -169,8 +169,8 @@ class SettingTable(RowTable):
 
 @dataclass(frozen=True, kw_only=True)
 class ExternalTable(RowTable):
-    """`[[external]]`: trajectories of another system. files: TUM format; `{sequence}` and `{seed}` stand for both.
-    metric: whether their lengths are metres; else relative errors are taken after Sim(3), as of runs without depth.
+    """`[[external]]`: trajectories of another system. files: TUM format, with the placeholders `{sequence}` and
+    `{seed}`. metric: whether lengths are metres; else relative errors are after Sim(3), as for runs without depth.
     """
 
     files: str
@@ -182,7 +182,7 @@ class ExternalTable(RowTable):
             raise InputError(f"`files` has `{unknown[0]}`; it may have `{{sequence}}` and `{{seed}}`")
 
     def file(self, sequence: str, seed: int) -> Path:
-        """Where the trajectory of a run lies, relative to the suite's folder."""
+        """Return the file of a run's trajectory, relative to the suite's folder."""
         return Path(self.files.replace("{sequence}", sequence).replace("{seed}", str(seed)))
 
 
@@ -193,13 +193,13 @@ class Suite(CheckedTable):
     Keys:
         title, about: for the head of the report.
         seeds, first_seed: runs of each setting on each sequence.
-        baseline: the setting that the others are compared with, run by run; by default the first.
+        baseline: setting that the others are compared with, run by run; by default the first.
         protocol: see `vggtgeo/benchmark/protocols.py`.
         timeout_minutes, memory_gb: limits of one run.
-        pages: whether each run leaves its page and its map.
-        recordings: whether each run leaves `run.rrd` for the Rerun viewer, which takes time of its own.
-        published: names of the tables of other systems' figures that belong beside this suite.
-        set: settings of the pipeline, of all runs; a sequence's come on top, then a setting's.
+        pages: whether each run writes its report and its map.
+        recordings: whether each run writes `run.rrd` for the Rerun viewer, which takes extra time.
+        published: names of tables of published figures to show in the report.
+        set: settings of the pipeline for all runs; a sequence's settings override them, then a setting's.
         sequence, setting, external: lists of tables.
     """
 
@@ -229,22 +229,22 @@ class Suite(CheckedTable):
             raise InputError(f"`first_seed` is {self.first_seed}; it must be at least 0")
         most = max((self.seeds, *(table.seeds or 0 for table in self.setting)))
         if self.first_seed + most > _LAST_SEED:
-            raise InputError(f"seeds go to {self.first_seed + most - 1}; the last that may be is {_LAST_SEED - 1}")
-        if (runs := len(self.sequence) * sum(table.seeds or self.seeds for table in self.setting)) > _MOST_RUNS:
-            raise InputError(f"sequences x settings x seeds are {runs:,} runs; at most {_MOST_RUNS:,} can be")
+            raise InputError(f"`seeds` go to {self.first_seed + most - 1}, at most {_LAST_SEED - 1} is allowed")
+        if (runs := len(self.sequence) * sum(table.seeds or self.seeds for table in self.setting)) > _MAX_RUNS:
+            raise InputError(f"sequences x settings x `seeds` are {runs:,} runs, at most {_MAX_RUNS:,} are allowed")
         for name in self.published:
             check_published(name)
         for key in ("sequence", "setting"):
             if not getattr(self, key):
-                raise InputError(f"there is no `[[{key}]]`; give at least one")
+                raise InputError(f"`[[{key}]]` is missing; give at least one")
         _check_different("sequence", [table.name for table in self.sequence])
         _check_different("setting", [table.name for table in (*self.setting, *self.external)])
         names = {table.name for table in self.sequence}
         for table in self.setting:
             if unknown := set(table.sequences) - names:
-                raise InputError(f"setting `{table.name}` names the sequences {sorted(unknown)}, which are not there")
+                raise InputError(f"setting `{table.name}`: `sequences` has {sorted(unknown)}, which do not exist")
         if self.baseline and self.baseline not in {table.name for table in self.setting}:
-            raise InputError(f"`baseline` is {self.baseline!r}, which is no setting")
+            raise InputError(f"`baseline` is {self.baseline!r}, which is not the name of a setting")
         updated(SlamSettings(), self.set)
 
     @property
@@ -253,22 +253,19 @@ class Suite(CheckedTable):
         return self.baseline or self.setting[0].name
 
     def title_of(self, setting: str) -> str:
-        """The title of a setting or an external system; its name where it has none."""
+        """Return the title of a setting or an external system; its name if it has none."""
         return next((table.title for table in (*self.setting, *self.external) if table.name == setting), "") or setting
 
 
 def shipped() -> dict[str, str]:
-    """The suites that come with the package: their names, and the titles."""
+    """Return names and titles of the suites in the package."""
     folder = files("vggtgeo.benchmark") / "suites"
     found = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith(".toml"))
     return {name[:-5]: tomllib.loads((folder / name).read_text("utf-8"))["title"] for name in found}
 
 
 def load_suite(name: str | Path) -> Suite:
-    """The suite in a TOML file, or one that comes with the package, by its name.
-
-    Raises InputError where neither is there, or something in the file is wrong.
-    """
+    """Load a suite from a TOML file, or a shipped one by its name; raise InputError if it is missing or invalid."""
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         try:
@@ -279,17 +276,17 @@ def load_suite(name: str | Path) -> Suite:
             ) from None
         return read_suite(text, path.stem, f"`{path}`")
     if str(name) not in shipped():
-        raise InputError(f"`{name}` is no suite and no TOML file; suites that come along: {_shipped_text()}")
+        raise InputError(f"`{name}` is neither a TOML file nor a shipped suite: {_shipped_text()}")
     text = (files("vggtgeo.benchmark") / "suites" / f"{name}.toml").read_text("utf-8")
     return read_suite(text, str(name), f"suite `{name}`")
 
 
 def read_suite(text: str, name: str, where: str) -> Suite:
-    """The suite in the TOML `text`."""
+    """Parse a suite from TOML text. where: for error messages."""
     try:
         values = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # numbers of too many digits and too many brackets are neither
-        raise InputError(f"{where} is no TOML: {error}") from None
+    except (ValueError, RecursionError) as error:  # also for numbers of too many digits, and deep nesting
+        raise InputError(f"{where} is not valid TOML: {error}") from None
     kinds: tuple[tuple[str, type[CheckedTable]], ...] = (
         ("sequence", SequenceTable),
         ("setting", SettingTable),
@@ -303,7 +300,7 @@ def read_suite(text: str, name: str, where: str) -> Suite:
     return Suite.read(where, {"name": name, **values})
 
 
-def limited(
+def restrict(
     suite: Suite,
     sequences: tuple[str, ...] | None = None,
     settings: tuple[str, ...] | None = None,
@@ -311,7 +308,7 @@ def limited(
     first_seed: int | None = None,
     frames: int | None = None,
 ) -> Suite:
-    """The part of a suite that is named; None keeps all. frames: the most of each sequence."""
+    """Return the named part of a suite; None keeps all. frames: maximum of each sequence."""
     changes: dict[str, Any] = {}
     if sequences is not None:
         changes["sequence"] = _chosen("sequences", sequences, suite.sequence)
@@ -354,15 +351,15 @@ def _chosen(what: str, wanted: tuple[str, ...], tables: tuple[Any, ...]) -> tupl
     names = [table.name for table in tables]
     unknown = [name for name in wanted if name not in names]
     if unknown or not wanted:
-        raise InputError(f"`{what}` holds {unknown or 'nothing'}; choose among {', '.join(names)}")
+        raise InputError(f"`{what}` must be of {', '.join(names)}, got {unknown or 'nothing'}")
     return tuple(table for table in tables if table.name in wanted)
 
 
 def _check_name(name: object) -> None:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise InputError(f"`name` is {name!r}; it must be of letters, digits, `-`, `_` and `+`")
-    if len(name) > _LONGEST_NAME:
-        raise InputError(f"`name` is of {len(name)} letters, {name[:20]}...; it must be of at most {_LONGEST_NAME}")
+        raise InputError(f"`name` must consist of letters, digits, `-`, `_` and `+`, got {name!r}")
+    if len(name) > _MAX_NAME:
+        raise InputError(f"`name` must have at most {_MAX_NAME} characters, got {len(name)}: {name[:20]}...")
 
 
 def _check_protocol(name: str) -> None:
@@ -371,10 +368,10 @@ def _check_protocol(name: str) -> None:
 
 
 def _check_different(what: str, names: list[str]) -> None:
-    folders = [name.lower() for name in names]  # each run has one, and some systems do not tell them apart by case
+    folders = [name.lower() for name in names]  # names of folders, which are case-insensitive on some systems
     twice = sorted({name for name in names if folders.count(name.lower()) > 1})
     if twice:
-        raise InputError(f"{what} {', '.join(twice)}: each name may be there once, in capitals or not")
+        raise InputError(f"`{what}` has the name {', '.join(twice)} twice; names must be unique, ignoring case")
 
 
 def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:

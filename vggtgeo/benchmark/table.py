@@ -1,4 +1,4 @@
-"""The tidy table: a row a run, as CSV and Parquet."""
+"""The table of runs, one row each, as CSV and Parquet."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vggtgeo.io.files import atomic_path
 from vggtgeo.models.extras import install_hint
 
 Row = Mapping[str, Any]
-"""A line of the table: plain values by the names of the columns."""
+"""A row of the table: plain values by column."""
 
 NUMBERS = (
     *("frames", "tracked", "coverage", "keyframes", "matched", "metric", "path_m"),
@@ -24,19 +24,19 @@ NUMBERS = (
     *("mesh_f_score", "mesh_accuracy_m", "mesh_completeness_m", "nees_place", "nees_rotation", "focal_error"),
     *("frames_per_second", "seconds_wall", "peak_memory_gb"),
 )
-"""Columns that tables compute with."""
+"""Numeric columns."""
 FIRST = ("suite", "sequence", "setting", "seed", "status", "message", "simulated", "protocol", "verdict", *NUMBERS)
-"""Columns that people look for; the others follow by name."""
+"""Columns that come first, in this order; the others follow by name."""
 
 
 def columns(rows: Iterable[Row]) -> list[str]:
-    """The columns of a table, in order."""
+    """Return the columns of a table, in order."""
     there = {name for row in rows for name in row}
     return [name for name in FIRST if name in there] + sorted(there - set(FIRST))
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """The table as text; empty where there is no value."""
+    """Return the table as CSV; missing values are empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns(rows), lineterminator="\n")
     writer.writeheader()
@@ -45,31 +45,31 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
-    """The table as Parquet; InputError where PyArrow is not installed."""
+    """Write the table as Parquet; raise InputError if PyArrow is not installed."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
         raise InputError(f"a Parquet table needs PyArrow; {install_hint('bench')}") from None
     values = {name: [_printable(row.get(name)) for row in rows] for name in columns(rows)}
-    table = pyarrow.table({name: pyarrow.array(_alike(column)) for name, column in values.items()})
-    with atomic_path(path) as temporary, temporary.open("wb") as stream:  # of a path, PyArrow takes UTF-8 alone
+    table = pyarrow.table({name: pyarrow.array(_same_type(column)) for name, column in values.items()})
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:  # PyArrow accepts UTF-8 paths only
         pyarrow.parquet.write_table(table, stream)
 
 
 def number(row: Row, column: str) -> float:
-    """A value as a number; NaN where the run has none."""
+    """Return a value as a number; NaN if missing."""
     value = row.get(column)
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else math.nan
 
 
 def _printable(value: Any) -> Any:
-    """A text in UTF-8: the name of a file need not be, and no column of Parquet takes another."""
+    """A text as valid UTF-8, as Parquet requires: file names need not be."""
     return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace") if isinstance(value, str) else value
 
 
-def _alike(column: list[Any]) -> list[Any]:
-    """The values of one type: numbers as float where any is."""
+def _same_type(column: list[Any]) -> list[Any]:
+    """The values converted to one type: to float if any is a float, else to text if types differ."""
     if any(isinstance(value, float) for value in column):
         return [float(value) if isinstance(value, int | float) else None for value in column]
     kinds = {type(value) for value in column if value is not None}

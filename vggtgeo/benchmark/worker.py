@@ -1,4 +1,4 @@
-"""One run, in a process of its own: reads `job.json`, leaves `row.json`."""
+"""One run in its own process: reads `job.json`, writes `row.json`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.inputs import open_input
-from vggtgeo.benchmark.measure import measured, truth_of_run
+from vggtgeo.benchmark.measure import measure, truth_of_run
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -35,14 +35,14 @@ from vggtgeo.viewing.target import open_target
 JOB, ROW, LOG, RECORDING = "job.json", "row.json", "log.txt", "run.rrd"
 """Files in the folder of a run."""
 NO_SPACE = 75
-"""Exit code of a run that a full disk ended, which says nothing of the run: it leaves no row."""
+"""Exit code of a run that ended because the disk was full: it writes no row, since that is no result of the run."""
 
 
 def run_job(folder: Path, scratch: Path | None = None) -> None:
-    """The run that `folder`/job.json describes; its row is there as a whole or not at all.
+    """Run the job of `folder`/job.json and write its row, atomically.
 
-    scratch: see `open_input`. What the user gave wrong makes a row with the status "error"; a fault of the program
-    leaves by its exception, and so does a full disk.
+    scratch: see `open_input`. An InputError gives a row with the status "error"; other exceptions, and a full disk,
+    propagate.
     """
     job = json.loads((folder / JOB).read_text(encoding="utf-8"))
     began = time.perf_counter()
@@ -57,7 +57,7 @@ def run_job(folder: Path, scratch: Path | None = None) -> None:
 
 
 def identity(job: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns of a row that its job knows, whatever becomes of it."""
+    """Return the columns of a row that are known from its job."""
     spec = job["spec"]
     return {
         "suite": job["suite"],
@@ -84,7 +84,7 @@ def _peak_gb() -> float:
 def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None) -> dict[str, Any]:
     with collected_warnings() as warned:
         given = open_input(spec, seed, scratch)
-    with recorded(folder, spec["recordings"], scratch) as callbacks:
+    with recording(folder, spec["recordings"], scratch) as callbacks:
         result = reconstruct(
             given.sequence,
             given.perception,
@@ -98,17 +98,18 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
             facts={"simulated": True} if given.simulated else None,
             warned=warned,
         )
-        if result.summary["interrupted"]:  # by a signal of somebody else: a part of the frames is no result
+        if result.summary["interrupted"]:  # by a signal from outside: a part of the frames is not a result
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGTERM)
         _save(folder, result, truth_of_run(result, given.truth), spec)
-    return measured(result, given, spec)
+    return measure(result, given, spec)
 
 
 @contextmanager
-def recorded(folder: Path, wanted: bool, scratch: Path | None = None) -> Iterator[tuple[Callback, ...]]:
-    """What logs the run to `folder`/run.rrd for the Rerun viewer, where that is wanted. The file comes at the end, and
-    grows in `scratch`: what a result writes takes away what an earlier run left, recordings among it.
+def recording(folder: Path, wanted: bool, scratch: Path | None = None) -> Iterator[tuple[Callback, ...]]:
+    """Yield the callback that logs the run to `folder`/run.rrd for the Rerun viewer, if wanted.
+
+    The file is written in `scratch` and moved at the end: saving the result would delete it as an earlier run's.
     """
     if not wanted:
         yield ()
@@ -130,9 +131,7 @@ def _save(folder: Path, result: Result, truth: Trajectory | None, spec: Mapping[
 
 
 def end_with_parent(parent: int, seconds: float = 1.0) -> None:
-    """End this process soon after the one that started it, `parent`, has ended: a run that nobody waits for must not go
-    on. That may have ended already, while this one was importing.
-    """
+    """End this process when its `parent` has ended, even if that was during the imports."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -143,7 +142,7 @@ def end_with_parent(parent: int, seconds: float = 1.0) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """`python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT`, the last the number of the process that waits."""
+    """Entry point: `python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT`; PARENT is a process id."""
     folder, scratch, parent = arguments
     end_with_parent(int(parent))
     try:
@@ -151,13 +150,13 @@ def main(arguments: list[str]) -> None:
     except (OSError, InputError) as error:
         if not _is_full(error):
             raise
-        with suppress(OSError):  # the log may lie on that disk
+        with suppress(OSError):  # the log may be on the full disk
             sys.stderr.write(f"{error}\n")
         sys.exit(NO_SPACE)
 
 
 def _is_full(error: BaseException) -> bool:
-    """Whether a disk without space is behind it."""
+    """Whether a full disk is the cause of an error."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return True
     return error.__context__ is not None and _is_full(error.__context__)

@@ -1,7 +1,7 @@
-"""Whether the address space of the process (`ulimit -v`) is enough for a command, asked before it begins.
+"""Check before a command that the limit of the address space (`ulimit -v`) is sufficient.
 
-JAX and OpenBLAS end the process in the middle of something, without a word that helps, where a thread or a page is
-refused. They reserve far more addresses than they use: a limit that looks generous beside the memory in use is none.
+JAX and OpenBLAS abort the process without a useful message if a thread or a page cannot be allocated. They reserve far
+more addresses than memory: a limit well above the memory in use may still be too low.
 """
 
 from __future__ import annotations
@@ -11,39 +11,38 @@ import warnings
 
 from vggtgeo.io.errors import InputError, InputWarning
 
-LEAST = {
+MIN_GB = {
     **dict.fromkeys(("run", "demo", "bench"), 3.0),
     **dict.fromkeys(("solve", "simulate"), 2.0),
     **dict.fromkeys(("evaluate", "export"), 1.0),
 }
-"""Gigabytes that the smallest job of a command needs. Measured as the peak of `VmPeak` (JAX 0.10.2, Linux, one and two
-cores): `demo --frames 8` 2.9, `run` of three images of 64 x 48 pixels 2.4, `solve` of 27 landmarks 2.0, `simulate` of
-three frames 1.7, `export` 1.0, `evaluate` 0.9. With 2.5 `demo` ended with "can't start new thread", with 2.0 `run` was
-aborted by LLVM, with 1.5 it crashed."""
-_PLENTY = 2.0
-"""Times the least: what a sequence takes grows with its length and its images; `demo` had 1.5 GB in use of its 2.9."""
+"""Gigabytes that the smallest job of a command needs: peak of `VmPeak` (JAX 0.10.2, Linux, one and two cores) of `demo
+--frames 8` 2.9, `run` of three images of 64 x 48 pixels 2.4, `solve` of 27 landmarks 2.0, `simulate` of three frames
+1.7, `export` 1.0, `evaluate` 0.9."""
+_WARN_FACTOR = 2.0
+"""Of the minimum: below it warn, since memory grows with the length of a sequence and the size of its images."""
 
 
 def check_address_space(command: str) -> None:
-    """InputError where the limit is below what the smallest job needs, an InputWarning where it is near.
+    """Raise InputError if the limit is below the need of the smallest job; warn if it is below twice that.
 
-    Windows has no such limit; commands that need no JAX are not asked.
+    Windows has no such limit; commands that do not need JAX are not checked.
     """
-    limit, least = _limit(), LEAST.get(command)
-    if limit is None or least is None or limit >= _PLENTY * least:
+    limit, minimum = _limit_gb(), MIN_GB.get(command)
+    if limit is None or minimum is None or limit >= _WARN_FACTOR * minimum:
         return
     limited = f"the address space is limited to {limit:.1f} GB (`ulimit -v`)"
-    if limit < least:
-        raise InputError(f"{limited}; `{command}` needs {least:g} GB at least: raise the limit, or lift it")
+    if limit < minimum:
+        raise InputError(f"{limited}; `{command}` needs at least {minimum:g} GB: raise or remove the limit")
     warnings.warn(
-        f"{limited}: that is enough for a small `{command}` only; where it is not, libraries end the program",
+        f"{limited}: enough for a small `{command}` only; above the limit, libraries abort the program",
         InputWarning,
         stacklevel=2,
     )
 
 
-def _limit() -> float | None:
-    """Gigabytes; None for no limit."""
+def _limit_gb() -> float | None:
+    """The limit, None if there is none."""
     if sys.platform == "win32":
         return None
     import resource

@@ -1,4 +1,4 @@
-"""`vggtgeo bench`: a suite of runs and its tables."""
+"""`vggtgeo bench`: run a benchmark suite."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def bench(
         for name, title in shipped().items():
             typer.echo(f"{name:14s} {title}")
         return
-    load_suite(Path(suite))  # what is wrong with it is told before the bar begins
+    load_suite(Path(suite))  # report errors in it before the progress bar starts
     folder = output or Path("runs") / Path(suite).stem
     with _Bar(quiet or as_json) as bar:
         report = run_suite(
@@ -91,7 +91,7 @@ def bench(
 
 
 class _Bar:
-    """Runs done, and a line for each."""
+    """A progress bar of runs, and a line for each."""
 
     def __init__(self, silent: bool) -> None:
         from rich.console import Console
@@ -102,18 +102,18 @@ class _Bar:
         self._task = self._progress.add_task("runs", total=None)
 
     def __enter__(self) -> _Bar:
-        if self._progress.console.is_terminal:  # elsewhere the lines of the runs say all
+        if self._progress.console.is_terminal:  # else the lines of the runs suffice
             self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if not self._progress.tasks[0].completed:  # it ends in an error, which is one line
+        if not self._progress.tasks[0].completed:  # an error follows: remove the bar
             self._progress.live.transient = True
         if self._progress.live.is_started:
             self._progress.stop()
 
     def advance(self, done: int, total: int, row: Row) -> None:
-        """A run has ended."""
+        """Show a finished run."""
         self._progress.update(self._task, completed=done, total=total)
         self._progress.console.print(_line(row), markup=False, highlight=False, soft_wrap=True)
 

@@ -1,4 +1,4 @@
-"""`vggtgeo data`: where to get recordings, and what is wrong with one."""
+"""`vggtgeo data`: list datasets, and check a recording."""
 
 from __future__ import annotations
 
@@ -53,6 +53,6 @@ def check_command(
             typer.echo(fact)
         for problem in found.problems:
             typer.echo(f"- {problem}")
-        typer.echo(f"{len(found.problems)} doubtful" if found.problems else "nothing wrong found")
+        typer.echo(f"{len(found.problems)} problems" if found.problems else "no problem found")
     if found.problems:
         raise typer.Exit(EXIT_INPUT)

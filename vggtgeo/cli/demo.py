@@ -1,4 +1,4 @@
-"""`vggtgeo demo`: the main job in a synthetic office, rendered on the spot."""
+"""`vggtgeo demo`: a run in a synthetic office, rendered on the spot."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vggtgeo.cli.run_options import ResumeOption
 from vggtgeo.cli.settings_file import SettingsOption
 
 SIZE = (480, 360)
-"""Pixels: large enough for a map one likes to look at, smaller than usual because frames are rendered on the spot."""
+"""Pixels: large enough for a dense map, small enough to render during the run."""
 
 
 def demo(
@@ -38,7 +38,7 @@ def demo(
     slam_settings = pipeline_settings(settings, assignments or (), {})
     sequence = simulate(scene, frames, seed, rate=10.0, size=SIZE)
     if not (quiet or as_json):
-        typer.echo(f"simulated scene `{scene}`: all numbers below are of a simulation")
+        typer.echo(f"simulated scene `{scene}`: all results below are from a simulation")
     run_and_write(
         sequence,
         Roles(),

@@ -1,4 +1,4 @@
-"""`vggtgeo evaluate`: an estimated trajectory against the truth."""
+"""`vggtgeo evaluate`: errors of an estimated trajectory."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from vggtgeo.geometry.trajectory import Trajectory
 
 MAX_TIME_DIFFERENCE = 0.01
-"""Seconds; that of `vggtgeo.evaluation`, repeated here so that `--help` need not load it (a test compares them)."""
+"""Seconds; equal to that of `vggtgeo.evaluation` (tested), repeated so that `--help` does not import it."""
 
 _WRITTEN_BY_RUNS = ("trajectory.txt", "keyframes.txt")
 _BENCHMARKS = ("groundtruth.txt", "groundtruth.csv", "data.csv", ".gt.freiburg")
-"""How names of files of true poses end at TUM RGB-D (and all of its layout), EuRoC and ICL-NUIM, in metres."""
+"""Endings of ground-truth files in metres: TUM RGB-D (and datasets of its layout), EuRoC, ICL-NUIM."""
 
 
 def evaluate(
@@ -86,8 +86,8 @@ def evaluate(
         known["offsets"] = None if offsets is None else offsets.as_dict()
         if rest is not None:
             known["without_offsets"] = {**rest.as_dict(), "comparable": not left.reasons}
-        told = {"warnings": [*report.warnings, *map(str, warned)], "comparable": not verdict.reasons}
-        typer.echo(json.dumps({**report.as_dict(), **known, **told}, indent=2))
+        notices = {"warnings": [*report.warnings, *map(str, warned)], "comparable": not verdict.reasons}
+        typer.echo(json.dumps({**report.as_dict(), **known, **notices}, indent=2))
     else:
         print_report(report, scale, metres)
         typer.echo(f"constant offsets: {'too few poses match to estimate them' if offsets is None else offsets}")
@@ -95,30 +95,28 @@ def evaluate(
             typer.echo(f"without {', '.join(offsets.significant) or 'any, as none is significant'}:")
             print_report(rest, scale, metres)
     if (left if rest is not None else verdict).reasons:
-        typer.echo("NOT COMPARABLE: these errors say nothing, see the warnings", err=True)
+        typer.echo("NOT COMPARABLE: these errors are meaningless, see the warnings", err=True)
         raise typer.Exit(EXIT_FAILED)
 
 
 def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
-    """The trajectory in the file `path`, or in `trajectory.txt` of the folder `path`. truth: whose times poses have
-    that are written without any.
-    """
+    """Load the trajectory of a file, or `trajectory.txt` of a folder. truth: gives the times of poses without times."""
     from vggtgeo.datasets.trajectory_files import load_trajectory
-    from vggtgeo.results.summary_file import check_count
-    from vggtgeo.results.unfinished import check_finished
+    from vggtgeo.results.summary_file import warn_if_truncated
+    from vggtgeo.results.unfinished import unfinished_message
 
-    unfinished = check_finished(path)
+    unfinished = unfinished_message(path)
     if unfinished:
         warnings.warn(unfinished, InputWarning, stacklevel=2)
     file = path / "trajectory.txt" if path.is_dir() else path
-    return check_count(file, load_trajectory(file, truth))
+    return warn_if_truncated(file, load_trajectory(file, truth))
 
 
 def load_scale(path: Path) -> str | None:
-    """What the summary of a run says of its scale, the run's folder or a file of poses in it; None for any other file,
-    whose scale nobody knows, and with a warning where the summary cannot be used.
+    """Return the scale in a run's summary, for its folder or a pose file in it; None for other files, and, with a
+    warning, if the summary is invalid.
     """
-    from vggtgeo.results.summary_file import lack
+    from vggtgeo.results.summary_file import describe_error
 
     file = (path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path) / "summary.json"
     if not file.is_file():
@@ -126,14 +124,14 @@ def load_scale(path: Path) -> str | None:
     try:
         return str(json.loads(whole_text(file, errors="strict"))["scale"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        text = f"`{file}` cannot be used ({lack(error)}): what it says of scale and verdict is not known"
+        text = f"`{file}` is invalid ({describe_error(error)}): scale and verdict of the run are unknown"
         warnings.warn(InputWarning(text), stacklevel=2)
         return None
 
 
 def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
-    """The trajectory in the file `path`, or the truth of the dataset in the folder `path`; and whether its lengths are
-    metres, None where nobody says so.
+    """Load the trajectory of a file, or the ground truth of a dataset folder; return it, and whether its lengths are
+    metres (None if unknown).
     """
     from vggtgeo.datasets import open_sequence
     from vggtgeo.datasets.trajectory_files import load_trajectory
@@ -143,12 +141,12 @@ def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
     sequence = open_sequence(path)
     truth = sequence.ground_truth()
     if truth is None:
-        raise InputError(f"`{path}` has no truth; give a trajectory in the TUM format")
+        raise InputError(f"`{path}` has no ground truth; give a trajectory in the TUM format")
     return truth, getattr(sequence, "truth_in_metres", True)
 
 
 def _in_metres(file: Path) -> bool | None:
-    """Of a file: a run's own by its summary, a benchmark's by its name; any program writes the formats of poses."""
+    """Whether the poses of a file are in metres: by a run's summary, or by the file name of a benchmark."""
     scale = load_scale(file)
     if scale is not None:
         return scale.startswith("metric")
@@ -156,9 +154,10 @@ def _in_metres(file: Path) -> bool | None:
 
 
 def print_report(report: TrajectoryReport, scale: str | None = None, metres: bool | None = True) -> None:
-    """Prints the table that people read; `TrajectoryReport.as_dict` is what programs read. scale: of the estimate, as
-    its summary has it; where it is free, errors mean something after a Sim(3) alignment only. metres: whether those are
-    the unit of the truth; where that is not known (None), lengths are printed without one.
+    """Print a table of the errors.
+
+    scale: of the estimate, as in its summary; if free, only errors after Sim(3) alignment are shown. metres: whether
+    the ground truth is in metres; if unknown (None), lengths are printed without a unit.
     """
     import numpy as np
     from rich.console import Console
@@ -173,7 +172,7 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
         f"{report.sim3.alignment.scale:.4f}; RPE over {report.relative.interval}",
         soft_wrap=True,
     )
-    # A narrow terminal gets a number in two lines, not cut: 4.4413e-17 is not "4.44…".
+    # In a narrow terminal wrap numbers instead of truncating them: 4.4413e-17 is not "4.44…".
     table = Table(*(Column(name, overflow="fold") for name in ("", "RMSE", "mean", "median", "max")))
     angles = ErrorStatistics.of(np.degrees(report.relative.rotation))
     free = scale is not None and scale.startswith("free")
@@ -197,7 +196,7 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
 
 
 _NO_UNIT = {
-    None: "lengths are in the unit of GT, which its file does not say: metres only if those of GT are",
+    None: "lengths are in the unit of GT, which is not known from its file",
     False: "lengths are in the unit of GT, which is not the metre",
 }
 

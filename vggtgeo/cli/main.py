@@ -1,4 +1,4 @@
-"""The program `vggtgeo`: its commands, each loaded when it is called, and what it says when something is wrong."""
+"""The program `vggtgeo`: its commands, imported when called, and its error messages."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from vggtgeo.io.one_line import one_line
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1
-BETWEEN_SEARCHES = 50_000
-"""New objects between two searches for garbage: after each 700, as usual, they take some per cent of a run."""
+GC_THRESHOLD = 50_000
+"""New objects between two garbage collections: with Python's default of 700 they take some per cent of a run."""
 
 
 class CommandEntry(NamedTuple):
-    """A command before it is loaded: the function `name` (`-` as `_`) of `module` is its implementation."""
+    """A command before its import: the function `name` (`-` as `_`) of `module` implements it."""
 
     name: str
     module: str
     summary: str
-    """First line of the function's docstring, repeated here so that `--help` need not load it."""
+    """First line of the function's docstring, repeated so that `--help` does not import it."""
     examples: tuple[str, ...] = ()
-    """Calls that the command's help ends with, each with what it is for after a `#`."""
+    """Example calls at the end of the command's help, with a comment after `#`."""
 
 
 COMMANDS = (
@@ -144,7 +144,7 @@ EXIT_CODES = (
 
 
 class _LazyGroup(TyperGroup):
-    """Lists stand-ins of its commands, and loads the one that is called; an error of any kind is one line."""
+    """Imports only the command that is called; reports any error in one line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if any(not word or (word.startswith("-") and word.endswith("=")) for word in args):
@@ -180,13 +180,13 @@ class _LazyGroup(TyperGroup):
 
 
 def _at_home(word: str) -> str:
-    """`~` as the home folder where a shell leaves it as it is: in quotes, and in `--output=~/runs`."""
+    """Expand `~` where a shell does not: in quotes, and in `--output=~/runs`."""
     option, equals, value = word.partition("=") if word.startswith("-") else ("", "", word)
     return option + equals + os.path.expanduser(value)
 
 
 def load_command(entry: CommandEntry) -> Any:
-    """The command itself, made of the annotated function, or the group, that implements it."""
+    """Import a command: a typer command of its annotated function, or a group."""
     function = getattr(importlib.import_module(entry.module), entry.name.replace("-", "_"))
     if isinstance(function, typer.Typer):  # a group of commands
         function.info.name = entry.name
@@ -198,35 +198,35 @@ def load_command(entry: CommandEntry) -> Any:
 
 
 def _examples(calls: tuple[str, ...]) -> str | None:
-    """Text for the end of a help page; a blank line keeps the lines apart there."""
+    """Text for the end of a help page; blank lines keep typer from joining the lines."""
     return "\n\n".join(("Examples:", *(f"  {call}" for call in calls))) if calls else None
 
 
 def _is_call_for_help(error: BaseException) -> bool:
-    """Whether typer answers with the help page: no argument where one is needed."""
+    """Whether typer shows the help page because arguments are missing."""
     return type(error).__name__ == "NoArgsIsHelpError"
 
 
 def _is_usage_error(error: BaseException) -> bool:
-    """Whether it is the command line that is wrong: an option or a value that is not there, say."""
+    """Whether the command line is invalid, for example by an unknown option."""
     return callable(getattr(error, "format_message", None)) and not _is_call_for_help(error)
 
 
 def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
-    """End the program with one line on stderr. command: whose help says more."""
+    """End the program with one line on stderr. command: for the hint to its help."""
     if isinstance(error, KeyboardInterrupt):
         message, code = "interrupted", EXIT_INTERRUPTED
     elif isinstance(error, OSError) and error.filename is not None:
         message, code = f"error: `{error.filename}`: {error.strerror}", EXIT_INPUT
     elif isinstance(error, FileNotFoundError) and _lacks_folder():
         message, code = (
-            "error: the folder that this command was started in is gone; change to another (`cd`)",
+            "error: the working folder no longer exists; change to another (`cd`)",
             EXIT_INPUT,
         )
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
     elif _is_short_of_memory(error):
-        message = f"error: there is not enough memory ({error}); give fewer or smaller images, or smaller settings"
+        message = f"error: not enough memory ({error}); use fewer or smaller images, or smaller settings"
         code = EXIT_INPUT
     elif _is_usage_error(error):
         message, code = f"error: {_usage_message(error, command)}", EXIT_INPUT
@@ -243,7 +243,7 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
 
 
 def _lacks_folder() -> bool:
-    """Whether the working folder was removed, so that a relative path leads nowhere."""
+    """Whether the working folder was removed, so that relative paths are invalid."""
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -252,9 +252,7 @@ def _lacks_folder() -> bool:
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
-    """Whether memory ran out, or what a thread needs: NumPy, Python, JAX and the loader of libraries each have a word
-    of their own for it.
-    """
+    """Whether memory or threads ran out: NumPy, Python, JAX and the dynamic loader have different errors for it."""
     words = ("RESOURCE_EXHAUSTED", "can't start new thread")
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error) or "cannot allocate memory" in str(error).lower()
@@ -262,24 +260,24 @@ def _is_short_of_memory(error: BaseException) -> bool:
 
 
 def _wrong_switch(error: BaseException) -> str | None:
-    """What is wrong with a variable of JAX's: neither true nor false (it says `invalid truth value ...`), or one that
-    makes an error of NaN, which stands for what is not known, depth, say.
+    """A message if the error comes from an environment variable of JAX: an invalid truth value, or `JAX_DEBUG_NANS`,
+    which makes NaN an error, although NaN is unknown depth here.
     """
-    if "FloatingPoint" in type(error).__name__ and "JAX_DEBUG_NANS" in os.environ:  # JAX has an error of its own, too
-        return "JAX_DEBUG_NANS makes every NaN an error, and here NaN means none; unset it"
+    if "FloatingPoint" in type(error).__name__ and "JAX_DEBUG_NANS" in os.environ:  # JAX's error or Python's
+        return "JAX_DEBUG_NANS makes every NaN an error, but NaN is used for unknown values; unset it"
     found = re.fullmatch(r"invalid truth value '(.*)' for environment '(\w+)'", str(error))
     return found and f"the environment variable `{found[2]}` is `{found[1]}`; JAX expects true or false"
 
 
 def _switches_of_jax() -> str:
-    """What the environment asks of JAX, beside what this program sets: any of it may be why."""
+    """Hint to JAX's environment variables set by the user, which may be the cause."""
     ours = jax_environment()
     theirs = [name for name in os.environ if name.startswith("JAX_") and name not in ours]
     return f"; the environment sets {', '.join(theirs)}: unset that, and try again" if theirs else ""
 
 
 def _lacks_platform() -> bool:
-    """Whether the environment asks JAX for a device that is not there: what it raises then is of any kind."""
+    """Whether the environment requests a JAX device that does not exist, for which JAX has many kinds of errors."""
     jax = sys.modules.get("jax")
     if jax is None or "JAX_PLATFORMS" not in os.environ:
         return False
@@ -290,9 +288,7 @@ def _lacks_platform() -> bool:
 
 
 def _usage_message(error: Any, command: str) -> str:
-    """What is wrong with the command line, and where to read how it should be: the help of `command`, or of the one
-    that the error itself knows.
-    """
+    """The error in the command line, and a hint to the help of the command."""
     message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
     command = error.ctx.command_path if error.ctx is not None else command
     file = _settings_file(error)
@@ -300,7 +296,7 @@ def _usage_message(error: Any, command: str) -> str:
 
 
 def _settings_file(error: Any) -> Path | None:
-    """The settings file that the wrong value is from; None of one that was given as a flag."""
+    """The settings file of the invalid value; None if it was given as a flag."""
     if error.ctx is None or getattr(error, "param", None) is None:
         return None
     source = error.ctx.get_parameter_source(error.param.name)
@@ -317,11 +313,11 @@ def _version(asked: bool) -> bool:
 
 
 def _stand_in() -> None:
-    """Never called: `_LazyGroup` puts the real command in its place."""
+    """Never called: `_LazyGroup` replaces it by the command."""
 
 
 def make_app() -> typer.Typer:
-    """The program with all its commands, none of them loaded."""
+    """Return the program with all its commands, without importing them."""
     app = typer.Typer(
         cls=_LazyGroup,
         no_args_is_help=True,
@@ -346,13 +342,13 @@ def make_app() -> typer.Typer:
 
 def main() -> None:
     """Entry point of the program."""
-    gc.set_threshold(BETWEEN_SEARCHES)
+    gc.set_threshold(GC_THRESHOLD)
     set_jax_flags()
-    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a name that Matplotlib does not know would end a run
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; an unknown backend in the environment would end a run
     end_on_signals()
     use_lasting_streams()
     use_readable_width()
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where it may keep its cache is no matter of a command
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # no messages about its cache folder
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
     try:
         make_app()(prog_name="vggtgeo")
@@ -363,7 +359,7 @@ def main() -> None:
 
 
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
-    """A way to show warnings: those for the user, of the input say, in one line, all others as before."""
+    """Return a function that shows `UserWarning`s in one line, and others as before."""
 
     def show(
         message: Warning | str,

@@ -1,6 +1,6 @@
-"""`vggtgeo models`: the networks of the perception roles, as files.
+"""`vggtgeo models`: the network files of the perception roles.
 
-What is heavy is imported when a command begins, so that `--help` answers at once.
+Heavy modules are imported inside functions, so that `--help` is fast.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FLAGS = {
     "geometry": "--init",
     "depth": "--depth",
 }
-"""The flag of `vggtgeo run` that chooses who plays a role, by the field of `vggtgeo.Roles`."""
+"""The flag of `vggtgeo run` that chooses a role, by the field of `vggtgeo.Roles`."""
 
 models = typer.Typer(
     no_args_is_help=True, add_completion=False, help="List, check, fetch and export the networks of the roles."
@@ -60,9 +60,9 @@ def list_networks(folder: Folder = None, as_json: JsonOption = False) -> None:
         typer.echo(json.dumps({"folder": str(place), "networks": rows}, ensure_ascii=False))
         return
     for row in rows:
-        there = "present" if row["present"] else "absent"
-        there += ", random weights: its answers mean nothing" if row["random"] else ""
-        typer.echo(f"{row['name']}  {there}  {row['megabytes']} MB  {row['role']}")
+        state = "present" if row["present"] else "absent"
+        state += ", random weights: its outputs are meaningless" if row["random"] else ""
+        typer.echo(f"{row['name']}  {state}  {row['megabytes']} MB  {row['role']}")
         typer.echo(f"    {row['paper']}")
         typer.echo(f"    {row['licence']}: {row['allows']}")
         typer.echo(f"    {row['get']}")
@@ -120,7 +120,7 @@ def verify(
         print_report(report)
     wrong = faults(report)
     if wrong:
-        raise InputError(f"`{file}` is not fit for use: {'; '.join(wrong)}")
+        raise InputError(f"`{file}` is not usable: {'; '.join(wrong)}")
 
 
 def _row(network: Network, place: Path) -> dict[str, str | int | bool]:

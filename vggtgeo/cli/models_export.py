@@ -1,4 +1,4 @@
-"""`vggtgeo models export`: a published network as the ONNX file that the pipeline reads."""
+"""`vggtgeo models export`: convert a published network to ONNX."""
 
 import contextlib
 import json
@@ -15,8 +15,8 @@ from vggtgeo.io.errors import InputError
 
 
 @contextlib.contextmanager
-def _ended_in_order() -> Iterator[None]:
-    """SIGTERM ends the program by an exception, as Ctrl-C does, so that temporary folders are removed."""
+def _exit_on_sigterm() -> Iterator[None]:
+    """Turn SIGTERM into an exception, as Ctrl-C, so that temporary folders are removed."""
 
     def leave(number: int, _: object) -> None:
         raise SystemExit(128 + number)
@@ -66,7 +66,7 @@ def export(
     from vggtgeo.models.exporters.recipes import recipe_of
     from vggtgeo.models.exporters.request import ExportError
 
-    def say(stage: str) -> None:
+    def show(stage: str) -> None:
         if not quiet:
             typer.echo(f"{stage} ...", err=True)
 
@@ -78,8 +78,8 @@ def export(
         request = recipe.request(source, checkpoint, height, width, views, tokens, variant, half, allow_extra_weights)
         from vggtgeo.models.exporters.export import export as write
 
-        with _ended_in_order():
-            report = write(recipe, request, output, say, tolerance)
+        with _exit_on_sigterm():
+            report = write(recipe, request, output, show, tolerance)
     except ExportError as error:
         raise InputError(str(error)) from error
     if as_json:

@@ -1,6 +1,4 @@
-"""Options that mean the same wherever they are: every switch has its opposite, so that a flag can take back what a
-settings file says.
-"""
+"""Options that several commands share. Every switch has its opposite, so that a flag can override a settings file."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 EXIT_FAILED = 3
-"""The run ended with the verdict "failed"; its outputs are there, to look at."""
+"""The run ended with the verdict "failed"; its outputs are written."""
 EXIT_INTERRUPTED = 130
 """After Ctrl-C."""
 QuietOption = Annotated[bool, typer.Option("--quiet/--no-quiet", help="Say nothing: no progress bar, no report.")]
@@ -18,9 +16,9 @@ JsonOption = Annotated[bool, typer.Option("--json/--no-json", help="Print one JS
 
 
 def _beside_output(context: Any, parameter: Any, target: str | None) -> str | None:
-    """`target`; one that a settings file put into its own output folder moves along where a flag names another.
+    """Return `target`; if a settings file puts it into its output folder, and a flag changes that folder, move it too.
 
-    Else the example of the help, a run again into a new folder, would write over the recording of the old one.
+    Else a repeated run into a new folder would overwrite the recording of the old one.
     """
     source = context.get_parameter_source(parameter.name)
     old, new = (context.default_map or {}).get("output"), context.params.get("output")
@@ -28,7 +26,7 @@ def _beside_output(context: Any, parameter: Any, target: str | None) -> str | No
         return target
     try:
         return str(Path(new) / Path(target).relative_to(old))
-    except ValueError:  # a word, or a file that lies elsewhere
+    except ValueError:  # `spawn`, `serve`, or a file elsewhere
         return target
 
 

@@ -11,14 +11,14 @@ from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import Tables, parsed, updated
 
 Switches = Mapping[str, Tables]
-"""What each switch of the command sets, by the name of its parameter."""
+"""Settings of each switch of a command, by the name of its parameter."""
 
 
 def pipeline_settings(in_use: SettingsInUse | None, assignments: Iterable[str], switches: Switches) -> SlamSettings:
-    """The defaults, changed by switches of the file, its tables, switches of the command line, `--set`, in this order.
+    """Return the defaults, overridden by switches of the file, its tables, switches of the command line, and `--set`.
 
     Raises:
-        InputError: a name that is no setting, or a value that it may not have.
+        InputError: an unknown setting, or an invalid value.
 
     """
     given = {name for name in switches if in_use is not None and in_use.on_command_line(name)}
@@ -41,7 +41,7 @@ def pipeline_settings(in_use: SettingsInUse | None, assignments: Iterable[str], 
 
 
 def _check_tables(in_use: SettingsInUse) -> None:
-    """InputError that names the file where it is the file's own tables that are wrong."""
+    """Raise InputError with the file's name if its own tables are invalid."""
     try:
         updated(SlamSettings(), in_use.tables)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""A run on the terminal: a bar while it goes on, or lines now and then where nobody sees a bar; a report at its end."""
+"""Terminal output of a run: a progress bar, or log lines if the output is not a terminal; a report at the end."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 
-LEAST_PAUSE, LONGEST_PAUSE = 5.0, 60.0
-"""Seconds between two lines: short runs shall not fill a log, and long ones show that they are alive."""
+MIN_PAUSE, MAX_PAUSE = 5.0, 60.0
+"""Seconds between two log lines: few lines for short runs, a sign of life for long ones."""
 PARTS = 10
-"""Of a run: a line for each, no sooner than the least pause."""
+"""Of a run: a log line for each, at least `MIN_PAUSE` apart."""
 
 
 class ProgressBar(Callback):
-    """Frames done, their rate, and the state's notes as they come; a context, which takes the bar away. A pipe or a
-    file gets lines in place of a bar, which would be written there when all is over.
+    """Shows the number of frames, their rate, and the state's notes; a context manager, which removes the bar.
+
+    A pipe or a file gets log lines instead of a bar.
     """
 
     def __init__(self, console: Console) -> None:
@@ -69,7 +70,7 @@ class ProgressBar(Callback):
         self._print(f"resumed after frame {slam.frames[-1].frame}, with {len(slam.keyframes)} keyframes")
 
     def on_stage(self, name: str) -> None:
-        """A line of its own, whose clock runs while the stage lasts."""
+        """Show a stage in its own line, with a clock."""
         self._end_stage()
         self._stage = self._progress.add_task(name, total=None, state="")
         self._progress.start()
@@ -77,10 +78,10 @@ class ProgressBar(Callback):
             self._print(name)
 
     def _is_due(self, done: int) -> bool:
-        """Whether it is time for a line."""
+        """Whether it is time for a log line."""
         now, part = time.perf_counter(), PARTS * done // self._total if self._total else self._part
         pause = now - self._last_line
-        due = pause >= LONGEST_PAUSE or (pause >= LEAST_PAUSE and part > self._part)
+        due = pause >= MAX_PAUSE or (pause >= MIN_PAUSE and part > self._part)
         if due:
             self._last_line, self._part = now, part
         return due
@@ -104,45 +105,45 @@ def _state(slam: Slam) -> str:
 
 
 def errors_line(truth: Mapping[str, Any], free: bool) -> str:
-    """The line that compares with the truth. free: whether the estimate's scale is."""
+    """Return the line with the errors against the ground truth. free: whether the estimate's scale is free."""
     se3, sim3 = (truth[name]["rmse"] for name in ("ate_se3_m", "ate_sim3_m"))
     if not truth["in_metres"]:
-        return f"ATE {sim3:.4g} after Sim(3) alignment, in the unit of the true poses, which is not the metre"
+        return f"ATE {sim3:.4g} after Sim(3) alignment, in the ground truth's unit, which is not the metre"
     if free:
         return f"ATE {100 * sim3:.2f} cm after Sim(3) alignment (the scale is free)"
     line = f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment"
     scale = truth["scale"]
     other = not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE
-    return f"{line}, which takes lengths {scale:.3g} times: are depth and truth in one unit?" if other else line
+    return f"{line} with scale {scale:.3g}: are depth and ground truth in the same unit?" if other else line
 
 
 def print_result(console: Console, result: Result, summary: Mapping[str, Any], folder: Path) -> None:
-    """The report of a run; its last line is the verdict. summary: as it was written."""
+    """Print the report of a run; its last line is the verdict. summary: as written to `summary.json`."""
     verdict, (fx, fy, cx, cy) = result.verdict, result.intrinsics_as_read
     rate, whole = summary["frames_per_second"], summary["frames_per_second_whole_run"]
     lines = [
         f"{summary['frames']} frames ({summary['frames_tracked']} tracked), {summary['keyframes']} keyframes, "
-        f"{rate:.1f} frames/s, {whole:.1f} with everything from compiling to writing",
+        f"{rate:.1f} frames/s, {whole:.1f} including compilation and writing",
         f"intrinsics fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}",
     ]
     if "images_reduced" in summary:
         sizes = summary["images_reduced"]
         lines[-1] += (
-            f", of the images as read; {sizes['from']} pixels were reduced to {sizes['to']} for everything else"
+            f", of the original images; {sizes['from']} pixels were reduced to {sizes['to']} for everything else"
         )
     if summary["scale"].startswith("free"):
         lines.append("scale: free, there is no metric depth; lengths have no unit")
     elif not verdict.metric:
-        lines.append("scale: doubtful, lengths may be no metres")
+        lines.append("scale: doubtful, lengths may not be metres")
     else:
         lines.append(f"scale: metric, by {summary['scale_basis']}")
     stated = summary.get("pose_sigma", {})
     if "translation_m" in stated:
-        moved, turned = stated["translation_m"], stated["rotation_deg"]
+        translation, rotation = stated["translation_m"], stated["rotation_deg"]
         lines.append(
-            f"poses relative to the first, one standard deviation: {100 * moved['median']:.1f} cm and "
-            f"{turned['median']:.2f} deg in the median, {100 * moved['largest']:.1f} cm and {turned['largest']:.2f} "
-            "deg at most (uncertainty.txt)"
+            f"standard deviation of poses relative to the first: median {100 * translation['median']:.1f} cm and "
+            f"{rotation['median']:.2f} deg, maximum {100 * translation['largest']:.1f} cm and "
+            f"{rotation['largest']:.2f} deg (uncertainty.txt)"
         )
     if "truth" in summary:
         lines.append(errors_line(summary["truth"], free=summary["scale"].startswith("free")))

@@ -1,6 +1,6 @@
-"""`vggtgeo run`: a sequence in, a trajectory and a map out.
+"""`vggtgeo run`: estimate trajectory and map of a sequence.
 
-What is heavy is imported when a run begins, so that `vggtgeo run --help` answers at once.
+Heavy modules are imported inside functions, so that `vggtgeo run --help` is fast.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 REFINE = {None: "auto", True: "always", False: "never"}
 """The setting behind `--refine-intrinsics`, `--fix-intrinsics`, or neither."""
-MOST_FPS = 1e5
-"""Above those of any camera: times would be too near each other to tell frames apart."""
+MAX_FPS = 1e5
+"""Above that of any camera; at higher rates the times of frames would be equal after rounding."""
 
 
 def run(
@@ -90,7 +90,7 @@ def run(
     check_can_be_written(output)
     with collected_warnings() as warned:
         sequence = open_input(path, kind, intrinsics, rgb_only, fps, depth_scale)
-    if len(sequence):  # a camera has no end
+    if len(sequence):  # zero for a live camera
         check_selection(sequence.name, len(sequence), start, end, stride)
     from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.slam.settings.groups import DepthSettings
@@ -144,7 +144,7 @@ def run(
 
 
 def check_map_place(file: Path, output: Path) -> None:
-    """InputError for a map's file that cannot be written, or that results of the run would replace."""
+    """Raise InputError if the map's file is not writable, or would be replaced by results of the run."""
     if file.is_dir():
         raise InputError(f"`--save-map` is `{file}`, which is a folder; give the name of a file")
     from vggtgeo.io.files import whole_path
@@ -165,18 +165,18 @@ def check_map_place(file: Path, output: Path) -> None:
 
 
 def check_map_file(file: Path) -> None:
-    """InputError for a map's file that would replace something that is no map."""
+    """Raise InputError if the map would replace a file that is not a map."""
     if file.is_file() and file.stat().st_size and not _is_map(file):
-        raise InputError(f"`--save-map` is `{file}`, which is there and is no map; give the name of a new file")
+        raise InputError(f"`--save-map` is `{file}`, which exists and is not a map; give the name of a new file")
 
 
 def check_recording_file(target: str, output: Path) -> None:
-    """InputError for a recording where the run's results would take it away."""
+    """Raise InputError if the run's results would replace the recording."""
     from vggtgeo.results.output_checks import is_in_results
 
     if target not in ("spawn", "serve") and is_in_results(output, Path(target)):
         raise InputError(
-            f"`--rerun` is `{target}`, in a folder that the run itself replaces; give another: `{output}/run.rrd`, say"
+            f"`--rerun` is `{target}`, in a folder that the run replaces; give another, for example `{output}/run.rrd`"
         )
 
 
@@ -191,30 +191,30 @@ def _is_map(file: Path) -> bool:
 
 
 def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool) -> dict[str, str]:
-    """Who plays which role, of those that were named; a role that nothing asks needs no network.
+    """Return the chosen implementation of each role; a role that is not used needs no network.
 
-    InputError for a name of a role that is left out.
+    InputError if a chosen role is disabled.
     """
-    unasked = {
+    disabled = {
         **({"lines": "--no-lines", "line_matches": "--no-lines"} if no_lines else {}),
         **({"confidence": "--no-confidence"} if no_confidence else {}),
     }
-    for role, flag in unasked.items():
+    for role, flag in disabled.items():
         if named[role] is not None:
-            raise InputError(f"`{named[role]}` is named, but `{flag}` leaves its role out; give one of the two")
-    return {role: name for role, name in named.items() if name is not None} | dict.fromkeys(unasked, "classical")
+            raise InputError(f"`{named[role]}` was chosen, but `{flag}` disables its role; give one of the two")
+    return {role: name for role, name in named.items() if name is not None} | dict.fromkeys(disabled, "classical")
 
 
 def check_flags(memory_limit_gb: float | None, fps: float | None = None) -> None:
-    """InputError for numbers that cannot be."""
+    """Raise InputError for numbers out of range."""
     if memory_limit_gb is not None and not 0 < memory_limit_gb < float("inf"):
-        raise InputError(f"`--memory-limit-gb` is {memory_limit_gb:g}; it must be a positive number")
-    if fps is not None and not 0 < fps <= MOST_FPS:
-        raise InputError(f"`--fps` is {fps:g}; it must be a positive number of frames a second, at most {MOST_FPS:g}")
+        raise InputError(f"`--memory-limit-gb` must be positive, got {memory_limit_gb:g}")
+    if fps is not None and not 0 < fps <= MAX_FPS:
+        raise InputError(f"`--fps` must be positive, at most {MAX_FPS:g} frames per second, got {fps:g}")
 
 
 def check_provider(provider: options.Provider) -> None:
-    """InputError for a GPU that is asked for and not there."""
+    """Raise InputError if a GPU is requested and not available."""
     if provider != "cuda":
         return
     from vggtgeo.io.network_errors import as_input_errors
@@ -232,13 +232,13 @@ def open_input(
     fps: float | None = None,
     depth_scale: float | None = None,
 ) -> Sequence:
-    """The sequence at `path`, with what the flags say otherwise."""
+    """Open the sequence at `path`, with the overrides of the flags."""
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_depth_scale, with_intrinsics, without_depth
 
     with warnings.catch_warnings():
-        if intrinsics is not None:  # then nothing is guessed
+        if intrinsics is not None:  # the guess is overridden
             warnings.simplefilter("ignore", GuessedCameraWarning)
-        if depth_scale is not None:  # then the unit is not that of the layout
+        if depth_scale is not None:  # the unit of the layout is overridden
             warnings.simplefilter("ignore", UnusableDepthWarning)
         sequence = open_sequence(path, kind, fps, depth=not rgb_only)
     if depth_scale is not None:
@@ -257,14 +257,14 @@ def make_perception(
     memory_limit_gb: float | None,
     mixed: Mapping[str, str],
 ) -> Perception:
-    """The roles of a preset, some played by others; warns of networks whose weights are random, and of a GPU that none
-    uses.
+    """Return the roles of a preset with the chosen replacements; warn of networks with random weights, and of an unused
+    GPU.
     """
     from vggtgeo.slam.settings.presets import perception
 
     perceived = perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
     if provider == "cuda" and not perceived.networks:
-        warnings.warn("`--provider cuda` has no effect: no network plays a role", InputWarning, stacklevel=2)
+        warnings.warn("`--provider cuda` has no effect: no role is a network", InputWarning, stacklevel=2)
     if perceived.random:
         warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
     return perceived

@@ -1,4 +1,4 @@
-"""What `vggtgeo run` and `vggtgeo demo` share: a run with a progress bar, its folder, its exit code."""
+"""A run with progress bar, output folder and exit code, for `vggtgeo run` and `vggtgeo demo`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
-from vggtgeo.results.run_folder import RESERVE, RunFolder, taken
+from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -37,17 +37,16 @@ from vggtgeo.viewing.callback import RerunCallback
 from vggtgeo.viewing.target import STAND_IN, open_target
 
 EARLY_SECONDS = 60.0
-"""Between two writings of the poses so far; one takes less than a second for 20,000 frames."""
+"""Between two writings of the poses so far, which take less than a second for 20,000 frames."""
 
 
 @dataclass(frozen=True)
 class Output:
-    """Where a run of the command line leaves what, and what it prints meanwhile.
+    """Output options of a run on the command line.
 
-    flags: the effective settings by the names of the flags, for `settings.toml`. rerun: where to log the run, see
-    `vggtgeo/viewing/target.py`. source: what is read, which nothing may be written into. save_map: file for the map.
-    resume: whether to go on with a run into the folder that was killed; None: there must be none. checkpoint_every: s,
-    see `Checkpoints`.
+    flags: effective settings by flag, for `settings.toml`. rerun: target of a recording, see
+    `vggtgeo/viewing/target.py`. source: the input, into which nothing is written. save_map: file for the map. resume:
+    whether to resume a killed run in the folder; None: there must not be one. checkpoint_every: s, see `Checkpoints`.
     """
 
     folder: Path
@@ -76,22 +75,22 @@ def run_and_write(
     warned: Iterable[Warning | str] = (),
     known_map: Slam | None = None,
 ) -> None:
-    """Run a sequence with a progress bar, write its folder, print the report, and leave with the code of the verdict.
+    """Run a sequence with a progress bar, write its folder, print the report, and exit with the code of the verdict.
 
     Raises:
         typer.Exit: the verdict is "failed", or the run was interrupted.
-        InputError: something that was given is wrong.
+        InputError: an argument is invalid.
 
     """
     silent = output.quiet or output.as_json
-    title = (title or sequence.name).encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
+    title = (title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
     console = Console(stderr=False, quiet=silent)
     start, end, stride = selection
-    # From the first frame to the last file a signal only ends the work early; what is there is written as a whole.
-    with interruption() as stop, taken(output.folder, output.source, RESERVE, output.resume) as folder:
+    # From the first frame to the last file, a signal ends the run early; the results so far are written completely.
+    with interruption() as stop, open_run_folder(output.folder, output.source, RESERVE, output.resume) as folder:
         checkpoints = Checkpoints(folder.checkpoint, bool(output.resume), output.checkpoint_every)
         if output.resume and not folder.checkpoint.is_file():
-            typer.echo(f"there is nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)
+            typer.echo(f"nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)
         viewed, url = _rerun_callbacks(output, folder, title, settings.window.size)
         if viewed:
             settings = updated(settings, {"window": {"record_iterations": True}})
@@ -113,16 +112,16 @@ def run_and_write(
                 known_map=known_map,
             )
             bar.on_stage("writing")
-            frames = _once_more(sequence, roles, settings) if output.save_depth == "every" else None
+            frames = _reopen(sequence, roles, settings) if output.save_depth == "every" else None
             summary = result.save_into(folder, depth=output.save_depth, frames=frames, settings=output.flags)
-            unsaved = _save_map(result, output.save_map)  # last: whatever becomes of it, the results are there
+            unsaved = _save_map(result, output.save_map)  # last: an error must not prevent the other results
         if stop.asked and not result.summary["interrupted"]:
-            typer.echo("interrupted after the last frame: everything was done and is written", err=True)
+            typer.echo("interrupted after the last frame: all results are complete and written", err=True)
     print_result(console, result, summary, output.folder)
     if output.as_json:
         typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
     if any(callback.cut_short for callback in viewed):
-        unsaved = unsaved or f"the recording `{output.rerun}` is cut short, as the warning above says"
+        unsaved = unsaved or f"the recording `{output.rerun}` is incomplete (see the warning above)"
     if unsaved:
         raise InputError(f"{unsaved}; all other results are in `{output.folder}`")
     if output.rerun == "serve":
@@ -134,7 +133,7 @@ def run_and_write(
 
 
 def _save_map(result: Result, file: Path | None) -> str:
-    """Why the map could not be saved; empty where it was, or nobody asked."""
+    """Save the map if asked for; return an error message, empty on success."""
     if file is None:
         return ""
     try:
@@ -146,8 +145,8 @@ def _save_map(result: Result, file: Path | None) -> str:
     return ""
 
 
-def _once_more(sequence: Sequence, roles: Roles | Perception, settings: SlamSettings) -> Sequence | None:
-    """The frames as the run saw them, where they come again; with their own depth where that is what it used."""
+def _reopen(sequence: Sequence, roles: Roles | Perception, settings: SlamSettings) -> Sequence | None:
+    """The frames as the run read them, with depth if the run used the sensor's; None for a stream."""
     if not len(sequence):
         return None
     own = roles.roles if isinstance(roles, Perception) else roles
@@ -156,9 +155,7 @@ def _once_more(sequence: Sequence, roles: Roles | Perception, settings: SlamSett
 
 
 class _EarlyFiles(Callback):
-    """Settings and poses are on the disk once a minute and before the adjustment of the whole map, should the run be
-    killed.
-    """
+    """Writes settings and poses once a minute and before the last adjustment, in case the run is killed."""
 
     def __init__(self, stage: Path, settings: Mapping[str, Any]) -> None:
         self._stage = stage
@@ -178,8 +175,9 @@ class _EarlyFiles(Callback):
 def _rerun_callbacks(
     output: Output, folder: RunFolder, name: str, window: int
 ) -> tuple[tuple[RerunCallback, ...], str | None]:
-    """What logs the run, if anything, and where a served run is to be seen; a file in the run's folder grows in its
-    stage.
+    """The callback that logs the run, if any, and the URL of a served recording.
+
+    A recording in the run's own folder is written to its stage.
     """
     if output.rerun is None:
         return (), None

@@ -1,9 +1,8 @@
-"""Settings files: a TOML file says what the flags say, and a run leaves the settings it used in its folder.
+"""Settings files: a TOML file with the flags of a command; a run writes the one it used into its folder.
 
-A key is the long name of a flag without its dashes (`rgb-only = true`, also `no-rgb-only = false`), or the
-name of an argument (`path = "..."`). A table holds the pipeline's own settings (`[tracking]`, `least_inliers = 20`), as
-`--set tracking.least_inliers=20` does.
-The file takes the place of the defaults, so a flag that is given wins over it.
+A key is the long name of a flag without dashes (`rgb-only = true`, also `no-rgb-only = false`), or the name of an
+argument (`path = "..."`). A table has settings of the pipeline (`[tracking]`, `least_inliers = 20`), as
+`--set tracking.least_inliers=20`. The file replaces the defaults: flags on the command line override it.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ import typer
 from vggtgeo.io.errors import InputError
 
 _NOT_SETTINGS = ("settings", "help", "assignments", "resume", "checkpoint_every")
-_LONGEST = 60
-_MOST_BYTES = 1_000_000
+_MAX_TEXT = 60
+_MAX_BYTES = 1_000_000
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("true or false", (bool,)),
     int: ("a whole number", (int,)),
@@ -34,7 +33,7 @@ _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
 
 @dataclass(frozen=True, eq=False)
 class SettingsInUse:
-    """The settings of the running command, wherever each came from: flag, file or default."""
+    """The settings of the running command, from flags, file and defaults."""
 
     context: Any
     """The command's context."""
@@ -43,31 +42,32 @@ class SettingsInUse:
     file: Path | None = None
 
     def values(self) -> dict[str, Any]:
-        """Each flag and argument by its key, in the order of the help; None where not set."""
+        """Return each flag and argument by its key, in the order of the help; None if not set."""
         found = {key: self.context.params.get(name) for key, name in _keys(self.context).items()}
         return {key: str(value) if isinstance(value, Path) else value for key, value in found.items()}
 
     def on_command_line(self, name: str) -> bool:
-        """Whether the parameter was given as a flag, not by a file or by default."""
+        """Return whether the parameter was given on the command line."""
         source = self.context.get_parameter_source(name)
         return source is not None and source.name == "COMMANDLINE"
 
 
 def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
-    """The file's values become the defaults of the command's other parameters."""
+    """Use the file's values as defaults of the command's other parameters."""
     if path is None or context.resilient_parsing:
         return SettingsInUse(context)
     given = _read(path)
-    piped = any(parameter.name == "assignments" for parameter in context.command.params)
-    tables = {key: value for key, value in given.items() if piped and isinstance(value, dict)}
+    has_pipeline = any(parameter.name == "assignments" for parameter in context.command.params)
+    tables = {key: value for key, value in given.items() if has_pipeline and isinstance(value, dict)}
     flags = {key: value for key, value in given.items() if key not in tables}
-    context.default_map = _checked(path, _affirmed(path, flags, context), _keys(context), _types(context), piped)
+    positive = _positive(path, flags, context)
+    context.default_map = _validated(path, positive, _keys(context), _types(context), has_pipeline)
     return SettingsInUse(context, tables, path)
 
 
 def _settings_by_group() -> dict[str, list[str]]:
-    """The pipeline's settings."""
-    from vggtgeo.slam.settings.table import names  # slow: it brings JAX
+    """Names of the pipeline's settings by group."""
+    from vggtgeo.slam.settings.table import names  # slow: imports JAX
 
     settings: dict[str, list[str]] = {}
     for name in names():
@@ -87,39 +87,39 @@ SettingsOption = Annotated[
         help="Flags from a file, as `rgb-only = true`; a flag that is given wins over it.",
     ),
 ]
-"""The option, for a command's signature. It raises InputError for a file that cannot be read or is no TOML, for a key
-that is no flag of the command, and for a value of a wrong type."""
+"""The option, for a command's signature. It raises InputError for an unreadable file, invalid TOML, an unknown key, or
+a value of the wrong type."""
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
+            content = file.read(_MAX_BYTES + 1)
     except OSError as error:
         raise InputError(
             f"`--settings` is `{path}`, which cannot be read ({error.strerror}); give a TOML file"
         ) from None
-    if len(content) > _MOST_BYTES:  # a device that never ends, or something that is no settings file
-        raise InputError(f"`--settings` is `{path}`, which has more than {_MOST_BYTES} bytes; give a TOML file")
+    if len(content) > _MAX_BYTES:  # an endless device, or another kind of file
+        raise InputError(f"`--settings` is `{path}`, which has more than {_MAX_BYTES} bytes; give a TOML file")
     try:
         # UTF-16 with its mark, as PowerShell writes it.
         wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         return tomllib.loads(content.decode("utf-16" if wide else "utf-8-sig"))
     except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
-        raise InputError(f"`{path}` is no TOML file: {error}; a line is `key = value`, text in quotes") from None
+        raise InputError(f"`{path}` is not valid TOML: {error}; a line is `key = value`, text in quotes") from None
 
 
-def _checked(
+def _validated(
     path: Path,
     given: dict[str, Any],
     names: dict[str, str],
     types: dict[str, Any],
-    piped: bool,
+    has_pipeline: bool,
 ) -> dict[str, Any]:
-    """The values by the names of their parameters. piped: whether the command takes the pipeline's settings, too."""
+    """The values by parameter name. has_pipeline: whether the command also has settings of the pipeline."""
     for key, value in given.items():
         if key not in names:
-            settings = _settings_by_group() if piped else {}
+            settings = _settings_by_group() if has_pipeline else {}
             if key in settings:
                 raise InputError(
                     f"`{path}`: `{key}` is {_short(value)}; it must be a table of settings: a line `[{key}]`, and "
@@ -129,7 +129,7 @@ def _checked(
             if group is not None:
                 raise InputError(f"`{path}`: `{key}` is a setting of `{group}`: write it below a line `[{group}]`")
             near = difflib.get_close_matches(key, names, 1, 0.0)[0]
-            raise InputError(f"`{path}`: `{key}` is no setting of this command; the nearest is `{near}`")
+            raise InputError(f"`{path}`: `{key}` is not a setting of this command; the nearest is `{near}`")
         if value == "":
             raise InputError(f"`{path}`: `{key}` is empty; give a value, or leave the line out")
         if isinstance(value, str) and "\0" in value:
@@ -141,26 +141,26 @@ def _checked(
 
 
 def _short(value: Any) -> str:
-    """A value as text of one line, cut where it is long."""
+    """A value as text, truncated if long."""
     text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]} ..."
 
 
-def _affirmed(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
-    """`no-global = true` as `global = false`: what a flag can say, a file can."""
+def _positive(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
+    """Rewrite negated switches: `no-global = true` becomes `global = false`."""
     values = dict(given)
     for key, name in _keys(context, negated=True).items():
         if key in values:
             positive = next(k for k, n in _keys(context).items() if n == name)
             if positive in values:
-                raise InputError(f"`{path}`: `{positive}` and `{key}` are one setting; give one of them")
+                raise InputError(f"`{path}`: `{positive}` and `{key}` are the same setting; give one of them")
             value = values.pop(key)
             values[positive] = not value if isinstance(value, bool) else value
     return values
 
 
 def _keys(context: Any, negated: bool = False) -> dict[str, str]:
-    """Name of the parameter behind each key (behind each switch's opposite if `negated`), in the order of the help."""
+    """Parameter name of each key (of each switch's opposite if `negated`), in the order of the help."""
     keys = {}
     for parameter in context.command.params:
         if parameter.name is not None and parameter.name not in _NOT_SETTINGS:

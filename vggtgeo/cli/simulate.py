@@ -45,11 +45,11 @@ def simulate(
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """(width, height) of a text like 640x480; raises InputError for anything else."""
+    """Return (width, height) of a text like 640x480; raise InputError for anything else."""
     try:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:
-        raise InputError(f"`--size` is {text!r}; it must be two whole numbers, as in 640x480") from None
+        raise InputError(f"`--size` must be two integers, as in 640x480, got {text!r}") from None
     if min(width, height) < 16 or max(width, height) > 8192:
-        raise InputError(f"`--size` is {text!r}; both sides must be at least 16 pixels, and 8192 at most")
+        raise InputError(f"`--size` must have sides of 16 to 8192 pixels, got {text!r}")
     return width, height

@@ -1,7 +1,7 @@
-"""Standard output and error that cannot stop a command: a full disk or a reader that went away costs what was printed.
+"""Standard output and error whose failure (a full disk, a closed pipe) does not stop a command.
 
-A run prints between its frames and after its last file. Were a failed `print` an exception there, hours of work would
-end for a line of text; so it is noted, the work goes on, and the end of the program says it.
+A run prints between frames: an exception of `print` would end hours of work. Instead the error is recorded, the work
+continues, and the program reports the error at its end.
 """
 
 from __future__ import annotations
@@ -12,15 +12,13 @@ import os
 import sys
 from typing import Any
 
-_LINE = "error: standard output cannot be written ({}): what is printed there is lost, files are written all the same"
-
-
-LEAST_WIDTH = 40
-"""Columns in which the tables can still be read."""
+_LINE = "error: standard output cannot be written ({}): printed text is lost, files are written"
+MIN_WIDTH = 40
+"""Columns needed to read the tables."""
 
 
 class _Lasting(io.FileIO):
-    """A file whose errors are noted. Fields: lost, the first."""
+    """A file that records its first error in `lost`, and raises none."""
 
     lost: OSError | None = None
 
@@ -36,32 +34,33 @@ class _Lasting(io.FileIO):
 
 
 def use_lasting_streams() -> None:
-    """Puts such streams in place of `sys.stdout` and `sys.stderr`; letters that they do not know become `?`."""
+    """Replace `sys.stdout` and `sys.stderr` by such streams; characters that they cannot encode become `?`."""
     _open_closed_ones()
     for name, number in (("stdout", 1), ("stderr", 2)):
         stream = getattr(sys, name)
-        if not isinstance(stream, io.TextIOWrapper):  # none at all, or that of a notebook
+        if not isinstance(stream, io.TextIOWrapper):  # None, or the stream of a notebook
             continue
         stream.reconfigure(errors="replace")
-        raw = getattr(stream.buffer, "raw", stream.buffer)  # PYTHONUNBUFFERED leaves out what lies between
-        if type(raw) is io.FileIO and stream.fileno() == number:  # no console of Windows
+        raw = getattr(stream.buffer, "raw", stream.buffer)  # with PYTHONUNBUFFERED, `buffer` is the raw file
+        if type(raw) is io.FileIO and stream.fileno() == number:  # not a Windows console
             lines = stream.line_buffering or stream.write_through
             buffer = io.BufferedWriter(_Lasting(number, "w", closefd=False))
             setattr(sys, name, io.TextIOWrapper(buffer, stream.encoding, "replace", line_buffering=lines))
 
 
 def use_readable_width() -> None:
-    """Some terminals and schedulers say that they have no columns, or one: what is printed there would be blank."""
-    told = os.environ.get("COLUMNS", "")
-    if not told.isdecimal() or not int(told):
+    """Correct `COLUMNS`: some terminals and schedulers set it to 0 or 1, with which tables would be blank."""
+    columns = os.environ.get("COLUMNS", "")
+    if not columns.isdecimal() or not int(columns):
         os.environ.pop("COLUMNS", None)
-    elif int(told) < LEAST_WIDTH:
-        os.environ["COLUMNS"] = str(LEAST_WIDTH)
+    elif int(columns) < MIN_WIDTH:
+        os.environ["COLUMNS"] = str(MIN_WIDTH)
 
 
 def exit_code(code: Any, failed: int) -> Any:
-    """The program's code, `failed` in place of 0 where standard output was lost, which is said in one line. Of a reader
-    that went away (`| head`) nothing is said: it had what it wanted.
+    """Return the exit code: `failed` instead of 0, with an error message, if standard output failed.
+
+    A closed pipe (`| head`) is not reported.
     """
     if not isinstance(sys.stdout, io.TextIOWrapper):
         return code
@@ -76,8 +75,8 @@ def exit_code(code: Any, failed: int) -> Any:
 
 
 def _open_closed_ones() -> None:
-    """A stream that was closed (`>&-`) would lend its number to the next file that is opened, and libraries in C that
-    print would write into a result.
+    """Open standard streams that were closed (`>&-`): else the next opened file would get the number of one, and output
+    of C libraries would go into it.
     """
     for number in range(3):
         try:

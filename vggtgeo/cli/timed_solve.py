@@ -1,4 +1,4 @@
-"""Solving a problem file with a clock beside it: the work of `vggtgeo solve`."""
+"""Solve a problem file and measure the time, for `vggtgeo solve`."""
 
 import os
 import time
@@ -20,22 +20,22 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 @dataclass(frozen=True)
 class Report:
-    """What `--json` prints. Energies are `1/2 sum rho`, computed in float64 whatever the precision of the solve."""
+    """The output of `--json`. Energies are `1/2 sum rho`, always computed in float64."""
 
     iterations: int
     energy_initial: float
     energy_final: float
     compile_s: float
-    """Seconds of tracing and compilation (little where the compiled code was in the cache)."""
+    """Seconds of tracing and compilation (little if the code was in the JIT cache)."""
     ms_per_iteration: float | None
-    """Median over the repetitions of the whole compiled run, by its iterations; None without any."""
+    """Median time of the compiled solve over the repetitions, per iteration; None without iterations."""
     dtype: str
     result: str
     """Name of the termination code."""
 
     @property
     def sentence(self) -> str:
-        """The same for people."""
+        """The report as text."""
         pace = "" if self.ms_per_iteration is None else f", {self.ms_per_iteration:.3g} ms each"
         return (
             f"{self.result}: energy {self.energy_initial:.6e} -> {self.energy_final:.6e} in {self.iterations} "
@@ -44,7 +44,7 @@ class Report:
 
 
 def check_output(problem: Path, output: Path) -> None:
-    """InputError for an output that is a folder or the problem itself, before anything is computed."""
+    """Raise InputError if the output is not writable, or is the problem itself, before anything is computed."""
     if output.is_dir():
         raise InputError(f"`{output}` is a folder; give the name of a file for the solution with `-o`")
     if output.exists() and not output.is_file():
@@ -55,18 +55,18 @@ def check_output(problem: Path, output: Path) -> None:
         raise InputError(f"`{output}` is the problem itself; give another name for the solution with `-o`")
     above = next(folder for folder in whole_path(output).parents if folder.exists())
     if not (above.is_dir() and os.access(above, os.W_OK)):
-        raise InputError(f"`{output}` cannot be written: `{above}` is no folder, or may not be written")
+        raise InputError(f"`{output}` cannot be written: `{above}` is not a writable folder")
 
 
 def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: int) -> Report:
     """Solve the problem in the file `problem` in precision `dtype` and write the solution to `output`.
 
     Raises:
-        InputError: the file cannot be used, or its initial energy is not finite (then nothing is written).
+        InputError: the file is invalid, or its initial energy is not finite (then nothing is written).
 
     """
     exact, start, index = load_problem(problem)
-    # Read once more in the precision of the solve: what that cannot hold is refused by the name it has in the file.
+    # Load again in the precision of the solve: the loader reports values that it cannot represent by their name.
     cast, cast_start, _ = (exact, start, index) if dtype == "float64" else load_problem(problem, dtype)
     energy_of = jax.jit(energy)
     initial = float(energy_of(exact, start))
@@ -87,7 +87,7 @@ def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: 
 
 
 def timed_solve(problem: Problem, start: State, max_steps: int, repeat: int) -> tuple[Solution, float, float]:
-    """Solution, seconds of compilation, and median seconds of `repeat` >= 1 compiled runs."""
+    """Return solution, seconds of compilation, and median seconds of `repeat` >= 1 compiled solves."""
     solver = SchurLevenbergMarquardt(max_iterations=max_steps)
     solve_one = jax.jit(lambda problem, start: solve(problem, start, solver=solver))
     began = time.perf_counter()
@@ -102,6 +102,6 @@ def timed_solve(problem: Problem, start: State, max_steps: int, repeat: int) -> 
 
 
 def _widen(state: State) -> State:
-    """The state in float64, its quaternions of unit length again."""
+    """The state in float64, with normalised quaternions."""
     wide: State = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), state)
     return replace(wide, poses=wide.poses.normalize())

@@ -1,4 +1,4 @@
-"""What `vggtgeo models verify` does: open a file as a network, run it on an image, time it, compare it."""
+"""Check a network file for `vggtgeo models verify`: contract, outputs on an image, latency, parity with PyTorch."""
 
 from __future__ import annotations
 
@@ -24,9 +24,11 @@ from vggtgeo.models.onnx.vggt import VggtWindow
 
 @dataclass(frozen=True)
 class Report:
-    """What was found. inputs: shapes that were shown. parity: largest relative difference from PyTorch an output,
-    empty where nothing is recorded; limit: what of it is only rounding. latency: seconds. depth_pixels: those of the
-    image that get a depth that a run would use; None for a network that gives none.
+    """The result of a check.
+
+    Fields: inputs, shapes; parity, largest relative difference from PyTorch per output, empty without a record; limit,
+    the difference allowed for rounding; latency, s; depth_pixels, pixels with a depth that a run would use, None for a
+    network without depth.
     """
 
     file: str
@@ -45,14 +47,14 @@ class Report:
 def verify_file(
     file: Path, network: str | None, image: Path | None, against: Path | None, runs: int, provider: Provider
 ) -> Report:
-    """Check one file; raises `InputError` where it cannot be opened, is another network, or fails while it runs."""
+    """Check one file; raise InputError if it cannot be opened, is another network, or fails while running."""
     if not file.name or file.is_dir():
         raise InputError(f"`{file}` is a folder; give the file of a network, `NAME.onnx`")
     beside = file.with_name(file.name + PARITY_SUFFIX)
     record = against or (beside if beside.is_file() else None)
     with as_input_errors():
         session = open_session(file, CONTRACTS[_contract_name(file, network)], provider=provider)
-        # First: whether the record is one is known at once, and the room that is shown takes seconds to render.
+        # Before the image: an invalid record is found at once, but the default image takes seconds to render.
         parity = verification.parity(session, record) if record else {}
         shown = shown_image(image)
         inputs = verification.example_inputs(session, shown)
@@ -72,14 +74,14 @@ def verify_file(
 
 
 def faults(report: Report) -> list[str]:
-    """What makes the file unfit for use; empty for a good one."""
+    """Return the faults of the file; empty if it is usable."""
     wrong = [
-        f"`{name}` holds {output.not_finite} values that are not finite"
+        f"`{name}` has {output.not_finite} values that are not finite"
         for name, output in report.outputs.items()
         if output.not_finite
     ]
     if report.depth_pixels == 0 and not report.random_weights:
-        wrong.append("no pixel of the image gets a depth that a run would use")
+        wrong.append("no pixel of the image has a depth that a run would use")
     return wrong + [
         f"`{name}` differs from PyTorch by {gap:.2g}, expected at most {report.limit:g}"
         for name, gap in report.parity.items()
@@ -88,10 +90,10 @@ def faults(report: Report) -> list[str]:
 
 
 def print_report(report: Report) -> None:
-    """The report as lines of text."""
-    typer.echo(f"{report.file}: keeps the contract of {report.network}")
+    """Print the report."""
+    typer.echo(f"{report.file}: fulfils the contract of {report.network}")
     if report.random_weights:
-        typer.echo("its weights are random: what it answers means nothing")
+        typer.echo("its weights are random: its outputs are meaningless")
     typer.echo(f"sha256 {report.sha256}")
     for name, shape in report.inputs.items():
         typer.echo(f"input {name} {list(shape)}")
@@ -108,21 +110,21 @@ def print_report(report: Report) -> None:
 
 
 def shown_image(path: Path | None) -> np.ndarray:
-    """A photograph, or a view of the simulated room: uint8 [H, W, 3]."""
+    """Return a photograph, or a view of the simulated room: uint8 [H, W, 3]."""
     if path is None:
         from vggtgeo.simulation.sequence import simulate
 
         return simulate("room", 1, 0, (640, 480)).frame(0).image
     from vggtgeo.datasets.image_files import read_image
 
-    if not path.is_file():  # a pipe has no end
-        raise InputError(f"`{path}` cannot be read as an image: it is no file; give a PNG or JPEG file")
+    if not path.is_file():  # reading a pipe might never end
+        raise InputError(f"`{path}` is not a file; give a PNG or JPEG image")
     return read_image(path)
 
 
 def _depth_pixels(session: Session, image: np.ndarray) -> int | None:
     if session.contract.network == "moge2":
-        height, width = image.shape[:2]  # with a camera, as in a run: without, a flat wall may lie anywhere
+        height, width = image.shape[:2]  # with intrinsics, as in a run: they fix the scale of the depth
         camera = Camera.guess(width, height).intrinsics
         depth = BoundedDepth(MogeDepth(session)).estimate(image, None, camera).depth
     elif session.contract.network == "vggt":
@@ -133,10 +135,10 @@ def _depth_pixels(session: Session, image: np.ndarray) -> int | None:
 
 
 def _contract_name(file: Path, asked: str | None) -> str:
-    """The contract asked for, else the one the file names in its metadata, else the one it keeps."""
+    """The contract of the requested network, else of the file's metadata, else the one that its signature matches."""
     if asked is not None:
         if asked not in NETWORKS:
-            raise InputError(f"`--network` is {asked!r}; it must be one of {', '.join(NETWORKS)}")
+            raise InputError(f"`--network` must be one of {', '.join(NETWORKS)}, got {asked!r}")
         return NETWORKS[asked].contract_name
     inputs, outputs, metadata = read_signature(file)
     named = metadata.get(METADATA_NETWORK)
@@ -145,7 +147,5 @@ def _contract_name(file: Path, asked: str | None) -> str:
     like = recognise(inputs, outputs)
     if not like:
         listing = ", ".join(f"`{name}` {signature}" for name, signature in {**inputs, **outputs}.items())
-        raise NetworkFileError(
-            f"`{file}` keeps the contract of no network that is known ({', '.join(CONTRACTS)}); it has {listing}"
-        )
+        raise NetworkFileError(f"`{file}` matches no known network ({', '.join(CONTRACTS)}); it has {listing}")
     return like[0]

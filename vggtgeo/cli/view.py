@@ -35,8 +35,8 @@ def view(
         check_can_be_shown(folder)
     elif rerun == "spawn" and not has_screen():
         raise InputError(
-            f"there is no screen; the recording is `{recording}`: look at it with `rerun {recording}` where there is "
-            "one, or here with `--rerun serve` in a browser"
+            f"there is no screen; view the recording with `rerun {recording}` on a machine that has one, or here with "
+            "`--rerun serve` in a browser"
         )
     opened = open_target(rerun, folder.resolve().name, folder / "view.rrd")
     if recording is None:
@@ -55,7 +55,7 @@ def view(
 
 
 def serve_until_interrupted(url: str | None, quiet: bool = False) -> None:
-    """Waits until Ctrl-C, so that a browser may go on reading."""
+    """Wait until Ctrl-C while the server runs."""
     if not quiet:
         typer.echo(f"serving (Ctrl-C ends it): open {url} in a browser", err=True)
     with contextlib.suppress(KeyboardInterrupt):

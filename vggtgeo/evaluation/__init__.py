@@ -1,17 +1,17 @@
-"""Metrics as the field computes them: callables on arrays and trajectories, no files, no printing."""
+"""Metrics of trajectories, depth and maps: functions on arrays and trajectories, without files or printing."""
 
 from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
 from vggtgeo.evaluation.alignment import ALIGNMENTS, Alignment, Similarity, align, heading, umeyama
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, nearest_in_time
 from vggtgeo.evaluation.calibration import focal_error, scale_error
 from vggtgeo.evaluation.clouds import CloudError, cloud_error
+from vggtgeo.evaluation.comparability import Comparability, comparability
 from vggtgeo.evaluation.consistency import Consistency, consistency, pose_consistency
 from vggtgeo.evaluation.depth import DepthError, depth_error, depth_of_cloud
 from vggtgeo.evaluation.meshes import Mesh, mesh_error, surface_points
 from vggtgeo.evaluation.offsets import Offsets, estimate_offsets, shifted
 from vggtgeo.evaluation.relative import UNITS, RelativeError, Unit, relative_error, rotation_angle
 from vggtgeo.evaluation.report import TrajectoryReport, coverage, evaluate_trajectory, followed
-from vggtgeo.evaluation.resemblance import Comparability, comparability
 from vggtgeo.evaluation.statistics import ErrorStatistics
 
 __all__ = [

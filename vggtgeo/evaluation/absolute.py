@@ -1,4 +1,4 @@
-"""Absolute trajectory error (ATE): how far the camera centres are from the truth after one alignment.
+"""Absolute trajectory error (ATE): distance of the camera centres from the ground truth after alignment.
 
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
 """
@@ -17,14 +17,14 @@ from vggtgeo.io.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class AbsoluteError:
-    """Fields: errors float64 [n], metres, a pose each; alignment, which carried the estimate to the truth."""
+    """Fields: errors float64 [n], metres, one per pose; alignment of the estimate to the ground truth."""
 
     errors: Float[np.ndarray, " n"]
     alignment: Similarity
 
     @property
     def statistics(self) -> ErrorStatistics:
-        """In metres; `rmse` is what the field calls ATE."""
+        """Statistics of the errors, metres; `rmse` is the ATE."""
         return ErrorStatistics.of(self.errors)
 
 
@@ -34,15 +34,15 @@ def absolute_error(
     alignment: Alignment = "se3",
     vertical: tuple[float, float, float] = VERTICAL,
 ) -> AbsoluteError:
-    """ATE of matched trajectories (see `associate`) after an `alignment` (see `align`).
+    """Return the ATE of matched trajectories (see `associate`) after an `alignment` (see `align`).
 
-    InputError where the two differ in length.
+    InputError if the lengths differ.
     """
     check_trajectories(estimate, truth)
     if len(estimate) != len(truth):
         raise InputError(
             f"`estimate` has {len(estimate)} poses, `truth` {len(truth)}; match them first with `associate`"
         )
-    carried = align(estimate, truth, alignment, vertical)
-    difference = carried.points(estimate.positions) - truth.positions
-    return AbsoluteError(np.linalg.norm(difference, axis=1), carried)
+    motion = align(estimate, truth, alignment, vertical)
+    difference = motion.points(estimate.positions) - truth.positions
+    return AbsoluteError(np.linalg.norm(difference, axis=1), motion)

@@ -1,7 +1,7 @@
-"""The motion that best carries one point set onto another: rigid, with scale, or about the vertical alone.
+"""Least-squares alignment of two point sets: rigid, with scale, or yaw and position.
 
-`align` knows them by the names of the field: "none", "se3", "sim3", "yaw" (heading and position, what a system with
-gravity cannot observe; Z. Zhang and D. Scaramuzza, IROS 2018).
+`align` takes "none", "se3", "sim3" or "yaw" (heading and position, the unobservable directions of a system with
+gravity; Z. Zhang and D. Scaramuzza, IROS 2018).
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 Axis = Literal["x", "y", "z"]
 AXES: dict[Axis, tuple[float, float, float]] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 VERTICAL = AXES["z"]
-"""In the truth's world, where nothing else is said: z, as in EuRoC and TUM RGB-D; ARKit's and KITTI's is y."""
+"""Default in the world of the ground truth: z, as in EuRoC and TUM RGB-D; ARKit and KITTI have y."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +35,11 @@ class Similarity:
     scale: float = 1.0
 
     def points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """The moved points."""
+        """Return the transformed points."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
-        """The trajectory in the new frame: positions moved and scaled, orientations turned."""
+        """Return the trajectory in the new frame: positions transformed, orientations rotated."""
         poses = trajectory.poses.copy()
         poses[:, :3, :3] = self.rotation @ trajectory.rotations
         poses[:, :3, 3] = self.points(trajectory.positions)
@@ -47,14 +47,14 @@ class Similarity:
 
 
 def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], with_scale: bool = False) -> Similarity:
-    """The similarity with the least `sum |s R source + t - target|^2`; s = 1 unless `with_scale`.
+    """Return the similarity that minimises `sum |s R source + t - target|^2`; s = 1 unless `with_scale`.
 
     With centred points, `C = target^T source / n = U D V^T` and `F = diag(1, 1, sign(det U det V))`:
     `R = U F V^T`, `s = tr(D F) / var(source)`, `t = mean(target) - s R mean(source)`.
 
-    Points on a line, or all at one place, leave the rotation free: one of the minimisers is returned. Where
-    the points of either set all coincide (a still camera) the scale means nothing and is 1. Source: S.
-    Umeyama, IEEE PAMI 13(4), 1991. InputError for no points, other shapes, or NaN.
+    For collinear or coincident points the rotation is not unique: one of the minimisers is returned. If all points of a
+    set coincide (a still camera) the scale is undefined and set to 1. Source: S. Umeyama, IEEE PAMI 13(4), 1991.
+    InputError for no points, wrong shapes, or NaN.
     """
     source, target = _check(source, target)
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
@@ -63,7 +63,7 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], 
     flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * flip) @ vt
     variance, covariance = float((centred**2).sum() / len(source)), float(d @ flip)
-    spread = np.ptp(source, axis=0).any() and np.ptp(target, axis=0).any()  # a mean is rounded: `variance` may be 1e-33
+    spread = np.ptp(source, axis=0).any() and np.ptp(target, axis=0).any()  # rounding: `variance` of equal points > 0
     scale = covariance / variance if with_scale and spread and variance > 0 and covariance > 0 else 1.0
     return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)
 
@@ -73,17 +73,17 @@ def heading(
     target: Float[np.ndarray, "n 3"],
     vertical: tuple[float, float, float] = VERTICAL,
 ) -> Similarity:
-    """The turn about `vertical` (any length) and the translation with the least `sum |R source + t - target|^2`.
+    """Return the rotation about `vertical` and the translation that minimise `sum |R source + t - target|^2`.
 
-    With centred points s, t and the unit vector a, the sum of `t . R(theta) s` is `A cos(theta) + B sin(theta)` and a
-    constant, `A = sum t . s - (t . a)(s . a)`, `B = sum t . (a x s)`, so `theta = atan2(B, A)`. InputError as
-    `umeyama`, or for a vertical without direction.
+    With centred points s, t and the unit vector a, the sum of `t . R(theta) s` is `A cos(theta) + B sin(theta)` plus a
+    constant, `A = sum t . s - (t . a)(s . a)`, `B = sum t . (a x s)`, so `theta = atan2(B, A)`. `vertical` may have any
+    length. InputError as `umeyama`, or for an invalid `vertical`.
     """
     source, target = _check(source, target)
     given = real_numbers("vertical", vertical)
     length = float(np.linalg.norm(given))
     if given.shape != (3,) or not (np.isfinite(length) and length > 0):
-        raise InputError(f"`vertical` is {vertical}; it must be a direction, three numbers")
+        raise InputError(f"`vertical` must be a direction of three numbers, got {vertical}")
     axis = np.asarray(given, np.float64) / length
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     s, t = source - source_mean, target - target_mean
@@ -101,13 +101,13 @@ def align(
     kind: Alignment = "se3",
     vertical: tuple[float, float, float] = VERTICAL,
 ) -> Similarity:
-    """What carries the matched poses of `estimate` to those of `truth`, by their positions.
+    """Return the alignment of the matched poses of `estimate` to those of `truth`, by their positions.
 
-    kind: "none" (both are in one frame already), "se3", "sim3", or "yaw", about `vertical`. InputError for another
-    kind, other lengths, or no pose.
+    kind: "none" (same frame already), "se3", "sim3", or "yaw", about `vertical`. InputError for another kind, different
+    lengths, or no pose.
     """
     if kind not in ALIGNMENTS:
-        raise InputError(f"`kind` is {kind!r}; it must be one of {', '.join(ALIGNMENTS)}")
+        raise InputError(f"`kind` must be one of {', '.join(ALIGNMENTS)}, got {kind!r}")
     check_trajectories(estimate, truth)
     _check(estimate.positions, truth.positions)
     if kind == "none":
@@ -124,8 +124,8 @@ def _check(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
             f"`source` has shape {source.shape}, `target` {target.shape}; both must be [n, 3], n at least 1"
         )
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
-        raise InputError("`source` or `target` has a NaN or an infinity; leave such points out")
+        raise InputError("`source` and `target` must be finite; leave points with NaN or infinity out")
     farthest = max(np.abs(source).max(), np.abs(target).max())
     if farthest > FARTHEST:
-        raise InputError(f"`source` or `target` has coordinates up to {farthest:.3g} m, which are no places")
+        raise InputError(f"`source` or `target` has coordinates up to {farthest:.3g} m, at most {FARTHEST:g} are valid")
     return source, target

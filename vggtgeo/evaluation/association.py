@@ -1,4 +1,4 @@
-"""Which pose of one trajectory belongs to which of another: the nearest in time, as in the `evo` package."""
+"""Association of the poses of two trajectories: nearest in time, as in the `evo` package."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -8,22 +8,20 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_real, real_array
 
 MAX_TIME_DIFFERENCE = 0.01
-"""Seconds between two poses that may still be compared; evo's default."""
+"""Largest time difference of a match, seconds; evo's default."""
 
 
 def nearest_in_time(
     times: Float[np.ndarray, " n"], others: Float[np.ndarray, " m"], max_dt: float
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """For each of `times` the nearest of `others` (increasing) within `max_dt` seconds; the earlier one of a
-    tie.
+    """Match each of `times` with the nearest of `others` (increasing) within `max_dt` seconds; ties go to the earlier.
 
-    Returns the rows in `times` that have a partner and, beside each, the row in `others`. One row of `others`
-    may serve several of `times`.
+    Returns the matched rows of `times`, and the row of `others` for each. A row of `others` may be used several times.
     """
     times, others = real_array("times", times, (None,)), real_array("others", others, (None,))
     check_real("max_dt", max_dt)
     if (np.diff(others) < 0).any():
-        raise InputError("`others` has times that do not increase; sort them")
+        raise InputError("`others` must increase; sort them")
     if len(others) == 0 or len(times) == 0:
         return np.zeros(0, int), np.zeros(0, int)
     after = np.clip(np.searchsorted(others, times, side="right"), 0, len(others) - 1)
@@ -37,16 +35,15 @@ def nearest_in_time(
 def associate(
     estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE
 ) -> tuple[Trajectory, Trajectory]:
-    """The poses of both trajectories that are at most `max_dt` seconds apart, pair by pair.
+    """Match the poses of two trajectories that are at most `max_dt` seconds apart; return both, pose by pose.
 
-    Each pose of the shorter trajectory looks for its nearest in the longer one. The times of both results are
-    those of the shorter, so that they name the pairs. InputError where `max_dt` is negative or nothing
-    matches.
+    Each pose of the shorter trajectory is matched with the nearest of the longer one. Both results have the times of
+    the shorter trajectory. InputError if `max_dt` is negative or nothing matches.
     """
     check_trajectories(estimate, truth)
     check_real("max_dt", max_dt)
     if not max_dt >= 0:
-        raise InputError(f"`max_dt` is {max_dt}; it must be at least 0 seconds")
+        raise InputError(f"`max_dt` must be at least 0 seconds, got {max_dt}")
     if len(truth) < len(estimate):
         truth_rows, estimate_rows = nearest_in_time(truth.timestamps, estimate.timestamps, max_dt)
         times = truth.timestamps[truth_rows]
@@ -59,13 +56,13 @@ def associate(
 
 
 def check_trajectories(estimate: Trajectory, truth: Trajectory) -> None:
-    """InputError unless both are trajectories."""
+    """Raise InputError unless both are trajectories."""
     for name, given in (("estimate", estimate), ("truth", truth)):
-        check_kind(name, given, Trajectory, "a `Trajectory`, such as `Trajectory.load_tum` gives")
+        check_kind(name, given, Trajectory, "a `Trajectory`, for example of `Trajectory.load_tum`")
 
 
 def spans(estimate: Trajectory, truth: Trajectory) -> str:
-    """From when to when both are, seconds, and what to do where they do not match."""
+    """Describe the time spans of both, seconds, for an error that they do not match."""
     parts = []
     for name, trajectory in (("`estimate`", estimate), ("`truth`", truth)):
         times = trajectory.timestamps

@@ -1,4 +1,4 @@
-"""How well one point cloud covers another: precision, recall, F-score, mean distances.
+"""Comparison of point clouds: precision, recall, F-score, mean distances.
 
 Source of the F-score: A. Knapitsch et al., "Tanks and Temples", ACM TOG 36(4), 2017.
 """
@@ -19,7 +19,7 @@ class CloudError:
     """Fields:
     precision: share of the estimated points with a true point within `threshold`.
     recall: share of the true points with an estimated point within `threshold`.
-    f_score: their harmonic mean (0 where both are 0).
+    f_score: their harmonic mean (0 if both are 0).
     accuracy: mean distance from an estimated point to the nearest true one, metres.
     completeness: mean distance from a true point to the nearest estimated one, metres.
     threshold: metres.
@@ -41,7 +41,7 @@ class CloudError:
 def cloud_error(
     estimate: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "m 3"], threshold: float = 0.05
 ) -> CloudError:
-    """Compares two clouds in one frame, metres, by nearest neighbours (k-d trees, O((n + m) log(n + m))).
+    """Compare two clouds in one frame, metres, by nearest neighbours (k-d trees, O((n + m) log(n + m))).
 
     InputError for an empty cloud, NaN, other shapes, or a threshold that is not positive.
     """
@@ -62,17 +62,17 @@ def cloud_error(
 
 
 def checked_points(name: str, given: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """The points as float64; InputError where there are none, or some are no places."""
+    """Return the points as float64; raise InputError if there are none, or coordinates are invalid."""
     points = real_array(name, given, (None, 3)).astype(np.float64)
     if not len(points):
-        raise InputError(f"`{name}` has shape {points.shape}; it must be [n, 3], n at least 1")
+        raise InputError(f"`{name}` must be [n, 3], n at least 1, got shape {points.shape}")
     if not np.isfinite(points).all():
-        raise InputError(f"`{name}` has a NaN or an infinity; leave such points out")
+        raise InputError(f"`{name}` must be finite; leave points with NaN or infinity out")
     if np.abs(points).max() > FARTHEST:
-        raise InputError(f"`{name}` has coordinates up to {np.abs(points).max():.3g} m, which are no places")
+        raise InputError(f"`{name}` has coordinates up to {np.abs(points).max():.3g} m, at most {FARTHEST:g} are valid")
     return points
 
 
 def _tree(points: np.ndarray) -> cKDTree:
-    """Of every place once: a tree cannot part equal points, and each query would look at all of them."""
+    """A k-d tree without duplicates: it cannot split equal points, and each query would visit all of them."""
     return cKDTree(np.unique(points, axis=0))

@@ -1,4 +1,4 @@
-"""Whether covariances tell the truth: the normalised estimation error squared (NEES).
+"""Consistency of covariances: the normalised estimation error squared (NEES).
 
 For an error `e` of k numbers and its covariance C, `e' C^-1 e` follows the chi-square law with k degrees of freedom, so
 its mean over n independent errors, n times, that with n k. Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation
@@ -23,10 +23,9 @@ from vggtgeo.io.given import check_positive, check_real, real_array, real_number
 class Consistency:
     """Fields:
     nees: float64 [n], of each error.
-    degrees: numbers in an error, what each NEES is on average where the covariances are right.
-    low, high: of the mean, the band that right covariances keep it in with the probability `level`, errors being
-        independent.
-    level: of the band.
+    degrees: dimension of an error, the expected NEES for correct covariances.
+    low, high: interval of the mean for correct covariances and independent errors, with probability `level`.
+    level: probability of the interval.
     """
 
     nees: Float[np.ndarray, " n"]
@@ -37,26 +36,26 @@ class Consistency:
 
     @property
     def mean(self) -> float:
-        """Above `high`: errors are larger than the covariances say (too sure). Below `low`: smaller."""
+        """Mean NEES. Above `high` the covariances are too small (overconfident), below `low` too large."""
         return float(self.nees.mean())
 
     @property
     def consistent(self) -> bool:
-        """Whether the mean lies within the band."""
+        """Whether the mean is within the interval."""
         return self.low <= self.mean <= self.high
 
     @property
     def inflation(self) -> float:
-        """Standard deviations would have to be larger by this factor for the mean to be what it should."""
+        """Factor on the standard deviations that makes the mean NEES equal to `degrees`."""
         return float(np.sqrt(self.mean / self.degrees))
 
 
 def consistency(
     errors: Float[np.ndarray, "n k"], covariances: Float[np.ndarray, "n k k"], level: float = 0.95
 ) -> Consistency:
-    """NEES of `errors` by their `covariances`, in the same coordinates and units.
+    """Return the NEES of `errors` with their `covariances`, in the same coordinates and units.
 
-    InputError for other shapes, no error, NaN, a covariance that is not positive definite, or an impossible level.
+    InputError for wrong shapes, no error, NaN, a covariance that is not positive definite, or an invalid level.
     """
     errors, covariances = real_numbers("errors", errors), real_numbers("covariances", covariances)
     check_real("level", level)
@@ -65,13 +64,13 @@ def consistency(
             f"`errors` has shape {errors.shape}, `covariances` {covariances.shape}; expected [n, k] and [n, k, k]"
         )
     if not 0 < level < 1:
-        raise InputError(f"`level` is {level}; it must lie between 0 and 1")
+        raise InputError(f"`level` must be between 0 and 1, got {level}")
     if not (np.isfinite(errors).all() and np.isfinite(covariances).all()):
-        raise InputError("`errors` or `covariances` has a NaN or an infinity; leave such rows out")
+        raise InputError("`errors` and `covariances` must be finite; leave rows with NaN or infinity out")
     try:
         factors = np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:
-        raise InputError("`covariances` has one that is not positive definite") from None
+        raise InputError("`covariances` must be positive definite") from None
     white = np.linalg.solve(factors, errors[..., None])[..., 0]
     count, degrees = errors.shape
     low, high = chi2.ppf([0.5 * (1 - level), 0.5 * (1 + level)], count * degrees) / count
@@ -86,19 +85,21 @@ def pose_consistency(
     scale: float = 1.0,
     max_dt: float = MAX_TIME_DIFFERENCE,
 ) -> tuple[Consistency, Consistency]:
-    """NEES of the places and the rotations of a trajectory, by standard deviations stated relative to its first pose.
+    """Return the NEES of positions and of rotations, for standard deviations relative to the first pose.
 
-    Both trajectories are taken relative to the first pose that has a true one, so that errors are those of the
-    statement, and that true pose counts in each. A deviation (metres, rad) is that of each of three directions. scale:
-    that lengths of the estimate are to be multiplied by. Poses whose deviation is zero or NaN are left out; InputError
-    where no other is left.
+    Both trajectories are expressed relative to the first matched pose. Standard deviations (metres, rad) are isotropic.
+    scale: factor on the estimate's lengths. Poses with a standard deviation of zero or NaN are left out; InputError if
+    none is left.
     """
     check_trajectories(estimate, truth)
     place_sigma = real_array("place_sigma", place_sigma, (None,))
     rotation_sigma = real_array("rotation_sigma", rotation_sigma, (None,))
     check_positive("scale", scale, "factor")
     if not len(estimate) == len(place_sigma) == len(rotation_sigma):
-        raise InputError(f"`estimate` has {len(estimate)} poses; expected as many standard deviations")
+        raise InputError(
+            f"`place_sigma` and `rotation_sigma` must have {len(estimate)} entries, one per pose of `estimate`, got "
+            f"{len(place_sigma)} and {len(rotation_sigma)}"
+        )
     rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)
     found, true = (
         rigid.invert(poses[:1]) @ poses if len(poses) else poses

@@ -1,4 +1,4 @@
-"""Points on the surface of a triangle mesh, so that meshes are compared as clouds are."""
+"""Comparison of triangle meshes by points sampled on their surfaces."""
 
 from typing import Any
 
@@ -9,18 +9,18 @@ from vggtgeo.evaluation.clouds import CloudError, checked_points, cloud_error
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_positive, check_whole, real_numbers
 
-MOST_POINTS = 50_000_000
-"""On a surface: 1.2 GB, and several times that while they are made."""
+MAX_POINTS = 50_000_000
+"""Of a surface: 1.2 GB, and several times as much while they are sampled."""
 Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
-"""Vertices, metres, and the rows of the three corners of each face."""
+"""Vertices, metres, and the vertex indices of each face."""
 
 
 def surface_points(mesh: Mesh, spacing: float, seed: int = 0) -> Float[np.ndarray, "k 3"]:
-    """Points on the faces of `mesh`, even by area, about one to a square of `spacing` metres; the same for a `seed`.
+    """Sample points on the faces of `mesh`, uniform by area, one per square of `spacing` metres on average.
 
     A face is drawn by its area, then a point in it: with u, v uniform in [0, 1] and s = sqrt(u), the point
     `(1 - s) a + s (1 - v) b + s v c` is uniform in the triangle (R. Osada et al., ACM TOG 21(4), 2002). InputError for
-    wrong shapes, a corner that is no vertex, a mesh without area, or a spacing that is not positive.
+    wrong shapes, an invalid vertex index, a mesh without area, or a spacing that is not positive.
     """
     vertices, faces = _checked(mesh)
     check_positive("spacing", spacing, "metres")
@@ -30,10 +30,10 @@ def surface_points(mesh: Mesh, spacing: float, seed: int = 0) -> Float[np.ndarra
     total = float(areas.sum())
     if not total > 0:
         raise InputError("`mesh` has no face with an area")
-    if total / spacing**2 > MOST_POINTS:
+    if total / spacing**2 > MAX_POINTS:
         raise InputError(
-            f"`spacing` is {spacing:g} m, which makes {total / spacing**2:.3g} points on {total:.3g} square metres; at "
-            f"most {MOST_POINTS} are made: give a larger one, or a larger threshold"
+            f"`spacing` is {spacing:g} m, which gives {total / spacing**2:.3g} points on {total:.3g} square metres, "
+            f"more than {MAX_POINTS}: give a larger one, or a larger threshold"
         )
     rng = np.random.default_rng(seed)
     face = rng.choice(len(faces), max(round(total / spacing**2), 1), p=areas / total)
@@ -42,9 +42,9 @@ def surface_points(mesh: Mesh, spacing: float, seed: int = 0) -> Float[np.ndarra
 
 
 def mesh_error(estimate: Mesh, truth: Mesh, threshold: float = 0.05, seed: int = 0) -> CloudError:
-    """`cloud_error` of points on both surfaces, a fifth of the threshold apart.
+    """Return the `cloud_error` of points sampled on both surfaces, a fifth of the threshold apart.
 
-    A distance to the nearest point on a surface is then at most a few per cent of the threshold too long.
+    At this spacing a distance to the nearest sample exceeds that to the surface by a few per cent of the threshold.
     """
     check_positive("threshold", threshold, "metres")
     spacing = threshold / 5
@@ -53,14 +53,14 @@ def mesh_error(estimate: Mesh, truth: Mesh, threshold: float = 0.05, seed: int =
 
 def _checked(mesh: Any) -> Mesh:
     if not isinstance(mesh, tuple | list) or len(mesh) != 2:
-        raise InputError(f"`mesh` is of the type `{type(mesh).__name__}`; expected a pair: its vertices, and its faces")
+        raise InputError(f"`mesh` must be a pair of vertices and faces, got `{type(mesh).__name__}`")
     vertices, faces = real_numbers("vertices of `mesh`", mesh[0]), real_numbers("faces of `mesh`", mesh[1])
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise InputError(
-            f"`mesh` has vertices {vertices.shape} and faces {faces.shape}; both must be [n, 3], not empty"
+            f"`mesh` must have vertices and faces [n, 3], not empty, got shapes {vertices.shape} and {faces.shape}"
         )
     if faces.dtype.kind not in "iu":
-        raise InputError(f"`mesh` has faces of {faces.dtype}; expected whole numbers, the rows of their corners")
+        raise InputError(f"`mesh` must have faces of integers, the indices of their vertices, got {faces.dtype}")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"`mesh` has a face with corner {faces.max()}, and {len(vertices)} vertices")
+        raise InputError(f"`mesh` has {len(vertices)} vertices, but vertex indices from {faces.min()} to {faces.max()}")
     return checked_points("vertices of `mesh`", vertices), faces

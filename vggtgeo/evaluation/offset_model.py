@@ -1,14 +1,15 @@
-"""The model of an estimate whose truth is of other moments, or of another point of the body.
+"""Least-squares model of time offset, lever arm and rotation between an estimate and its ground truth.
 
-The estimate has camera poses `E_i` at times `t_i`; the truth is a continuous motion `T(t)` of a point fixed to the
-camera. With the alignment A (a similarity), the time offset d that is to be added to the truth's times, and the pose B
-of the truth's point in the camera's frame (lever arm and rotation),
+The estimate has camera poses `E_i` at times `t_i`; the ground truth is a continuous motion `T(t)` of a point fixed to
+the camera. With the alignment A (a similarity), the time offset d to be added to the ground truth's times, and the pose
+B of the ground truth's point in the camera frame (lever arm and rotation),
 
-    T(t_i - d) = A E_i B,    residuals  p_T - p_AEB  and  log(R_T R_AEB^T),  in the truth's world.
+    T(t_i - d) = A E_i B,    residuals  p_T - p_AEB  and  log(R_T R_AEB^T),  in the ground truth's world.
 
-Both residuals are white noise upon a drift (`drift_noise`), estimated in turn with the unknowns (D. Cochrane, G. H.
-Orcutt, JASA 44, 1949): neighbouring errors of SLAM are alike, so that n poses are not n observations. Rotation and
-lever arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995.
+Both residuals have the noise model `drift_noise`, estimated alternately with the unknowns (D. Cochrane, G. H. Orcutt,
+JASA 44, 1949): errors of neighbouring poses are correlated, so that n poses are not n observations. Rotation and lever
+arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995. A Gauss-Newton loop of its own, in numpy, for
+two reasons: the whitening is O(n) per column, and the second Jacobian Z is not that of any residual.
 """
 
 from collections.abc import Iterator
@@ -30,20 +31,21 @@ Noises = tuple[DriftNoise, DriftNoise]
 UNKNOWNS = 14
 """3 of A's translation, 3 of its rotation, its scale, the time offset, 3 of B's position, 3 of its rotation."""
 TIME, LEVER, TURN = slice(7, 8), slice(8, 11), slice(11, 14)
-LONGEST = 10.0
-"""Seconds: the largest time offset that is looked for."""
+MAX_OFFSET = 10.0
+"""Largest time offset in the search, seconds."""
 LEVEL = 1e-3
 """Significance level of all tests of offsets."""
 _ROUNDS, _STEPS, _HALVINGS = 5, 20, 6
-_LEAST_STEP = 0.1
-"""Seconds between the starts of the search, and between a pose and those its velocity is taken from: a body that is
-carried moves much the same within."""
-_REACH = _LEAST_STEP
-_LEAST_SPREAD = 1e-6
+_MIN_STEP = 0.1
+"""Seconds between the starts of the search, and between a pose and those its velocity is computed from: the motion of a
+hand-held camera changes little within."""
+_MIN_SPREAD = 1e-6
 """Of a path: that of a still camera in a file of six decimals."""
-_WEAK, _TELLS = 10.0, 4.0
-_MOST_POSES, _MOST_TRIED = 400, 100
-"""Of a fit, and of a start of the search: with more it takes longer and knows little more, as errors are alike."""
+_WEAK_PRIOR, _MIN_GAIN = 10.0, 4.0
+"""Prior deviation of the alignment, in spreads of the path; information, in units of the prior's, of a direction that
+counts as determined."""
+_MAX_POSES, _MAX_SEARCH_POSES = 400, 100
+"""Of a fit, and in the search: correlated errors make more poses slower and hardly more accurate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +64,11 @@ class Unknowns:
     @property
     def offsets(self) -> Float[np.ndarray, "14"]:
         """Time offset, lever arm and rotation vector, in the order of the unknowns; zero for the alignment."""
-        turned = Rotation.from_matrix(self.turn).as_rotvec()
-        return np.concatenate([np.zeros(TIME.start), [self.time], self.lever, turned])
+        rotation = Rotation.from_matrix(self.turn).as_rotvec()
+        return np.concatenate([np.zeros(TIME.start), [self.time], self.lever, rotation])
 
     def moved(self, step: Float[np.ndarray, "14"], middle: Float[np.ndarray, "3"]) -> "Unknowns":
-        """After a step of all unknowns; the alignment turns and grows about `middle` in the truth's world."""
+        """Retract by a step of all unknowns; the alignment rotates and scales about `middle` in the truth's world."""
         turn, growth = Rotation.from_rotvec(step[3:6]).as_matrix(), float(np.exp(step[6]))
         return Unknowns(
             turn @ self.rotation,
@@ -80,8 +82,10 @@ class Unknowns:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """unknowns: estimated, of which those that are `free`. covariance: float64 [14, 14] of a step of them. determined:
-    which of them the motion determines. noise: of positions and rotations. degrees: of freedom. rotation_error: RMS,
+    """The result of a fit.
+
+    Fields: unknowns, of which `free` ones are estimated; covariance, float64 [14, 14], of a step of them; determined,
+    which of them the motion determines; noise, of positions and rotations; degrees of freedom; rotation_error, RMS,
     radians.
     """
 
@@ -99,46 +103,48 @@ class OffsetModel:
 
     def __init__(self, estimate: Trajectory, truth: ContinuousTrajectory) -> None:
         self._truth = truth
-        rows = np.arange(0, len(estimate), -(-len(estimate) // _MOST_POSES))
+        rows = np.arange(0, len(estimate), -(-len(estimate) // _MAX_POSES))
         times = estimate.timestamps
-        # Of each row the poses on both sides, too, whose differences are its velocity.
-        before = np.minimum(np.searchsorted(times, times[rows] - _REACH, side="right") - 1, rows - 1)
-        after = np.maximum(np.searchsorted(times, times[rows] + _REACH), rows + 1)
+        # The poses on both sides of each row give its velocity by finite differences.
+        before = np.minimum(np.searchsorted(times, times[rows] - _MIN_STEP, side="right") - 1, rows - 1)
+        after = np.maximum(np.searchsorted(times, times[rows] + _MIN_STEP), rows + 1)
         self._sides = np.maximum(before, 0), np.minimum(after, len(times) - 1)
         self._all, self._rows, self._times = estimate, rows, times[rows]
-        self._every = -(-len(rows) // _MOST_TRIED)
+        self._every = -(-len(rows) // _MAX_SEARCH_POSES)
         true = truth.poses(self._times[self._seen(0.0)])[:, :3, 3]
         self._middle = true.mean(axis=0)
-        spread = max(float(np.sqrt(((true - self._middle) ** 2).sum(axis=1).mean())), _LEAST_SPREAD)
-        # Deviations of what is known without any pose: nothing of the alignment, and of an offset that it is no longer
-        # than the search, no farther than the path extends, no more than a radian. The data must tell more than that.
-        self._prior = np.array([_WEAK * spread] * 3 + [_WEAK] * 4 + [LONGEST] + [spread] * 3 + [1.0] * 3)
-        self._least = 1e-6 * spread, 1e-6  # files of poses have six decimals or more
+        spread = max(float(np.sqrt(((true - self._middle) ** 2).sum(axis=1).mean())), _MIN_SPREAD)
+        # Standard deviations of the prior: wide for the alignment; the range of the search for the time offset, the
+        # spread of the path for the lever arm, a radian for the rotation.
+        prior = [_WEAK_PRIOR * spread] * 3 + [_WEAK_PRIOR] * 4 + [MAX_OFFSET] + [spread] * 3 + [1.0] * 3
+        self._prior = np.array(prior)
+        self._min_sigma = 1e-6 * spread, 1e-6  # pose files have six decimals or more
 
     def matched(self, time: float) -> int:
-        """How many poses have a true one with this time offset."""
+        """Return the number of poses that have a true one with this time offset."""
         return int(self._seen(time).sum())
 
     def search(self) -> tuple[float, int]:
-        """The time offset that suits positions and rotations best, each after an alignment of its own, and how many
-        were tried: no more than `LONGEST`, nor so large that fewer than half of the poses have a true one.
+        """Return the best time offset for positions and rotations, and the number of candidates.
+
+        Candidates are up to `MAX_OFFSET`, with at least half as many matched poses as the best matched one.
         """
-        step = max(float(np.median(np.diff(self._all.timestamps))), _LEAST_STEP)
-        count = int(LONGEST / step)
+        step = max(float(np.median(np.diff(self._all.timestamps))), _MIN_STEP)
+        count = int(MAX_OFFSET / step)
         grid = step * np.arange(-count, count + 1)
         seen = np.array([self.matched(time) for time in grid])
         tried = grid[seen >= 0.5 * seen.max()]
-        costs = [self._apart(time) for time in tried]
+        costs = [self._misfit(time) for time in tried]
         return float(tried[np.argmin(costs)]), len(tried)
 
     def fit(self, free: Bool[np.ndarray, "14"], *times: float) -> Fit:
-        """The unknowns that are `free`, in turn with the noise; the time offset from near 0 or one of `times`."""
+        """Fit the `free` unknowns, alternating with the noise; the time offset starts from 0 and from `times`."""
         starts = [
             self._solved(start, free, self._white(self._residuals(start)))
             for time in {0.0, *times}
             for start in self._starts(time, free)
         ]
-        unknowns = min(starts, key=lambda one: self._apart_by(self._residuals(one)))
+        unknowns = min(starts, key=lambda one: self._log_sigma(self._residuals(one)))
         noise = self._noise(unknowns, free)
         for _ in range(_ROUNDS):
             unknowns, before = self._solved(unknowns, free, noise), noise
@@ -148,7 +154,7 @@ class OffsetModel:
         return self._fitted(unknowns, free, noise)
 
     def refit(self, fit: Fit, free: Bool[np.ndarray, "14"]) -> Fit:
-        """The unknowns that are `free`, others being zero, with the noise of a `fit`."""
+        """Fit the `free` unknowns, others being zero, with the noise of a `fit`."""
         held = np.where(free, fit.unknowns.offsets, 0.0)
         starts = [self._solved(start, free, fit.noise) for start in self._starts(float(held[7]), free)]
         cost = lambda one: np.mean(self._whitened(self._residuals(one), fit.noise) ** 2)
@@ -169,19 +175,19 @@ class OffsetModel:
         chosen = np.flatnonzero(self._seen(time))[::every]
         return self._all.poses[self._rows[chosen]], self._truth.poses(self._times[chosen] - time)
 
-    def _apart(self, time: float) -> float:
+    def _misfit(self, time: float) -> float:
         found, true = self._pair(time, self._every)
         moved = umeyama(found[:, :3, 3], true[:, :3, 3], True).points(found[:, :3, 3])
         position = ((moved - true[:, :3, 3]) ** 2).sum(axis=1).mean()
         rotation = _turn_of_steps(found[:, :3, :3], true[:, :3, :3])[1]
-        return float(np.log(position + self._least[0] ** 2) + np.log(rotation + self._least[1] ** 2))
+        return float(np.log(position + self._min_sigma[0] ** 2) + np.log(rotation + self._min_sigma[1] ** 2))
 
-    def _apart_by(self, residuals: np.ndarray) -> float:
+    def _log_sigma(self, residuals: np.ndarray) -> float:
         return sum(np.log(one.sigma) for one in self._white(residuals))
 
     def _starts(self, time: float, free: np.ndarray) -> Iterator[Unknowns]:
-        """From the positions alone, as an alignment does, and from the rotations: where positions lie on a line or are
-        those of a point far away, the latter is nearer.
+        """Initial values from positions alone, and from rotations: the latter are better for a straight path or a long
+        lever arm.
         """
         found, true = self._pair(time)
         turned, turns = true[:, :3, :3], bool(free[TURN].all())
@@ -196,7 +202,7 @@ class OffsetModel:
     def _placed(
         self, rotation: np.ndarray, turn: np.ndarray, time: float, found: np.ndarray, true: np.ndarray, lever: bool
     ) -> Unknowns:
-        """With rotations known, scale, translation and lever arm are a linear problem."""
+        """Solve for scale, translation and lever arm, a linear problem for given rotations."""
         along = found[:, :3, 3] @ rotation.T
         columns = [np.broadcast_to(np.eye(3), (len(found), 3, 3))]
         columns += [rotation @ found[:, :3, :3]] if lever else []
@@ -207,11 +213,11 @@ class OffsetModel:
         return Unknowns(rotation, solved[:3], scale, time, solved[3:6] if lever else np.zeros(3), turn)
 
     def _solved(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:
-        """By Gauss-Newton."""
+        """Gauss-Newton with step halving."""
         residuals = self._whitened(self._residuals(unknowns), noise)
         for _ in range(_STEPS):
             jacobian = self._whitened(self._jacobian(unknowns), noise) * (self._prior * free)
-            # The identity keeps directions that nothing determines where they are.
+            # The identity, the prior's information, keeps undetermined directions where they are.
             normal = jacobian.T @ jacobian + np.eye(UNKNOWNS)
             size = 1.0 / np.sqrt(np.diag(normal))
             inverse = np.linalg.pinv(normal * np.outer(size, size), rcond=1e-13, hermitian=True)
@@ -253,7 +259,9 @@ class OffsetModel:
         return self._columns(unknowns, made, self._truth.velocities(self._times[seen] - unknowns.time))
 
     def _other_jacobian(self, unknowns: Unknowns) -> np.ndarray:
-        """The same formulas with each trajectory in the other's place: the motion is the same, the noise is not."""
+        """The Jacobian with the trajectories exchanged: equal motion, independent noise (an instrument, see
+        `_covariance`).
+        """
         seen = self._seen(unknowns.time)
         before, after = (self._predicted(unknowns, self._all.poses[side[seen]]) for side in self._sides)
         seconds = np.subtract(*(self._all.timestamps[side[seen]] for side in self._sides[::-1]))
@@ -263,8 +271,8 @@ class OffsetModel:
         return self._columns(unknowns, true, motion / seconds[:, None])
 
     def _columns(self, unknowns: Unknowns, body: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """For poses of the truth's point and its velocity; without the log's own Jacobian, which is the identity where
-        the residual is small.
+        """Jacobian for poses and velocities of the truth's point; the log's own Jacobian is taken as the identity, as
+        for small residuals.
         """
         camera = body[:, :3, :3] @ unknowns.turn.T
         arm = body[:, :3, 3] - self._middle
@@ -277,7 +285,7 @@ class OffsetModel:
         return found
 
     def _whitened(self, rows: np.ndarray, noise: Noises) -> np.ndarray:
-        """Of residuals or a Jacobian [n, 6, ...], rows of unit variance."""
+        """Whiten residuals or a Jacobian [n, 6, ...]."""
         parts = [
             one.whitened(part.reshape(len(part), -1)).reshape(3 * len(part), *part.shape[2:])
             for one, part in zip(noise, (rows[:, :3], rows[:, 3:]), strict=True)
@@ -285,32 +293,35 @@ class OffsetModel:
         return np.concatenate(parts)
 
     def _white(self, residuals: np.ndarray) -> Noises:
-        """As if the noise were white."""
-        parts = zip((residuals[:, :3], residuals[:, 3:]), self._least, strict=True)
-        first, second = (DriftNoise(max(float(np.sqrt(np.mean(part**2))), least)) for part, least in parts)
+        """White noise with the RMS of the residuals."""
+        parts = zip((residuals[:, :3], residuals[:, 3:]), self._min_sigma, strict=True)
+        first, second = (DriftNoise(max(float(np.sqrt(np.mean(part**2))), sigma)) for part, sigma in parts)
         return first, second
 
     def _noise(self, unknowns: Unknowns, free: np.ndarray) -> Noises:
         residuals, jacobian = self._residuals(unknowns), self._jacobian(unknowns)[:, :, free] * self._prior[free]
-        parts = zip((slice(0, 3), slice(3, 6)), self._least, strict=True)
-        first, second = (DriftNoise.of(residuals[:, part], jacobian[:, part], least) for part, least in parts)
+        parts = zip((slice(0, 3), slice(3, 6)), self._min_sigma, strict=True)
+        first, second = (DriftNoise.of(residuals[:, part], jacobian[:, part], sigma) for part, sigma in parts)
         return first, second
 
     def _scaled(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Both Jacobians J and Z, whitened and by unknowns in units of the prior's deviations, and a basis of the
-        directions that the motion determines: where they agree by four times what the prior tells (a deviation of less
-        than half of its), and more than noise alone would agree.
+        """Both Jacobians J and Z, whitened, in units of the prior, and a basis of the determined directions.
+
+        A direction is determined if `Z^T J` has four times the prior's information (half its standard deviation), and
+        more than two independent noises would have by chance.
         """
         jacobians = self._jacobian(unknowns), self._other_jacobian(unknowns)
         own, other = (self._whitened(one, noise) * (self._prior * free) for one in jacobians)
         values, vectors = np.linalg.eigh(0.5 * (other.T @ own + own.T @ other))
         lengths = np.sqrt(((own @ vectors) ** 2).sum(axis=0) * ((other @ vectors) ** 2).sum(axis=0))
         chance = norm.ppf(1 - LEVEL / 2) / np.sqrt(0.5 * len(own))
-        return own, other, vectors[:, (values > _TELLS) & (values > chance * lengths)]
+        return own, other, vectors[:, (values > _MIN_GAIN) & (values > chance * lengths)]
 
     def _balanced(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:
-        """The solution of `Z^T r = 0`, see `_covariance`, near that of `J^T r = 0`. The latter is biased: noise of the
-        truth is smaller between its poses, as interpolation averages, and noisy rotations make a lever arm shorter.
+        """The solution of `Z^T r = 0` (instrumental variables, see `_covariance`), starting from that of `J^T r = 0`.
+
+        The latter is biased: interpolation reduces the ground truth's noise between its poses, and noisy rotations
+        shorten a lever arm.
         """
         size = np.inf
         for _ in range(_STEPS):
@@ -325,15 +336,15 @@ class OffsetModel:
         return unknowns
 
     def _covariance(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray]:
-        """Of the solution of `Z^T r = 0`, `(Z^T J)^-1 Z^T Z (Z^T J)^-T` with the Jacobians J and Z of the two
-        trajectories: noise of either is no motion, and `Z^T J` does not count it as some. Where the motion determines
-        nothing, that of the prior.
+        """Covariance of the solution of `Z^T r = 0`: `(Z^T J)^-1 Z^T Z (Z^T J)^-T`, J and Z the Jacobians of the two
+        trajectories, whose noises are independent, so that `Z^T J` contains motion only. In undetermined directions the
+        covariance of the prior.
         """
         own, other, basis = self._scaled(unknowns, free, noise)
         own, other = own @ basis, other @ basis
         gain = basis @ np.linalg.pinv(other.T @ own, rcond=1e-18)
         covariance = gain @ (other.T @ other) @ gain.T + np.eye(UNKNOWNS) - basis @ basis.T
-        return covariance * np.outer(self._prior, self._prior), free & (np.diag(covariance) < 1.0 / _TELLS)
+        return covariance * np.outer(self._prior, self._prior), free & (np.diag(covariance) < 1.0 / _MIN_GAIN)
 
 
 def _mean(rotations: np.ndarray) -> np.ndarray:
@@ -341,8 +352,10 @@ def _mean(rotations: np.ndarray) -> np.ndarray:
 
 
 def _turn_of_steps(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, float]:
-    """The rotation of the truth's body in the camera's frame, and the mean square of what it leaves, rad^2: by the
-    rotation vectors from one pose to the next, which no alignment changes (W. Kabsch, Acta Cryst. A 32, 1976).
+    """The rotation of the truth's body in the camera frame, and the mean square residual, rad^2.
+
+    From rotation vectors between successive poses, which an alignment does not change (W. Kabsch, Acta Cryst. A 32,
+    1976).
     """
     camera, body = (Rotation.from_matrix(one[:-1].mT @ one[1:]).as_rotvec() for one in (found, true))
     u, _, vt = np.linalg.svd(camera.T @ body)

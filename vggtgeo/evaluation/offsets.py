@@ -1,8 +1,8 @@
-"""Whether a constant offset of clocks, or of the point of the body that is recorded, explains the error of an estimate.
+"""Constant offsets between estimate and ground truth: of clocks, of the tracked point, of the axes.
 
-A marker beside the lens, axes of another convention, a clock of its own: the truth is then of another point or moment,
-and the error is no error of the estimate. `estimate_offsets` fits such offsets (`offset_model`), drops those that are
-not significant one by one, and compares the error with and without the rest.
+A motion-capture marker beside the lens, other axes, or another clock cause errors that are not the estimate's.
+`estimate_offsets` fits such offsets (`offset_model`), removes insignificant ones step by step, and compares the errors
+with and without the rest.
 """
 
 from collections.abc import Iterable
@@ -16,10 +16,10 @@ from scipy.stats import f as fisher
 
 from vggtgeo.evaluation.absolute import absolute_error
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check_trajectories
+from vggtgeo.evaluation.comparability import MAX_LEFT, comparability
 from vggtgeo.evaluation.interpolation import ContinuousTrajectory
-from vggtgeo.evaluation.offset_model import LEVEL, LEVER, LONGEST, TIME, TURN, UNKNOWNS, Fit, OffsetModel
+from vggtgeo.evaluation.offset_model import LEVEL, LEVER, MAX_OFFSET, TIME, TURN, UNKNOWNS, Fit, OffsetModel
 from vggtgeo.evaluation.report import FEW_MATCHES
-from vggtgeo.evaluation.resemblance import MOST, comparability
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.given import check_real
@@ -29,19 +29,19 @@ _PARTS = {"time offset": TIME, "lever arm": LEVER, "rotation": TURN}
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """Constant offsets between a truth and an estimate.
+    """Constant offsets between a ground truth and an estimate.
 
     Fields:
-        time, time_sd: seconds that have to be added to the truth's times (positive: its clock is late), and the
-            standard deviation of that, infinite where the motion does not determine it.
-        lever, lever_sd: float64 [3], the truth's point in the camera's frame, in the unit of the truth.
-        turn: float64 [3, 3], axes of the truth's body in the camera's frame.
+        time, time_sd: offset to add to the ground truth's times, seconds, and its standard deviation, infinite if the
+            motion does not determine it.
+        lever, lever_sd: float64 [3], the ground truth's point in the camera frame, in the unit of the ground truth.
+        turn: float64 [3, 3], axes of the ground truth's body in the camera frame.
         turn_sd: float64 [3], radians, of a small rotation about each of the camera's axes.
-        significant: those that are not zero by chance, of "time offset", "lever arm", "rotation".
-        ate, ate_left: RMSE after Sim(3), in the unit of the truth, and what is left of it without the significant
-            offsets. Sim(3), as a lever arm would explain a part of an error of scale.
-        rotation_error, rotation_error_left: RMS, radians, of both the same.
-        explains: whether they are most of the error: without them less than half of that of positions or rotations is
+        significant: the significant ones of "time offset", "lever arm", "rotation".
+        ate, ate_left: RMSE after Sim(3), in the unit of the ground truth, before and after removing the significant
+            offsets. Sim(3), since a lever arm would explain a part of a scale error.
+        rotation_error, rotation_error_left: RMS rotation error, radians, before and after.
+        explains: whether the offsets explain most of the error: less than half of that of positions or rotations is
             left, and the two are comparable.
     """
 
@@ -59,7 +59,7 @@ class Offsets:
     explains: bool = False
 
     def removed(self, estimate: Trajectory, truth: Trajectory) -> Trajectory:
-        """The truth of the camera itself, by the clock of the estimate: without the significant offsets."""
+        """Return the ground truth without the significant offsets: of the camera itself, by the estimate's clock."""
         has = {name: name in self.significant for name in _PARTS}
         lever = self.lever if has["lever arm"] else np.zeros(3)
         turn = self.turn if has["rotation"] else np.eye(3)
@@ -67,7 +67,7 @@ class Offsets:
         return Trajectory(moved.timestamps, moved.poses @ rigid.invert(_pose(turn, lever)))
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON: seconds, metres, degrees; None where the motion does not determine a number."""
+        """Return plain numbers for JSON, seconds, metres, degrees; None if the motion does not determine a number."""
         known = lambda values, sds: [float(v) if np.isfinite(sd) else None for v, sd in zip(values, sds, strict=True)]
         parts = {"time_offset_s": ([self.time], [self.time_sd]), "lever_arm_m": (self.lever, self.lever_sd)}
         parts["rotation_deg"] = np.degrees(self._turned), np.degrees(self.turn_sd)
@@ -93,27 +93,27 @@ class Offsets:
         turned, sds = np.degrees(self._turned), np.degrees(self.turn_sd)
         return {
             "time offset": f"time offset of the truth {_numbers([self.time], [self.time_sd], ' s')}",
-            "lever arm": f"lever arm of the truth's point in the camera's frame {_numbers(self.lever, self.lever_sd)}",
-            "rotation": f"rotation of the truth's axes in the camera's frame {_numbers(turned, sds, ' deg')}",
+            "lever arm": f"lever arm of the truth's point in the camera frame {_numbers(self.lever, self.lever_sd)}",
+            "rotation": f"rotation of the truth's axes in the camera frame {_numbers(turned, sds, ' deg')}",
         }
 
     @property
     def message(self) -> str:
-        """What explains most of the error, and by how much; empty where nothing does."""
+        """Describe the offsets that explain most of the error; empty if none do."""
         if not self.explains:
             return ""
         names = "; ".join(self._texts[name] for name in self.significant)
         angles = np.degrees([self.rotation_error, self.rotation_error_left])
         return (
-            f"most of the error is a constant offset ({names}): without it ATE after Sim(3) {self.ate_left:.3g} in "
-            f"place of {self.ate:.3g}, rotations {angles[1]:.2g} in place of {angles[0]:.2g} deg"
+            f"most of the error is a constant offset ({names}): without it the ATE after Sim(3) is {self.ate_left:.3g} "
+            f"instead of {self.ate:.3g}, the rotation error {angles[1]:.2g} instead of {angles[0]:.2g} deg"
         )
 
 
 def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE) -> Offsets | None:
-    """The constant offsets of time and body between two trajectories; None for fewer than ten poses.
+    """Estimate constant offsets of time, lever arm and rotation between two trajectories; None for under ten poses.
 
-    Offsets of more than ten seconds are not found. InputError where no poses match within `max_dt` seconds.
+    Time offsets are searched up to ten seconds. InputError if no poses match within `max_dt` seconds.
 
     Example:
         >>> import vggtgeo as vg
@@ -127,7 +127,7 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
     check_trajectories(estimate, truth)
     plain = absolute_error(*associate(estimate, truth, max_dt), "sim3").statistics.rmse
     first, last = estimate.timestamps[[0, -1]]
-    near = truth.select((truth.timestamps >= first - 2 * LONGEST) & (truth.timestamps <= last + 2 * LONGEST))
+    near = truth.select((truth.timestamps >= first - 2 * MAX_OFFSET) & (truth.timestamps <= last + 2 * MAX_OFFSET))
     if min(len(estimate), len(near)) < FEW_MATCHES:
         return None
     continuous = ContinuousTrajectory(near)
@@ -155,14 +155,14 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
     )
     rest = found.removed(estimate, truth)
     left = absolute_error(*associate(estimate, rest, max_dt), "sim3").statistics.rmse
-    most = left < MOST * plain or kept.rotation_error < MOST * alone.rotation_error
+    most = left < MAX_LEFT * plain or kept.rotation_error < MAX_LEFT * alone.rotation_error
     verdict = comparability(estimate, rest, max_dt)
     doubts = set(verdict.doubts) - set(comparability(estimate, truth, max_dt).doubts)
     return replace(found, ate_left=left, explains=bool(names) and most and not (verdict.reasons or doubts))
 
 
 def shifted(estimate: Trajectory, truth: Trajectory, seconds: float) -> Trajectory:
-    """The truth with `seconds` added to its times, and poses interpolated at those of the estimate."""
+    """Return the ground truth with `seconds` added to its times, and poses interpolated at the estimate's times."""
     check_trajectories(estimate, truth)
     check_real("seconds", seconds)
     times = truth.timestamps + seconds
@@ -178,7 +178,7 @@ def shifted(estimate: Trajectory, truth: Trajectory, seconds: float) -> Trajecto
 
 
 def _reduced(model: OffsetModel, fit: Fit, tried: int) -> tuple[Fit, tuple[str, ...]]:
-    """Without the offsets that are not significant, the least significant one first."""
+    """Remove the offsets that are not significant, the least significant first."""
     names = list(_PARTS)
     while names:
         chances = {name: _chance(fit, _PARTS[name]) * (tried if name == "time offset" else 1) for name in names}
@@ -197,9 +197,7 @@ def _with(free: np.ndarray, name: str, wanted: bool = True) -> np.ndarray:
 
 
 def _chance(fit: Fit, part: slice) -> float:
-    """The probability of an offset as large as this one where there is none, by the F test; 1 where it is not
-    determined.
-    """
+    """p-value of an offset by the F test; 1 if it is not determined."""
     known, value = fit.determined[part], fit.unknowns.offsets[part]
     if not known.any():
         return 1.0
@@ -219,7 +217,7 @@ def _pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def _numbers(values: Iterable[float], sds: Iterable[float], unit: str = "") -> str:
-    """Each with its standard deviation, and as many digits as that has."""
+    """Format values with standard deviations, to two digits of these."""
     shown = []
     for value, sd in zip(values, sds, strict=True):
         digits = int(np.clip(1 - np.floor(np.log10(max(sd, 1e-6))), 0, 6)) if np.isfinite(sd) else 0

@@ -1,8 +1,8 @@
-"""Relative pose errors (RPE; RTE and RRE pair by pair): how well the motion over a stated delta is known.
+"""Relative pose error (RPE; RTE and RRE of each pair): error of the motion over a given delta.
 
 For poses `Q` (truth) and `P` (estimate), camera -> world, the error of the pair (i, j) is the motion
-`E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; its translation's length is the RTE, its rotation's angle the RRE, and the
-RPE is their root mean square. No alignment is needed; a reconstruction without scale must be scaled before.
+`E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; the length of its translation is the RTE, the angle of its rotation the RRE, and the
+RPE is their root mean square. No alignment is needed; a reconstruction of free scale must be scaled before.
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
 """
 
@@ -20,22 +20,21 @@ from vggtgeo.io.given import check_kind, check_real, real_array
 
 Unit = Literal["poses", "seconds", "metres"]
 UNITS: tuple[Unit, ...] = get_args(Unit)
-_MOST_POSES = 2**31
+_MAX_POSES = 2**31
 PATH_TOLERANCE = 0.1
 """Share of a delta in seconds or metres by which overlapping pairs may miss it; evo's default."""
 
 
 @dataclass(frozen=True, eq=False)
 class RelativeError:
-    """Errors of the m pairs that lie `delta` apart.
+    """Errors of the m pairs that are `delta` apart.
 
     Fields:
         translation: float64 [m], metres (RTE).
         rotation: float64 [m], radians (RRE).
-        direction: float64 [m], radians between the two translation directions, which knows no scale; NaN
-        where
-            either camera stood still.
-        delta: between the two of a pair, in `unit`.
+        direction: float64 [m], angle between the translation directions, radians, independent of scale; NaN if one of
+            the translations is zero.
+        delta: distance of the two poses of a pair, in `unit`.
         unit: "poses", "seconds", or "metres" of the true path.
     """
 
@@ -47,29 +46,29 @@ class RelativeError:
 
     @property
     def interval(self) -> str:
-        """The delta with its unit, for a heading: `1 pose`, `0.5 seconds`."""
+        """The delta with its unit: `1 pose`, `0.5 seconds`."""
         return f"{self.delta:g} {self.unit[:-1] if self.delta == 1 else self.unit}"
 
     @property
     def translation_statistics(self) -> ErrorStatistics:
-        """In metres; `mean` is the RTE of the sequence, `rmse` the RPE."""
+        """Statistics in metres; `mean` is the RTE of the sequence, `rmse` the RPE."""
         return ErrorStatistics.of(self.translation)
 
     @property
     def rotation_statistics(self) -> ErrorStatistics:
-        """In radians; `mean` is the RRE of the sequence, `rmse` the RPE."""
+        """Statistics in radians; `mean` is the RRE of the sequence, `rmse` the RPE."""
         return ErrorStatistics.of(self.rotation)
 
 
 def relative_error(
     estimate: Trajectory, truth: Trajectory, delta: float = 1, all_pairs: bool = False, unit: Unit = "poses"
 ) -> RelativeError:
-    """RPE of matched trajectories (see `associate`) over `delta`, measured along the truth.
+    """Return the RPE of matched trajectories (see `associate`) over `delta`, measured along the ground truth.
 
-    Pairs are consecutive, (0, delta), (delta, 2 delta), ..., as evo has it; with `all_pairs` they overlap:
-    (0, delta), (1, 1 + delta), ... In seconds and metres a pair ends with the first pose at least `delta` on;
-    overlapping pairs with the nearest one, if that is not off by more than a tenth. No pair (a trajectory shorter than
-    delta) gives empty arrays. InputError where the two differ in length, or for an impossible `delta` or `unit`.
+    Pairs are consecutive, (0, delta), (delta, 2 delta), ..., as in evo; with `all_pairs` they overlap: (0, delta),
+    (1, 1 + delta), ... In seconds and metres a pair ends with the first pose at least `delta` later; overlapping pairs
+    with the nearest one, if it is within a tenth of delta. A trajectory shorter than delta gives empty arrays.
+    InputError if the lengths differ, or `delta` or `unit` is invalid.
     """
     check_trajectories(estimate, truth)
     if len(estimate) != len(truth):
@@ -93,17 +92,17 @@ def relative_error(
 def pairs(
     trajectory: Trajectory, delta: float, all_pairs: bool = False, unit: Unit = "poses"
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Rows of the first and the second pose of each pair that lies `delta` apart; see `relative_error`."""
+    """Return the rows of the first and the second pose of each pair; see `relative_error`."""
     if unit not in UNITS:
-        raise InputError(f"`unit` is {unit!r}; it must be one of {', '.join(UNITS)}")
+        raise InputError(f"`unit` must be one of {', '.join(UNITS)}, got {unit!r}")
     check_real("delta", delta)
     if unit == "poses":
-        if not (1 <= delta <= _MOST_POSES) or delta != int(delta):
-            raise InputError(f"`delta` is {delta}; it must be at least 1 pose, a whole number, at most {_MOST_POSES}")
+        if not (1 <= delta <= _MAX_POSES) or delta != int(delta):
+            raise InputError(f"`delta` must be an integer of poses from 1 to {_MAX_POSES}, got {delta}")
         first = np.arange(0, max(len(trajectory) - int(delta), 0), 1 if all_pairs else int(delta))
         return first, first + int(delta)
     if not (np.isfinite(delta) and delta > 0):
-        raise InputError(f"`delta` is {delta}; it must be more than 0 {unit}")
+        raise InputError(f"`delta` must be more than 0 {unit}, got {delta}")
     if unit == "seconds":
         way = trajectory.timestamps - trajectory.timestamps[:1]
     else:
@@ -113,8 +112,8 @@ def pairs(
 
 
 def _consecutive(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
-    """`way` grows along the rows; each pair begins where the one before ended."""
-    delta -= 1e-9 * delta  # times and paths are sums: a delta that is met exactly must count as met
+    """Pairs of which each begins where the one before ended; `way` is non-decreasing."""
+    delta -= 1e-9 * delta  # `way` has rounding errors: an exact delta must count as reached
     ends, row = [], 0
     while row < len(way):
         ends.append(row)
@@ -124,7 +123,7 @@ def _consecutive(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def _overlapping(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
-    """From each row to the one after it whose distance is nearest to `delta`; the first of equals."""
+    """Pairs of each row with the later one whose distance is nearest to `delta`; the first of equals."""
     first = np.arange(max(len(way) - 1, 0))
     after = np.clip(np.searchsorted(way, way[first] + delta), first + 1, len(way) - 1)
     before = np.maximum(np.searchsorted(way, way[np.maximum(after - 1, 0)]), first + 1)
@@ -135,7 +134,7 @@ def _overlapping(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def rotation_angle(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-    """The angle of each rotation, radians in [0, pi]; accurate at both ends, where an arc cosine is not."""
+    """Return the angle of each rotation, radians in [0, pi]; accurate near 0 and pi, unlike an arc cosine."""
     rotations = real_array("rotations", rotations, (None, 3, 3))
     skew = rotations - rotations.swapaxes(1, 2)
     sine = np.sqrt(skew[:, 2, 1] ** 2 + skew[:, 0, 2] ** 2 + skew[:, 1, 0] ** 2)

@@ -1,4 +1,4 @@
-"""Everything the field asks of an estimated trajectory, in one value."""
+"""All usual errors of an estimated trajectory in one report."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -19,22 +19,24 @@ from vggtgeo.evaluation.relative import RelativeError, Unit, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
-MINIMUM_MATCHES = 3
+MIN_MATCHES = 3
 FEW_MATCHES = 10
-"""An alignment takes up to seven numbers out of the errors; with fewer poses the rest says little."""
-LEAST_COVERAGE = 0.5
-LONGEST_GAP = 1.0
-"""Seconds between two estimated poses that still count as followed."""
+"""An alignment fits up to seven parameters; with fewer poses it hides most of the error."""
+MIN_COVERAGE = 0.5
+MAX_GAP = 1.0
+"""Seconds between two estimated poses up to which the time between them counts as covered."""
 ABSURD_SCALE = 3.0
-"""A scale beyond this factor, either way: other units, or no metric estimate at all."""
+"""A scale beyond this factor, either way, indicates other units or a non-metric estimate."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryReport:
-    """Fields: matched, estimated, true: poses compared, in the estimate, in the truth; coverage: share of the truth's
-    duration that the estimate follows, gaps above a second left out; se3 and sim3, unaligned, yaw: ATE after either
-    alignment, after none, and after heading and position alone; relative: RPE as estimated; relative_sim3: RPE after
-    the scale of the Sim(3) alignment; still: which of the two, "estimate" or "truth", is at one place all the time.
+    """Errors of a trajectory.
+
+    Fields: matched, estimated, true: number of poses compared, in the estimate, in the ground truth; coverage: share of
+    the ground truth's duration covered by the estimate, without gaps above a second; se3, sim3, yaw, unaligned: ATE
+    after each alignment, and without; relative: RPE as estimated; relative_sim3: RPE after the scale of the Sim(3)
+    alignment; still: which of "estimate" and "truth" do not move.
     """
 
     matched: int
@@ -51,7 +53,7 @@ class TrajectoryReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What makes these numbers doubtful, a sentence each."""
+        """Reasons to doubt these numbers, as sentences."""
         found = []
         scale = self.sim3.alignment.scale
         if self.matched < FEW_MATCHES:
@@ -60,37 +62,35 @@ class TrajectoryReport:
             found.append(
                 f"only {self.matched} of {min(self.estimated, self.true)} poses match: are the clocks the same?"
             )
-        if self.coverage < LEAST_COVERAGE:
+        if self.coverage < MIN_COVERAGE:
             found.append(
-                f"the estimate follows {100 * self.coverage:.0f} % of the truth's duration; the rest is not judged"
+                f"the estimate covers {100 * self.coverage:.0f} % of the truth's duration; the rest is not evaluated"
             )
         if not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE:
-            found.append(
-                f"the scale is {scale:.3g}: the two are not in one unit, and Sim(3) errors say nothing of that"
-            )
+            found.append(f"the scale is {scale:.3g}: the units differ, which errors after Sim(3) do not show")
         if self.still:
-            found.append(f"all poses of the {' and the '.join(self.still)} are at one place: the scale says nothing")
+            found.append(f"all positions of the {' and the '.join(self.still)} are equal: the scale is undefined")
         if not len(self.relative.translation):
-            found.append(f"no two of them are {self.relative.interval} apart: there is no RPE, give a smaller `delta`")
+            found.append(f"no two poses are {self.relative.interval} apart: no RPE, give a smaller `delta`")
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """See `as_dict`."""
+        """Return `as_dict()`."""
         return self.as_dict()
 
     def __str__(self) -> str:
         se3, sim3, pairs = self.se3.statistics.rmse, self.sim3.statistics.rmse, self.relative
-        moved, turned = pairs.translation_statistics.rmse, np.degrees(pairs.rotation_statistics.rmse)
+        translation, rotation = pairs.translation_statistics.rmse, np.degrees(pairs.rotation_statistics.rmse)
         return (
             f"{self.matched} poses: ATE {se3:.3f} m after SE(3), {sim3:.3f} m after Sim(3) (scale "
-            f"{self.sim3.alignment.scale:.4f}); RPE over {pairs.interval}: {moved:.3f} m, {turned:.3f} deg"
+            f"{self.sim3.alignment.scale:.4f}); RPE over {pairs.interval}: {translation:.3f} m, {rotation:.3f} deg"
             + "".join(f"; {warning}" for warning in self.warnings)
         )
 
     __repr__ = __str__
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON: metres and degrees; None where there was nothing to measure."""
+        """Return plain numbers for JSON, metres and degrees; None if undefined."""
         pairs = self.relative, self.relative_sim3
         translations = [_plain(asdict(pair.translation_statistics)) for pair in pairs]
         angles = np.degrees(self.relative.rotation)
@@ -122,11 +122,11 @@ def evaluate_trajectory(
     unit: Unit = "poses",
     vertical: tuple[float, float, float] = VERTICAL,
 ) -> TrajectoryReport:
-    """Matches the two by time (within `max_dt` seconds) and measures ATE and RPE.
+    """Match the two by time (within `max_dt` seconds) and compute ATE and RPE.
 
-    delta, unit: of the RPE's pairs: matched poses, seconds, or metres of the true path. vertical: up in the truth's
-    world, for the alignment of heading and position. InputError where fewer than three poses match: an alignment would
-    hide any error.
+    delta, unit: of the RPE's pairs: matched poses, seconds, or metres of the true path. vertical: up in the world of
+    the ground truth, for the alignment of heading and position. InputError if fewer than three poses match: an
+    alignment would hide any error.
 
     Example:
         >>> import vggtgeo as vg
@@ -136,9 +136,9 @@ def evaluate_trajectory(
 
     """
     matched, reference = associate(estimate, truth, max_dt)
-    if len(matched) < MINIMUM_MATCHES:
+    if len(matched) < MIN_MATCHES:
         raise InputError(
-            f"{len(matched)} poses match within {max_dt:g} s; at least {MINIMUM_MATCHES} are needed: "
+            f"{len(matched)} poses match within {max_dt:g} s; at least {MIN_MATCHES} are needed: "
             f"{spans(estimate, truth)}"
         )
     sim3 = absolute_error(matched, reference, "sim3")
@@ -158,11 +158,11 @@ def evaluate_trajectory(
     )
 
 
-def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGEST_GAP) -> float:
-    """Share of the truth's duration that lies between two poses of the estimate at most `longest_gap` seconds apart, or
-    two steps of a truth whose own poses are farther apart (a picture every few seconds).
+def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = MAX_GAP) -> float:
+    """Return the share of the ground truth's duration between estimated poses at most `longest_gap` seconds apart.
 
-    NaN for a truth without duration.
+    If the ground truth itself has a larger interval, gaps of two of its intervals are allowed. NaN for a ground truth
+    without duration.
     """
     check_trajectories(estimate, truth)
     if len(truth) < 2:
@@ -173,9 +173,9 @@ def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGE
 
 
 def followed(
-    times: Float[np.ndarray, " n"], estimate: Trajectory, truth: Trajectory, longest_gap: float = LONGEST_GAP
+    times: Float[np.ndarray, " n"], estimate: Trajectory, truth: Trajectory, longest_gap: float = MAX_GAP
 ) -> Bool[np.ndarray, " n"]:
-    """Which of `times` (seconds) lie between two poses of the estimate as `coverage` counts them, or at one."""
+    """Return which of `times` (seconds) are covered as in `coverage`, or are at an estimated pose."""
     poses = estimate.timestamps
     after = np.searchsorted(poses, times)
     close = np.concatenate([[False], _close(estimate, truth, longest_gap), [False]])

@@ -1,4 +1,4 @@
-"""A list of errors in a few numbers."""
+"""Summary statistics of errors."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Of non-negative errors, in their unit; all NaN where there was no error to look at. `count` says how many."""
+    """Statistics of `count` non-negative errors, in their unit; NaN if there are none."""
 
     rmse: float
     mean: float
@@ -19,7 +19,7 @@ class ErrorStatistics:
 
     @classmethod
     def of(cls, errors: Float[np.ndarray, " n"]) -> Self:
-        """The statistics of `errors` [n]."""
+        """Return the statistics of `errors` [n]."""
         if len(errors) == 0:
             return cls(np.nan, np.nan, np.nan, np.nan, 0)
         rmse = float(np.sqrt(np.mean(np.square(errors))))

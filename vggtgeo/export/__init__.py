@@ -1,4 +1,4 @@
-"""Files for other programs, made of a run's folder."""
+"""Export a run's folder for other programs."""
 
 from vggtgeo.export.formats import FORMATS as FORMATS
 from vggtgeo.export.formats import export as export

@@ -1,8 +1,7 @@
-"""A COLMAP model: pictures, cameras, points with tracks, in the binary layout that gsplat and others read.
+"""Export as a COLMAP model: images, cameras, points with tracks, in the binary layout.
 
 Layout: https://colmap.github.io/format.html. COLMAP's pixel (0, 0) is the corner of the top-left pixel, ours its
-    centre:
-half a pixel is added.
+centre: half a pixel is added.
 """
 
 from __future__ import annotations
@@ -13,26 +12,25 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.export.contents import EmptyRunError, scene_of
-from vggtgeo.export.pictures import copy_pictures, picture_mask
+from vggtgeo.export.contents import EmptyRunError, copy_pictures, picture_mask, scene_of
 from vggtgeo.geometry import rigid
 from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import Scene
 
 PINHOLE = 1
-"""COLMAP's number of the model fx, fy, cx, cy."""
+"""COLMAP's identifier of the model fx, fy, cx, cy."""
 
 
 def write_colmap(source: Path, target: Path) -> dict[str, float]:
-    """`images/` and `sparse/0/` below `target`, of the run in `source`; and, where undistorted pictures have borders
-    that no pixel fills, `masks/`, named and coloured as COLMAP takes them (black: not used).
+    """Write `images/` and `sparse/0/` of the run in `source` below `target`; also `masks/` if the undistorted images
+    have invalid borders (black: not used).
 
-    Returns what was written: counts, and the mean over the points of each one's mean reprojection error, pixels.
-    EmptyRunError where no point was seen from two keyframes.
+    Returns counts, and the mean over points of each point's mean reprojection error, pixels. EmptyRunError if no point
+    was observed from two keyframes.
     """
     scene = scene_of(source)
     if not len(scene.tracks):
-        raise EmptyRunError(f"`{source / 'scene.npz'}` has no point that two keyframes saw: there is nothing to export")
+        raise EmptyRunError(f"`{source / 'scene.npz'}` has no point with observations in two keyframes")
     copy_pictures(scene, source, target)
     mask = picture_mask(scene, source)
     for view in range(len(scene.frames) if mask is not None else 0):
@@ -61,7 +59,7 @@ def _cameras(scene: Scene) -> bytes:
 
 
 def _places(scene: Scene) -> np.ndarray:
-    """Of each observation its place among those of its image."""
+    """Index of each observation among those of its image."""
     order = np.argsort(scene.tracks.view, kind="stable")
     view = scene.tracks.view[order]
     places = np.empty(len(order), np.int64)

@@ -1,4 +1,4 @@
-"""The formats by name, and the one function behind `vggtgeo export`."""
+"""The export formats, and the function behind `vggtgeo export`."""
 
 from __future__ import annotations
 
@@ -17,15 +17,35 @@ from vggtgeo.datasets.opening import FOLDER_KINDS
 from vggtgeo.export.colmap import write_colmap
 from vggtgeo.export.contents import EmptyRunError
 from vggtgeo.export.nerfstudio import write_nerfstudio
-from vggtgeo.export.paths import write_kitti, write_tum
 from vggtgeo.export.surfaces import write_glb, write_las, write_ply
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import whole_path, write_text
 from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import LockedError, locked, not_written
 from vggtgeo.io.text_files import whole_text
-from vggtgeo.results.summary_file import read_summary
+from vggtgeo.results.summary_file import load_poses, read_summary
 from vggtgeo.results.unfinished import check_is_run
+
+
+def write_tum(source: Path, target: Path) -> dict[str, float]:
+    """Write `trajectory.txt` and `keyframes.txt`: `time x y z qx qy qz qw` per line, camera -> world."""
+    for name in ("trajectory.txt", "keyframes.txt"):
+        load_poses(source, name).save_tum(target / name)
+    return {"poses": len(Trajectory.load_tum(target / "trajectory.txt"))}
+
+
+def write_kitti(source: Path, target: Path) -> dict[str, float]:
+    """Write `poses.txt`, the first three rows of each camera -> world matrix per line, and `times.txt`, seconds.
+
+    The format cannot represent frames without a pose: they are left out of both files.
+    """
+    trajectory = load_poses(source, "trajectory.txt")
+    rows = [" ".join(f"{value:.9e}" for value in pose[:3].reshape(-1)) for pose in trajectory.poses]
+    write_text(target / "poses.txt", "".join(f"{row}\n" for row in rows))
+    write_text(target / "times.txt", "".join(f"{time:.6f}\n" for time in trajectory.timestamps))
+    return {"poses": len(trajectory)}
+
 
 FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
     "colmap": write_colmap,
@@ -36,46 +56,44 @@ FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
     "tum": write_tum,
     "kitti": write_kitti,
 }
-"""Each writes below a folder what the format wants of a run's folder, and returns what was written, in numbers."""
+"""Each function writes the files of a format from a run's folder to another, and returns counts."""
 _RECORD = ".vggtgeo-export"
-"""Names of the files that exports wrote into a folder: those an export may replace, and no others."""
+"""Lists the files that exports wrote into a folder: the only ones that an export may replace."""
 _LOCK = ".vggtgeo-export.lock"
-_TURNS, _WAIT = 100, 0.1
-"""How often, and how many seconds between, an export waits for another."""
+_TRIES, _WAIT = 100, 0.1
+"""Number of times, and seconds between, that an export waits for another."""
 
 
 def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[str] | None = None) -> dict[str, float]:
-    """Writes the run in `source` for another program.
+    """Export the run in `source` for another program; warn if its verdict is "failed".
 
     Args:
         source: folder that `vggtgeo run` or `Result.save` wrote.
         to: one of `FORMATS`.
-        target: folder, made where it does not exist; by default `export/` and the format's name, in `source`.
+        target: folder, created if it does not exist; by default `export/FORMAT` in `source`.
 
     Returns:
-        What was written: counts, and for COLMAP the mean over the points of each one's mean reprojection error, pixels.
-        An InputWarning says of a run whose verdict is "failed" why it is.
+        Counts, and for COLMAP the mean over points of each point's mean reprojection error, pixels.
 
     Raises:
-        InputError: an unknown format, no run in `source`, or files of it that are damaged, the run has no points or no
-            surfaces for this format, `target` is the run itself, or has files in the way that no export wrote, or a
-            package is not installed.
+        InputError: the format is unknown; `source` contains no run, or damaged files; the run has no points or mesh for
+            this format; `target` is the run itself, or has other files under the same names; or a package is missing.
 
     """
     place = path_of("source", source)
-    if to not in tuple(FORMATS):  # a list has no hash
-        raise InputError(f"`to` is {to!r}; it must be one of {', '.join(FORMATS)}")
+    if to not in tuple(FORMATS):  # `to` may be unhashable
+        raise InputError(f"`to` must be one of {', '.join(FORMATS)}, got {to!r}")
     check_is_run(place)
     output = path_of("target", target) if target is not None else place / "export" / to
     _check_target(output, place)
     verdict = read_summary(place)[1]
     failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""
     try:
-        with _staged(output) as stage:  # what is there already stays until all is written
+        with _staged(output) as stage:  # existing files stay until all new ones are complete
             written = FORMATS[to](place, stage)
             names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
-            with _in_turn(output):
-                _claim(output, names, ours=whole_path(output) == whole_path(place / "export" / to))
+            with _locked(output):
+                _record(output, names, ours=whole_path(output) == whole_path(place / "export" / to))
                 for name in names:
                     (output / name).parent.mkdir(parents=True, exist_ok=True)
                     (stage / name).replace(output / name)
@@ -88,16 +106,15 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
 
 @contextmanager
 def _staged(output: Path) -> Iterator[Path]:
-    """A folder in `output` for the files of an export, which is gone afterwards, as are folders that were made for it
-    and stayed empty. InputError where it cannot be written.
-    """
+    """A temporary folder in `output` for the files of an export; new folders that stay empty are removed as well."""
     made = [folder for folder in (output, *output.parents) if not folder.exists()]
     try:
         stage = _new_stage(output)
         try:
             yield stage
         except OSError as error:
-            if error.filename is not None and Path(error.filename).is_relative_to(stage):  # which will be gone
+            # Name the output in the error: the stage does not exist afterwards.
+            if error.filename is not None and Path(error.filename).is_relative_to(stage):
                 raise not_written(output, error) from None
             raise
         finally:
@@ -117,17 +134,15 @@ def _new_stage(output: Path) -> Path:
 
 
 @contextmanager
-def _in_turn(output: Path) -> Iterator[None]:
-    """Waits while another export puts its files into the folder, so that they are not mixed: a moment, as all of them
-    are written by then. InputError where it does not end.
-    """
-    with ExitStack() as holding:
-        for turn in range(_TURNS + 1):
+def _locked(output: Path) -> Iterator[None]:
+    """Lock the folder against other exports, which hold it for a moment only; raise InputError after a timeout."""
+    with ExitStack() as lock:
+        for attempt in range(_TRIES + 1):
             try:
-                holding.enter_context(locked(output / _LOCK))
+                lock.enter_context(locked(output / _LOCK))
                 break
             except LockedError as error:
-                if turn == _TURNS:
+                if attempt == _TRIES:
                     raise InputError(
                         f"`{output}` is in use by another export ({error}); give another folder with `-o`"
                     ) from None
@@ -138,7 +153,7 @@ def _in_turn(output: Path) -> Iterator[None]:
 
 
 def _check_target(output: Path, run: Path) -> None:
-    """InputError where the files of an export would lie among those of the run, or in no folder."""
+    """Raise InputError if the export would mix with the run's own files or a recording, or `output` is a file."""
     if whole_path(output) == whole_path(run):
         raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
     if output.is_dir() and not (output / _RECORD).is_file() and _is_recording(output):
@@ -148,40 +163,40 @@ def _check_target(output: Path, run: Path) -> None:
             raise InputError(f"`{output}` is in `{run / name}`, which is the run's own; give another for the export")
     for folder in (output, *output.parents):
         if os.path.lexists(folder) and not folder.is_dir():
-            raise InputError(f"`{folder}` is no folder; give a new one for the export with `-o`")
+            raise InputError(f"`{folder}` is not a folder; give a new one for the export with `-o`")
 
 
 def _is_recording(folder: Path) -> bool:
-    """Whether it has the layout of one; pictures alone may be anything."""
+    """Whether the folder has the layout of a dataset, other than plain images."""
     return any(reader.matches(folder) for name, reader in FOLDER_KINDS.items() if name != "images")
 
 
-def _claim(output: Path, names: list[str], ours: bool) -> None:
-    """Notes the files that an export writes into a folder; InputError where one is there that no export wrote.
+def _record(output: Path, names: list[str], ours: bool) -> None:
+    """Record the files of an export; raise InputError if one exists that no export wrote.
 
-    ours: whether the folder is of exports alone.
+    ours: whether the folder is for exports only.
     """
     record = output / _RECORD
     try:
         known = set(whole_text(record, errors="strict").splitlines())
     except (OSError, UnicodeDecodeError):
         known = set()
-    strange = [name for name in names if name not in known and os.path.lexists(output / name)]
-    if strange and not ours:
+    foreign = [name for name in names if name not in known and os.path.lexists(output / name)]
+    if foreign and not ours:
         raise InputError(
-            f"`{output / strange[0]}` is there and was not written by an export, which would replace it; give a new "
+            f"`{output / foreign[0]}` exists and was not written by an export, which would replace it; give a new "
             "folder with `-o`"
         )
-    if not ours and (image := _another_image(output, names, known)):
+    if not ours and (image := _foreign_image(output, names, known)):
         raise InputError(
-            f"`{image}` is an image that no export wrote, and those of the export would lie among such: is `{output}` "
-            "a recording? Give a new folder with `-o`"
+            f"`{image}` is an image that no export wrote, and the export would add images beside it: is `{output}` a "
+            "recording? Give a new folder with `-o`"
         )
     write_text(record, "\n".join(sorted({*known, *names})) + "\n")
 
 
-def _another_image(output: Path, names: list[str], known: Collection[str]) -> Path | None:
-    """An image of somebody else in a folder that images are written into."""
+def _foreign_image(output: Path, names: list[str], known: Collection[str]) -> Path | None:
+    """An image that no export wrote, in a folder to which images are exported."""
     for folder in sorted({(output / name).parent for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES}):
         for path in image_files(folder) if folder.is_dir() else ():
             if path.relative_to(output).as_posix() not in known:

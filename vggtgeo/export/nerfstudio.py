@@ -1,7 +1,7 @@
-"""`transforms.json` with pictures, depth and points, as nerfstudio and its relatives read it.
+"""Export as `transforms.json` with images, depth and points, for nerfstudio and compatible programs.
 
 Poses are camera -> world with OpenGL's axes (x right, y up, z backward); pixel (0, 0) is the corner of the top-left
-pixel. Depth images hold thousandths of the unit in 16 bit, 0 = none (nerfstudio's own default).
+pixel. Depth images are 16 bit, in thousandths of the unit, 0 = unknown (nerfstudio's default).
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 
 from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.export.contents import cloud_of, scene_of
-from vggtgeo.export.pictures import copy_pictures, picture_mask
+from vggtgeo.export.contents import cloud_of, copy_pictures, picture_mask, scene_of
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_path, write_json
@@ -26,9 +25,8 @@ MILLI = 1000.0
 
 
 def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
-    """`transforms.json`, `images/`, `depth/` (where the run saved it) and `points.ply`, below `target`; and `mask.png`
-    where undistorted pictures have borders that no pixel fills: what is black is not trained on. Depth that is not
-    known is 0, and needs no mask.
+    """Write `transforms.json`, `images/`, `depth/` (if the run saved it) and `points.ply` below `target`; also
+    `mask.png` if the undistorted images have invalid borders: black pixels are not used for training.
     """
     scene, cloud = scene_of(source), cloud_of(source)
     poses = rigid.invert(scene.poses) @ FROM_OPENGL
@@ -48,7 +46,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
             deep += 1
         frames.append(frame)
     if not deep:
-        text = f"`{source}` has no `depth/`, so there is none in the export; run again with `--save-depth` to have it"
+        text = f"`{source / 'depth'}` does not exist, the export has no depth; run again with `--save-depth`"
         warnings.warn(text, InputWarning, stacklevel=3)
     cloud.save_ply(target / "points.ply")
     fx, fy, cx, cy = (float(value) for value in scene.intrinsics)
@@ -59,12 +57,12 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
 
 
 def _depth(file: Path, size: tuple[int, int], target: Path, name: str) -> str:
-    """Writes the depth of one picture of `size` (width, height) in nerfstudio's units, and returns its name."""
+    """Write the depth of one image of `size` (width, height) in nerfstudio's units; return its name."""
     counts = read_codes(file)
     if counts.shape != size[::-1] or counts.dtype != np.uint16:
         raise InputError(
-            f"`{file}` is {counts.dtype} of shape {counts.shape}; expected depth of {size[0]} x {size[1]} pixels in 16 "
-            "bits, as `vggtgeo run --save-depth` writes it"
+            f"`{file}` must be depth of {size[0]} x {size[1]} pixels in 16 bits, as of `vggtgeo run --save-depth`, got "
+            f"{counts.dtype} of shape {counts.shape}"
         )
     write_picture(target / name, np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16))
     return name

@@ -1,4 +1,15 @@
-"""Clouds and meshes: PLY, GLB (glTF), LAS."""
+"""Clouds and meshes: PLY, GLB (glTF), LAS.
+
+Colours of a run are those of its images: sRGB (IEC 61966-2-1), 8 bits. Each format has its own colour space:
+
+| format | colour space by its specification | written |
+|---|---|---|
+| glTF, `COLOR_0` | linear factors (glTF 2.0, 3.9.2); 8 bits of that lose dark tones | linear, 16 bits |
+| PLY; points of nerfstudio | none; readers show the bytes as sRGB | sRGB, 8 bits |
+| LAS | image channels of 16 bits (LAS 1.4, 2.6.8), shown as sRGB | sRGB, 16 bits |
+| COLMAP | the bytes of the images | sRGB, 8 bits |
+| Rerun | sRGB (`rerun.components.Color`) | sRGB, 8 bits |
+"""
 
 from __future__ import annotations
 
@@ -7,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8, UInt16
 
-from vggtgeo.export.colours import FULL_SCALE, linear_16_bits, srgb_16_bits
 from vggtgeo.export.contents import cloud_of, mesh_of
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
@@ -17,15 +28,18 @@ from vggtgeo.models.extras import install_hint
 UPRIGHT = np.array([1.0, -1.0, -1.0])
 """From y down, z forward (the first camera's axes) to glTF's y up, z backward."""
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""From the same to z up, y forward, as surveying has it."""
+"""From the same axes to z up, y forward, as in surveying."""
 LAS_UNIT = 1e-3
-_OWN = "_color"
-"""Name of an attribute that is the program's own, by its first letter."""
+_CUSTOM_ATTRIBUTE = "_color"
+"""Names of custom attributes of glTF begin with an underscore."""
 _LAS_COUNTS = 2**31 - 1
+FULL_SCALE = 65535
+_LINEAR_BELOW, _SLOPE, _OFFSET, _GAMMA = 0.04045, 12.92, 0.055, 2.4
+"""Of the transfer function of sRGB."""
 
 
 def write_ply(source: Path, target: Path) -> dict[str, float]:
-    """`cloud.ply`, and `mesh.ply` where the run has a mesh."""
+    """Write `cloud.ply`, and `mesh.ply` if the run has a mesh."""
     cloud = cloud_of(source)
     cloud.save_ply(target / "cloud.ply")
     if not (source / "mesh.ply").is_file():
@@ -36,35 +50,35 @@ def write_ply(source: Path, target: Path) -> dict[str, float]:
 
 
 def write_glb(source: Path, target: Path) -> dict[str, float]:
-    """`map.glb`: the mesh; the first camera's down is down."""
+    """Write the mesh as `map.glb`; down is that of the first camera."""
     trimesh = _package("trimesh")
     mesh = mesh_of(source)
-    # Without a material glTF means metal, which is dark where nothing is around it to reflect.
+    # The default material of glTF is metallic, which is dark without an environment to reflect.
     matte = trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
     shape = trimesh.Trimesh(mesh.vertices * UPRIGHT, mesh.faces, vertex_normals=mesh.normals * UPRIGHT, process=False)
     shape.visual = trimesh.visual.TextureVisuals(material=matte)
     opaque = np.full(len(mesh.colours), FULL_SCALE, np.uint16)
-    shape.vertex_attributes[_OWN] = np.column_stack([linear_16_bits(mesh.colours), opaque])
+    shape.vertex_attributes[_CUSTOM_ATTRIBUTE] = np.column_stack([linear_16_bits(mesh.colours), opaque])
     with atomic_path(target / "map.glb") as temporary:
         temporary.write_bytes(trimesh.Scene(shape).export(file_type="glb", tree_postprocessor=_as_colours))
     return {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
 
 
 def _as_colours(tree: dict[str, Any]) -> None:
-    """Names the attribute of 16 bits as glTF does: trimesh itself writes colours of 8 bits only."""
+    """Rename the attribute of 16 bits to glTF's: trimesh itself writes colours of 8 bits only."""
     attributes = tree["meshes"][0]["primitives"][0]["attributes"]
-    attributes["COLOR_0"] = attributes.pop(_OWN)
+    attributes["COLOR_0"] = attributes.pop(_CUSTOM_ATTRIBUTE)
     tree["accessors"][attributes["COLOR_0"]]["normalized"] = True
 
 
 def write_las(source: Path, target: Path) -> dict[str, float]:
-    """`map.las`, version 1.4, point format 7: places to a millimetre, 16-bit colours; the first camera's up is z."""
+    """Write `map.las`, version 1.4, point format 7: millimetres, 16-bit colours, z is the first camera's up."""
     laspy = _package("laspy")
     cloud = cloud_of(source)
     points = cloud.points.astype(np.float64) @ Z_UP.T
     if np.ptp(points, axis=0).max() >= LAS_UNIT * _LAS_COUNTS:
         raise InputError(
-            f"`{source / 'map.ply'}` is {np.ptp(points, axis=0).max():.3g} m across; LAS in millimetres holds "
+            f"`{source / 'map.ply'}` is {np.ptp(points, axis=0).max():.3g} m across; LAS in millimetres is limited to "
             f"{LAS_UNIT * _LAS_COUNTS:.0f} m: export it with `--to ply`"
         )
     header = laspy.LasHeader(point_format=7, version="1.4")
@@ -80,8 +94,20 @@ def write_las(source: Path, target: Path) -> dict[str, float]:
 
 
 def _package(name: str) -> Any:
-    """An optional package; InputError, which says how to get it, where it is not installed."""
+    """Import an optional package; raise InputError with the command to install it."""
     try:
         return importlib.import_module(name)
     except ImportError:
         raise InputError(f"this export needs the package `{name}`; {install_hint('maps')}") from None
+
+
+def srgb_16_bits(colours: UInt8[np.ndarray, "n 3"]) -> UInt16[np.ndarray, "n 3"]:
+    """Return sRGB colours in 16 bits, for LAS."""
+    return colours.astype(np.uint16) * (FULL_SCALE // 255)
+
+
+def linear_16_bits(colours: UInt8[np.ndarray, "n 3"]) -> UInt16[np.ndarray, "n 3"]:
+    """Return the linear light of sRGB colours, `FULL_SCALE` for 1, for glTF."""
+    codes = np.arange(256) / 255.0
+    linear = np.where(codes <= _LINEAR_BELOW, codes / _SLOPE, ((codes + _OFFSET) / (1.0 + _OFFSET)) ** _GAMMA)
+    return np.rint(FULL_SCALE * linear).astype(np.uint16)[colours]

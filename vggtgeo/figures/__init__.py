@@ -1,1 +1,1 @@
-"""Pictures of results (matplotlib)."""
+"""Figures of results (matplotlib)."""

@@ -1,35 +1,38 @@
-"""Pictures of a point cloud: points splatted into an image, nearest first, for pages and notebooks without a viewer."""
+"""Images of a point cloud, rendered by splatting, for reports and notebooks."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from vggtgeo.figures.plots import view_axes
+from vggtgeo.figures.plots import NotebookFigure, trajectory_figure, view_axes
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 
 BACKGROUND = (246, 246, 244)
 _PATH, _START = (31, 95, 191), (224, 123, 26)
 _HEADROOM = 0.15
-"""Metres above the highest camera that the view from above keeps: what is higher is ceiling."""
+"""Metres above the highest camera in the view from above: higher points are ceiling."""
 _POINT = 0.024
-"""Metres: how large a point is drawn, a little more than the map's cells so that surfaces close."""
-_LARGEST = 12
-"""Pixels."""
+"""Size of a point, metres: a little more than a voxel of the map, so that surfaces have no holes."""
+_MAX_SIZE = 12
+"""Of a point, pixels."""
 _STEP_BACK = 1.2
-"""Metres behind the camera."""
+"""Distance of the viewpoint behind the camera, metres."""
 _LENS = 0.9
 """Focal length of the walk-in view, in image widths."""
+_MAP_HEIGHT = 3.6
+"""Of the two views of the map below the trajectory, inches."""
 
 
 def from_above(cloud: PointCloud, trajectory: Trajectory, width: int = 900) -> UInt8[np.ndarray, "h w 3"]:
-    """The map without its ceiling, orthographic from above, the path drawn over it; the longest extent lies along x.
+    """Render the map without ceiling, orthographic from above, with the path; the longest extent is along x.
 
     Args:
         cloud: world frame, metres.
-        trajectory: camera -> world, the same frame; says where up is.
+        trajectory: camera -> world, same frame; defines up.
         width: pixels; the height is three quarters of it.
 
     """
@@ -37,19 +40,19 @@ def from_above(cloud: PointCloud, trajectory: Trajectory, width: int = 900) -> U
     points, path = cloud.points @ axes.T, trajectory.positions @ axes.T
     kept = points[:, 2] < path[:, 2].max() + _HEADROOM
     if not kept.any():
-        kept[:] = True  # false depth may put the whole map overhead: that is to be seen, then
+        kept[:] = True  # wrong depth may put the whole map above the cameras: show it anyway
     points, colours = points[kept], cloud.colours[kept]
     low, high = _extent(points[:, :2], path[:, :2])
     height = width * 3 // 4
     scale = float(np.min(np.array([width, height]) / (high - low)))
     middle = 0.5 * (low + high)
-    place = lambda p: np.array([0.5 * width, 0.5 * height]) + scale * (p[:, :2] - middle) * np.array([1.0, -1.0])
+    project = lambda p: np.array([0.5 * width, 0.5 * height]) + scale * (p[:, :2] - middle) * np.array([1.0, -1.0])
     sizes = np.full(len(points), scale * _POINT)
-    return _with_path(_splat(place(points), -points[:, 2], colours, (height, width), sizes), place(path))
+    return _with_path(_splat(project(points), -points[:, 2], colours, (height, width), sizes), project(path))
 
 
 def walk_in(cloud: PointCloud, trajectory: Trajectory, width: int = 900) -> UInt8[np.ndarray, "h w 3"]:
-    """The map in perspective, from a place behind and above the camera in the middle of the path, looking its way."""
+    """Render the map in perspective, from behind and above the camera in the middle of the path."""
     height = width * 3 // 4
     camera = trajectory.poses[len(trajectory) // 2]
     up, ahead = view_axes(trajectory)[2], camera[:3, 2]
@@ -66,8 +69,31 @@ def walk_in(cloud: PointCloud, trajectory: Trajectory, width: int = 900) -> UInt
     return _splat(place, local[:, 2], colours, (height, width), focal * _POINT / local[:, 2])
 
 
+def result_figure(
+    trajectory: Trajectory, keyframes: Trajectory, cloud: PointCloud, metric: bool, truth: Trajectory | None = None
+) -> NotebookFigure:
+    """Draw the trajectory from above and from the side, and the map in perspective and from above."""
+    figure = trajectory_figure(trajectory, truth, keyframes, not metric, title="", width=9.0)
+    if not len(cloud):
+        return figure
+    width, height = figure.get_size_inches()
+    whole = NotebookFigure(figsize=(width, height + _MAP_HEIGHT))
+    FigureCanvasAgg(whole)
+    above, below = whole.subplots(2, 1, height_ratios=[height, _MAP_HEIGHT])
+    figure.set_dpi(150)
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    canvas.draw()
+    views = [view(cloud, trajectory, 700) for view in (walk_in, from_above)]
+    for axes, picture in ((above, np.asarray(canvas.buffer_rgba())), (below, np.concatenate(views, axis=1))):
+        axes.imshow(picture)
+        axes.axis("off")
+    whole.subplots_adjust(0, 0, 1, 1, 0, 0.01)
+    return whole
+
+
 def _along_the_extent(axes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The level frame `axes`, turned about up so that the points' longest horizontal extent is its first row."""
+    """Rotate the level frame `axes` about up so that its first row is the longest horizontal extent of the points."""
     flat = points @ axes[:2].T
     along = np.linalg.eigh(np.cov(flat.T))[1][:, 1] @ axes[:2]
     along = along if along @ axes[0] >= 0 else -along
@@ -75,7 +101,7 @@ def _along_the_extent(axes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _extent(points: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around the path and all but the farthest half per cent of the points, with a margin."""
+    """Corners of a box around the path and the points without outliers (0.5 % at each end), with a margin."""
     low = np.minimum(np.quantile(points, 0.005, axis=0), path.min(axis=0))
     high = np.maximum(np.quantile(points, 0.995, axis=0), path.max(axis=0))
     margin = 0.03 * (high - low).max() + 0.05
@@ -85,14 +111,14 @@ def _extent(points: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _splat(
     place: np.ndarray, distance: np.ndarray, colours: np.ndarray, shape: tuple[int, int], sizes: np.ndarray
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Squares of `sizes` pixels, the nearest on top."""
+    """Draw squares of `sizes` pixels, the nearest on top."""
     height, width = shape
-    nearest = np.full(height * width, -1)  # of each pixel, by its place in the order from the farthest point on
-    sizes = np.clip(np.ceil(sizes), 1, _LARGEST).astype(int)
+    nearest = np.full(height * width, -1)  # index of each pixel's point in the order from far to near
+    sizes = np.clip(np.ceil(sizes), 1, _MAX_SIZE).astype(int)
     order = np.argsort(-distance, kind="stable")
     place, colours, sizes = place[order], colours[order], sizes[order]
     corner = np.floor(place - 0.5 * (sizes - 1)[:, None]).astype(int)
-    for down, right in np.ndindex(_LARGEST, _LARGEST):
+    for down, right in np.ndindex(_MAX_SIZE, _MAX_SIZE):
         x, y = corner[:, 0] + right, corner[:, 1] + down
         number = np.flatnonzero((sizes > max(down, right)) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
         at = y[number] * width + x[number]

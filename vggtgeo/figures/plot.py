@@ -1,4 +1,4 @@
-"""`plot`: one function that draws any value of the library."""
+"""`plot`: draw any value of the library."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from vggtgeo.io.given import check_kind, check_positive, real_array
 
 @singledispatch
 def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
-    """A figure of a value, which a notebook shows as it is; `savefig` writes it. Outside `jit`, for one problem.
+    """Return a figure of a value; a notebook displays it, `savefig` writes it. Not for traced or batched values.
 
     Args:
         value: one of
 
             - `Trajectory`: from above and from the side. Options: `truth` (a trajectory), drawn beside it after SE(3)
               alignment, or Sim(3) `with_scale=True`.
-            - `Result` of a run: the same, and the map from inside and from above. Options: `truth`.
-            - what `evaluate` returns: a histogram of the errors after either alignment.
+            - `Result`: the same, and the map from inside and from above. Options: `truth`.
+            - `TrajectoryReport` of `evaluate`: histograms of the errors after each alignment.
             - `Solution`: the energy by iteration.
-            - `Covariances`: the camera centres from above with an ellipse each. Takes the `state` that they belong to.
-              Options: `truth`, camera centres [n, 3] in the world; `sigmas`, by default as many as can be seen well.
-            - `Observability`: the eigenvalues, and what would be lost without each kind of observation.
+            - `Covariances`: the camera centres from above with ellipses. Takes the `state` that they belong to.
+              Options: `truth`, camera centres [n, 3] in the world; `sigmas`, by default chosen to be visible.
+            - `Observability`: the eigenvalues, and the information lost without each kind of observation.
             - `BenchReport`: the error of every run, by scene and variant.
-        args: of the value's kind.
-        options: of the value's kind.
+        args: as above.
+        options: as above.
 
     Raises:
-        InputError: there is no picture of such a value.
+        InputError: a value of another type, or an invalid option.
 
     Example (of `solve`'s):
         >>> vg.plot(solution).axes[0].get_ylabel()
@@ -49,13 +49,13 @@ def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
 
     """
     known = sorted(kind.__name__ for kind in plot.registry if kind is not object)
-    raise InputError(f"`plot` has no picture of a `{type(value).__name__}`; it draws {', '.join(known)}")
+    raise InputError(f"`value` must be one of {', '.join(known)}, got `{type(value).__name__}`")
 
 
 def check_single(values: Any, axes: int) -> None:
-    """InputError for a batch, which has no one picture."""
+    """Raise InputError for a batch."""
     if np.ndim(values) != axes:
-        raise InputError("`value` is a batch; give one of it: `jax.tree.map(lambda leaf: leaf[0], value)` is the first")
+        raise InputError("`value` is a batch; plot one of it: `jax.tree.map(lambda leaf: leaf[0], value)` is the first")
 
 
 @plot.register(Trajectory)
@@ -65,7 +65,7 @@ def _trajectory(value: Trajectory, truth: Trajectory | None = None, *, with_scal
 
 
 def check_truth(value: Trajectory, truth: Trajectory | None) -> None:
-    """InputError unless it is a trajectory of the same times: another one could not be drawn beside `value`."""
+    """Raise InputError unless `truth` is a trajectory with matching times."""
     if truth is not None:
         check_kind("truth", truth, Trajectory, "a `vggtgeo.Trajectory`")
         associate(value, truth)
@@ -88,12 +88,12 @@ def _covariances(
     value: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, *, sigmas: float | None = None
 ) -> NotebookFigure:
     check_single(value.poses, 3)
-    check_kind("state", state, State, "a `State`, such as `solution.state`")
+    check_kind("state", state, State, "a `State`, for example `solution.state`")
     keyframes = len(value.poses)
     if np.shape(state.poses.wxyz_xyz) != (keyframes, 7):
         raise InputError(
-            f"`state` has poses of the shape {np.shape(state.poses.wxyz_xyz)}, the covariances {keyframes} keyframes; "
-            "give the state that they are of, and covariances of all its keyframes"
+            f"`state` has poses of shape {np.shape(state.poses.wxyz_xyz)}, expected {keyframes} keyframes as the "
+            "covariances; pass the state and the covariances of one solution"
         )
     check_finite(state)
     if truth is not None:

@@ -1,10 +1,9 @@
-"""The picture of a trajectory: seen from above and from the side, the truth beside it where it is known.
+"""Figures of a trajectory from above and from the side, with the ground truth; of errors; of the energy.
 
-The frame of a reconstruction is arbitrary, so the views are found from the cameras themselves: people hold them
-without roll, so up is the direction that is most nearly at right angles to all image rows. A camera that hardly turns
-leaves open how far it looks down: then up is the axis of the truth's world that is nearest to the mean up of the
-images, or, without a truth, that mean itself, and the picture says so: a level flight with a camera that looks down
-rises in it. The longest horizontal extent lies along the x axis.
+The frame of a reconstruction is arbitrary, so up is estimated from the cameras: hand-held cameras have little roll, so
+up is the direction most nearly orthogonal to all image rows. If the camera hardly rotates, its pitch is unknown. Then
+up is the axis of the ground truth's world nearest to the mean up of the images; without ground truth it is that mean
+itself, and the figure's title says so. The longest horizontal extent is along the x axis.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ _ESTIMATE, _TRUTH, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
 _WIDTH = 11.0
 """Inches."""
 _WEIGHT_OF_MEAN_UP = 0.02
-_LEAST_TURN = 0.05
-"""Mean square of the image rows along their second direction from which turns tell what is up: 13 degrees RMS of yaw.
-Below, the mean up of the images, by its weight, has more than a third of the word."""
-_LEAST_EXTENT = 0.1
-"""Metres: how much the picture of a still camera shows."""
+_MIN_YAW = 0.05
+"""Second eigenvalue of the image rows' scatter above which rotations define up: 13 degrees RMS of yaw. Below, the mean
+up of the images has more than a third of the weight."""
+_MIN_EXTENT = 0.1
+"""Metres: extent of the figure of a still camera."""
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows, whether or not it has started matplotlib's own machinery."""
+    """A figure that a notebook displays, with or without pyplot."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -45,8 +44,8 @@ class NotebookFigure(Figure):
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
-    """What is drawn: the estimate carried to the truth's frame, the truth, and the error that is left."""
+class _Aligned:
+    """The estimate aligned to the ground truth, the ground truth, and the error that is left."""
 
     estimate: Trajectory
     keyframes: Float[np.ndarray, "k 3"]
@@ -63,12 +62,11 @@ def plot_trajectory(
     title: str = "",
     metres: bool = True,
 ) -> None:
-    """Writes a PNG with the top and side view of `estimate`, metres, equal axes; atomically.
+    """Write a PNG with the top and side view of `estimate`, with equal axes, atomically.
 
-    With `truth`, the estimate is first aligned to it, SE(3), or Sim(3) `with_scale` or where the truth has another unit
-    than `metres`, and the title tells the ATE over the poses that match in time; where too few match, the truth is left
-    out. `keyframes` are marked. The result of a reconstruction without scale and without truth has no unit. InputError
-    for an empty estimate.
+    With `truth`, the estimate is aligned to it by SE(3), or by Sim(3) if `with_scale` or the ground truth is not in
+    `metres`, and the title has the ATE of the poses that match in time; if too few match, `truth` is left out.
+    `keyframes` are marked. InputError for an empty estimate.
     """
     figure = trajectory_figure(estimate, truth, keyframes, with_scale, title, metres=metres)
     with atomic_path(path) as temporary:
@@ -84,7 +82,7 @@ def trajectory_figure(
     width: float = _WIDTH,
     metres: bool = True,
 ) -> NotebookFigure:
-    """The same as a figure, `width` inches wide; without a title where `title` is None."""
+    """Return the figure of `plot_trajectory`, `width` inches wide; without a title if `title` is None."""
     if len(estimate) == 0:
         raise InputError("`estimate` has no pose; there is nothing to draw")
     drawn = _align(estimate, truth, keyframes, with_scale or not metres)
@@ -95,40 +93,41 @@ def trajectory_figure(
         view_axes(seen, level_world=drawn.truth is not None),
         "m" if in_metres else "unit of the truth" if drawn.error else "no unit",
         width,
-        "seen from the side" + ("" if drawn.truth or _turns(seen) else "; up is that of the images"),
+        "seen from the side" + ("" if drawn.truth or _yaws(seen) else "; up is that of the images"),
     )
     if title is not None:
         figure.suptitle(_title(drawn, title, with_scale, metres), x=0.01, ha="left", fontsize=12, color=_INK)
     return figure
 
 
-def _align(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory | None, with_scale: bool) -> _Drawn:
+def _align(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory | None, with_scale: bool) -> _Aligned:
     places = np.zeros((0, 3)) if keyframes is None else keyframes.positions
     if truth is None:
-        return _Drawn(estimate, places, None, None)
+        return _Aligned(estimate, places, None, None)
     try:
         error = absolute_error(*associate(estimate, truth), "sim3" if with_scale else "se3")
     except InputError:
-        return _Drawn(estimate, places, None, None)
+        return _Aligned(estimate, places, None, None)
     alignment = error.alignment
     inside = (truth.timestamps >= estimate.timestamps[0]) & (truth.timestamps <= estimate.timestamps[-1])
-    return _Drawn(alignment.trajectory(estimate), alignment.points(places), truth.select(inside), error)
+    return _Aligned(alignment.trajectory(estimate), alignment.points(places), truth.select(inside), error)
 
 
 def view_axes(trajectory: Trajectory, level_world: bool = False) -> Float[np.ndarray, "3 3"]:
-    """A level frame for looking at `trajectory`, found from its cameras: rows are the longest horizontal direction, the
-    other horizontal one, and up; right-handed. level_world: an axis of the world is vertical, as in benchmarks; used
-    where the cameras turn too little to tell.
+    """Return a level frame, estimated from the cameras: rows are the longest horizontal direction, the other horizontal
+    one, and up; right-handed.
+
+    level_world: whether an axis of the world is vertical, as in benchmarks; used if the cameras rotate too little.
     """
     up = _up(trajectory)
-    if level_world and not _turns(trajectory):
+    if level_world and not _yaws(trajectory):
         axis = np.argmax(np.abs(up))
         up = np.sign(up[axis]) * np.eye(3)[axis]
     centred = trajectory.positions - trajectory.positions.mean(axis=0)
     horizontal = centred - np.outer(centred @ up, up)
     along = np.linalg.svd(horizontal, full_matrices=True)[2][0] if len(trajectory) > 1 else np.zeros(3)
     along = along - (along @ up) * up
-    if np.linalg.norm(along) < 0.1:  # no motion but up and down: any horizontal direction will do
+    if np.linalg.norm(along) < 0.1:  # vertical motion only: any horizontal direction
         along = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     along /= np.linalg.norm(along)
     if (trajectory.positions[-1] - trajectory.positions[0]) @ along < 0:
@@ -136,10 +135,10 @@ def view_axes(trajectory: Trajectory, level_world: bool = False) -> Float[np.nda
     return np.stack([along, np.cross(up, along), up])
 
 
-def _turns(trajectory: Trajectory) -> bool:
-    """Whether the cameras turn enough for their image rows to lie in one plane only, the horizontal one."""
+def _yaws(trajectory: Trajectory) -> bool:
+    """Whether the cameras rotate enough for their image rows to span the horizontal plane."""
     rows = trajectory.rotations[:, :, 0]
-    return bool(np.linalg.eigvalsh(rows.T @ rows / len(rows))[1] > _LEAST_TURN)
+    return bool(np.linalg.eigvalsh(rows.T @ rows / len(rows))[1] > _MIN_YAW)
 
 
 def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
@@ -149,12 +148,12 @@ def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
     return up if up @ mean_up >= 0 else -up
 
 
-def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float, side_title: str) -> NotebookFigure:
+def _draw(drawn: _Aligned, axes_of_view: np.ndarray, unit: str, width: float, side_title: str) -> NotebookFigure:
     origin = (drawn.truth or drawn.estimate).positions[0]
     everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
     points = (np.concatenate(everything) - origin) @ axes_of_view.T
     low, high = points.min(axis=0), points.max(axis=0)
-    span = max(float((high - low).max()), _LEAST_EXTENT)
+    span = max(float((high - low).max()), _MIN_EXTENT)
     extent = np.maximum(high - low, 0.15 * span)
     low, high = 0.5 * (low + high) - 0.56 * extent, 0.5 * (low + high) + 0.56 * extent
     heights = high - low
@@ -174,7 +173,7 @@ def _draw(drawn: _Drawn, axes_of_view: np.ndarray, unit: str, width: float, side
     return figure
 
 
-def _draw_view(axes: Any, drawn: _Drawn, origin: np.ndarray, rows: np.ndarray) -> None:
+def _draw_view(axes: Any, drawn: _Aligned, origin: np.ndarray, rows: np.ndarray) -> None:
     def flat(points: np.ndarray) -> np.ndarray:
         return rows @ (points - origin).T
 
@@ -194,7 +193,7 @@ def _draw_view(axes: Any, drawn: _Drawn, origin: np.ndarray, rows: np.ndarray) -
         spine.set_color("#bbbbbb")
 
 
-def _title(drawn: _Drawn, title: str, with_scale: bool, metres: bool) -> str:
+def _title(drawn: _Aligned, title: str, with_scale: bool, metres: bool) -> str:
     if drawn.error is None:
         facts = f"{len(drawn.estimate)} pose{'s' if len(drawn.estimate) > 1 else ''}, no truth"
         if not with_scale:
@@ -208,7 +207,7 @@ def _title(drawn: _Drawn, title: str, with_scale: bool, metres: bool) -> str:
 
 
 def errors_figure(report: TrajectoryReport) -> NotebookFigure:
-    """Histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
+    """Draw histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
     figure = NotebookFigure(figsize=(6.0, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -224,7 +223,7 @@ def errors_figure(report: TrajectoryReport) -> NotebookFigure:
 
 
 def energy_figure(history: np.ndarray, message: str) -> NotebookFigure:
-    """Energy before the first and after each iteration, logarithmic; `history` [h] without NaN."""
+    """Draw the energy before the first and after each iteration, logarithmic; `history` [h] without NaN."""
     figure = NotebookFigure(figsize=(5.0, 3.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()

@@ -1,4 +1,4 @@
-"""Figures of what a problem determines: ellipses of the camera centres, and the information by kind of factor."""
+"""Figures of uncertainty and observability: ellipses of the camera centres, information by kind of factor."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.geometry import rigid
 
 COLOURS = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8a8f98", "#8e5fb0", "#b0413e")
-"""Of the terms of a problem, in their order, then from the first again."""
+"""Of the terms of a problem, repeated if there are more."""
 _INK, _GRID = "#333333", "#e3e3e3"
 _FACTORS = (1, 3, 10, 30, 100, 300, 1000)
-"""Standard deviations that the ellipses may reach."""
-_SHARE = 0.2
-"""Of the picture's extent: how long the half axis of the largest ellipse may be."""
+"""Standard deviations to choose from for the ellipses."""
+_MAX_SHARE = 0.2
+"""Largest half axis of an ellipse, as share of the figure's extent."""
 
 
 def covariance_figure(
     found: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, sigmas: float | None = None
 ) -> NotebookFigure:
-    """The camera centres of `state` in the horizontal plane of the first camera, with ellipses of `sigmas` standard
-    deviations (by default as many as can be seen well), and the true centres (world frame) where they are given.
+    """Draw the camera centres of `state` in the horizontal plane of the first camera, with ellipses of `sigmas`
+    standard deviations (by default chosen to be visible), and the true centres (world frame) if given.
     """
     poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
     blocks = np.asarray(found.poses, np.float64)[:, :3, :3]
@@ -40,7 +40,7 @@ def covariance_figure(
     values, vectors = np.linalg.eigh(spread)
     half_axes = np.sqrt(np.maximum(values, 0.0))
     extent = max(float(np.ptp(centres, axis=0).max()), 1e-6)
-    seen = [factor for factor in _FACTORS if factor * half_axes.max() <= _SHARE * extent]
+    seen = [factor for factor in _FACTORS if factor * half_axes.max() <= _MAX_SHARE * extent]
     factor = sigmas if sigmas is not None else (seen or _FACTORS)[-1 if seen else 0]
     figure, axes = _figure(6.5, 4.4)
     for place, sizes, directions in zip(centres, half_axes, vectors, strict=True):
@@ -62,8 +62,8 @@ def covariance_figure(
 
 
 def observability_figure(found: Observability) -> NotebookFigure:
-    """Left: the balanced eigenvalues with all factors and without each kind. Right: the share of the information about
-    each common motion and about the free intrinsics that would be lost without each kind.
+    """Draw, on the left, the balanced eigenvalues with all factors and without each kind; on the right, the share of
+    information about each common motion and the free intrinsics that is lost without each kind.
     """
     figure = NotebookFigure(figsize=(10.0, 3.8), layout="constrained")
     FigureCanvasAgg(figure)

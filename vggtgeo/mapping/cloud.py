@@ -1,4 +1,4 @@
-"""The map: one point cloud of all keyframes."""
+"""The point cloud of a map: dense depth of all keyframes, averaged in voxels."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.threads import map_in_threads
 
 STEP = 3
-"""Pixels between those of a depth map that become points: at 2.5 m and 500 pixels of focal length, 1.5 cm."""
-LEAST_CONFIDENCE = 0.5
-AGREE = 0.04
-"""Largest relative difference of a point's depth from what another keyframe sees there."""
-STEEP = 0.1
-"""Relative difference of depth of pixels `STEP` apart above which they are no one surface and have no normal."""
-TOGETHER = 64
-"""Keyframes whose points are averaged before those of others are made: all points of one take 2 MB."""
+"""Pixels between the sampled ones of a depth map: 1.5 cm at 2.5 m and 500 pixels focal length."""
+MIN_CONFIDENCE = 0.5
+MAX_DIFFERENCE = 0.04
+"""Largest relative difference of depth between a point and a keyframe that confirms it."""
+MAX_STEP = 0.1
+"""Relative difference of depth of neighbouring samples above which they are on different surfaces: no normal."""
+BATCH = 64
+"""Keyframes whose points are averaged at a time: the points of one take 2 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Points, colours, normals (0 = not known), weights, and of how many points of keyframes each is the mean."""
+    """Points, colours, normals (0 = unknown), weights, and number of samples in each mean."""
 
     points: np.ndarray
     colours: np.ndarray
@@ -38,12 +38,12 @@ class _Points:
 
     @classmethod
     def of(cls, points: np.ndarray, colours: np.ndarray, normals: np.ndarray, weight: np.ndarray) -> _Points:
-        """Of single points."""
+        """Return points of one sample each."""
         return cls(points, colours, normals, np.maximum(weight.astype(np.float64), 1e-6), np.ones(len(points)))
 
     @classmethod
     def joined(cls, parts: Sequence[_Points]) -> _Points:
-        """One after the other."""
+        """Concatenate."""
         return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
@@ -54,17 +54,17 @@ def map_points(
     *,
     voxel: float = 0.02,
 ) -> PointCloud:
-    """One coloured cloud of all keyframes, in the world frame, with normals towards the cameras.
+    """Return a coloured cloud of all keyframes, world frame, with normals towards the cameras.
 
-    Where a keyframe has dense depth: every third pixel whose confidence is at least one half and whose depth another
-    keyframe confirms to 4 %; else the adjusted points alone. Points of one cell of `voxel` metres are averaged by their
+    Of a keyframe with dense depth, every third pixel is used if its confidence is at least 0.5 and a neighbouring
+    keyframe confirms its depth to 4 %; of others, the adjusted points. Points in a voxel are averaged, weighted by
     information.
 
     Args:
         keyframes: poses world -> camera.
         intrinsics: float64 [4], pixels.
-        depth_maps: one a keyframe, None where there is none.
-        voxel: edge of a cell, metres.
+        depth_maps: one per keyframe, None if unknown.
+        voxel: edge of a voxel, metres.
 
     """
 
@@ -74,13 +74,13 @@ def map_points(
         around = [j for j in (i - 2, i - 1, i + 1, i + 2) if 0 <= j < len(keyframes) and depth_maps[j] is not None]
         return _dense_points(keyframes, depth_maps, i, around, intrinsics)
 
-    groups = [range(len(keyframes))[first : first + TOGETHER] for first in range(0, len(keyframes), TOGETHER)]
-    # Where there are points of several groups in a cell, their means are averaged once more.
-    means = [_means_in_cells(_Points.joined(map_in_threads(part, group)), voxel) for group in groups]
+    batches = [range(len(keyframes))[first : first + BATCH] for first in range(0, len(keyframes), BATCH)]
+    # A voxel with points of several batches is averaged again below.
+    means = [_voxel_means(_Points.joined(map_in_threads(part, batch)), voxel) for batch in batches]
     if not means or not sum(len(mean.points) for mean in means):
-        nothing = np.zeros((0, 3))
-        return PointCloud(nothing, nothing.astype(np.uint8), np.zeros(0, np.float32), nothing.astype(np.float32))
-    found = means[0] if len(means) == 1 else _means_in_cells(_Points.joined(means), voxel)
+        empty = np.zeros((0, 3))
+        return PointCloud(empty, empty.astype(np.uint8), np.zeros(0, np.float32), empty.astype(np.float32))
+    found = means[0] if len(means) == 1 else _voxel_means(_Points.joined(means), voxel)
     length = np.linalg.norm(found.normals, axis=1, keepdims=True)
     return PointCloud(
         found.points,
@@ -105,10 +105,10 @@ def _dense_points(
     neighbours: Sequence[int],
     intrinsics: np.ndarray,
 ) -> _Points:
-    """Points of keyframe i, those that a neighbour confirms where there is one."""
+    """Points of keyframe i that a neighbour confirms; all of them without neighbours."""
     keyframe, own = keyframes[i], depth_maps[i]
     assert own is not None
-    own = own.opened()
+    own = own.decoded()
     depth = own.depth[STEP // 2 :: STEP, STEP // 2 :: STEP]
     rows, columns = np.mgrid[STEP // 2 : own.depth.shape[0] : STEP, STEP // 2 : own.depth.shape[1] : STEP]
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
@@ -116,12 +116,12 @@ def _dense_points(
         points = rigid.unproject(pixels, 1.0 / depth.reshape(-1).astype(np.float64), keyframe.pose, intrinsics)
     normals = _normals(points.reshape(*depth.shape, 3), depth, rigid.centre(keyframe.pose)).reshape(-1, 3)
     rows, columns = rows.reshape(-1), columns.reshape(-1)
-    good = np.isfinite(points[:, 0]) & (own.confidence[rows, columns] >= LEAST_CONFIDENCE)
+    good = np.isfinite(points[:, 0]) & (own.confidence[rows, columns] >= MIN_CONFIDENCE)
     confirmed = np.zeros(len(points), bool)
     for j in neighbours:
         other = depth_maps[j]
         assert other is not None
-        confirmed[good] |= _agrees(points[good], keyframes[j], other.depth, intrinsics)
+        confirmed[good] |= _confirmed(points[good], keyframes[j], other.depth, intrinsics)
     good &= confirmed if neighbours else True
     rows, columns = rows[good], columns[good]
     sigma = np.maximum(own.sigma[rows, columns] * own.depth[rows, columns], 1e-3).astype(np.float64)
@@ -130,14 +130,14 @@ def _dense_points(
 
 
 def _normals(points: np.ndarray, depth: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Unit normals [h, w, 3] of a grid of points, towards the camera; 0 where the neighbours are of no one surface."""
+    """Unit normals [h, w, 3] of a grid of points, towards the camera; 0 at depth edges."""
     normals = np.zeros_like(points)
     right, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     across = np.cross(down, right)
     length = np.linalg.norm(across, axis=-1)
     with np.errstate(invalid="ignore"):
-        steep = np.maximum(np.abs(depth[1:-1, 2:] - depth[1:-1, :-2]), np.abs(depth[2:, 1:-1] - depth[:-2, 1:-1]))
-        good = (length > 1e-12) & (steep < STEEP * depth[1:-1, 1:-1])
+        step = np.maximum(np.abs(depth[1:-1, 2:] - depth[1:-1, :-2]), np.abs(depth[2:, 1:-1] - depth[:-2, 1:-1]))
+        good = (length > 1e-12) & (step < MAX_STEP * depth[1:-1, 1:-1])
     unit = np.where(good[..., None], across / np.where(good, length, 1.0)[..., None], 0.0)
     with np.errstate(invalid="ignore"):
         behind = (unit * (centre - points[1:-1, 1:-1])).sum(-1) < 0
@@ -145,20 +145,20 @@ def _normals(points: np.ndarray, depth: np.ndarray, centre: np.ndarray) -> np.nd
     return normals
 
 
-def _agrees(points: np.ndarray, keyframe: Keyframe, depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+def _confirmed(points: np.ndarray, keyframe: Keyframe, depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     local = points @ keyframe.pose[:3, :3].T + keyframe.pose[:3, 3]
     inside, rows, columns = pinhole.visible(local, intrinsics, (depth.shape[0], depth.shape[1]))
     z = local[inside, 2]
     with np.errstate(invalid="ignore"):
-        inside[inside] = np.abs(depth[rows, columns] - z) < AGREE * z
+        inside[inside] = np.abs(depth[rows, columns] - z) < MAX_DIFFERENCE * z
     return inside
 
 
-def _means_in_cells(given: _Points, voxel: float) -> _Points:
-    """The mean of each cell, by weight."""
-    cells = np.floor(given.points / voxel).astype(np.int64)
+def _voxel_means(samples: _Points, voxel: float) -> _Points:
+    """Weighted mean of each voxel."""
+    cells = np.floor(samples.points / voxel).astype(np.int64)
     _, group = np.unique(cell_numbers(cells), return_inverse=True)
-    total = np.bincount(group, given.weight)
-    mean = lambda values: np.column_stack([np.bincount(group, given.weight * column) / total for column in values.T])
-    count = np.bincount(group, given.count)
-    return _Points(mean(given.points), mean(given.colours.astype(np.float64)), mean(given.normals), total, count)
+    total = np.bincount(group, samples.weight)
+    mean = lambda values: np.column_stack([np.bincount(group, samples.weight * column) / total for column in values.T])
+    count = np.bincount(group, samples.count)
+    return _Points(mean(samples.points), mean(samples.colours.astype(np.float64)), mean(samples.normals), total, count)

@@ -1,4 +1,4 @@
-"""Several views of one surface: what no other view confirms is dropped, what several do is averaged."""
+"""Multi-view consistency of depth: drop pixels that too few views confirm, average the others."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
 
 SIGMAS = 2.5
-"""Standard deviations by which views of one surface may differ: 99 % of a normal distribution."""
-AGREE = 0.01, 0.03
-"""Relative difference of views that is always, and that is never, allowed for."""
+"""Largest difference of two views of one surface, standard deviations: 99 % of a normal distribution."""
+DIFFERENCE_RANGE = 0.01, 0.03
+"""Bounds of that gate, as relative difference of depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,29 +25,29 @@ class PosedDepth:
     intrinsics: np.ndarray
 
 
-def confirm(own: PosedDepth, others: Sequence[PosedDepth], least: int) -> DepthMap:
-    """The depth map without what fewer than `least` others confirm, the rest averaged by information.
+def confirm(own: PosedDepth, others: Sequence[PosedDepth], min_views: int) -> DepthMap:
+    """Return the depth map where at least `min_views` others confirm it, averaged by information.
 
-    A view confirms a pixel if its own depth, where it sees the pixel's point, is the same within the noise of both. The
-    errors of views of one surface have images in common, so that the mean is taken for as sure as the best of them, not
-    surer. Confidence is 1 - 2^-n of n confirming views.
+    A view confirms a pixel if its depth at the pixel's point agrees within the noise of both. The errors of the views
+    are correlated, since they share images: the variance of the mean is that of the best view, not smaller. Confidence
+    is 1 - 2^-n for n confirming views.
     """
-    depth_map = own.depth_map.opened()
+    depth_map = own.depth_map.decoded()
     depth, variance = depth_map.depth, (depth_map.sigma * depth_map.depth) ** 2
     rays = pinhole.grid_rays((depth.shape[0], depth.shape[1]), own.intrinsics, np.float32)
     weight = 1.0 / variance
     total, moment, count, best = weight.copy(), weight * depth, np.zeros(depth.shape, np.int32), variance.copy()
     for other in others:
-        z, z_variance = _seen_by(own, other, depth, rays)
+        z, z_variance = _depth_by(other, own, depth, rays)
         with np.errstate(invalid="ignore"):
-            gate = np.clip(SIGMAS * np.sqrt(variance + z_variance), AGREE[0] * depth, AGREE[1] * depth)
-            same = np.abs(z - depth) < gate
+            low, high = DIFFERENCE_RANGE
+            same = np.abs(z - depth) < np.clip(SIGMAS * np.sqrt(variance + z_variance), low * depth, high * depth)
         count += same
         gain = np.where(same, 1.0 / z_variance, 0.0)
         total += gain
         moment += np.where(same, gain * z, 0.0)
         best = np.where(same, np.minimum(best, z_variance), best)
-    good = (count >= least) & np.isfinite(depth)
+    good = (count >= min_views) & np.isfinite(depth)
     mean = moment / total
     nan = np.float32(np.nan)
     return DepthMap(
@@ -57,11 +57,10 @@ def confirm(own: PosedDepth, others: Sequence[PosedDepth], least: int) -> DepthM
     )
 
 
-def _seen_by(own: PosedDepth, other: PosedDepth, depth: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth along `own`'s rays by what `other` sees at each pixel's point, and its variance; NaN where it sees nothing.
+def _depth_by(other: PosedDepth, own: PosedDepth, depth: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth along `own`'s rays as measured by `other` at each pixel's point, and its variance; NaN where not visible.
 
-    The difference of depth in the other's frame is carried over as a relative one: the point moves along a ray that is
-    nearly the same.
+    The relative depth error is taken over from the other view: its ray through the point is nearly the same.
     """
     relative = (other.pose @ np.linalg.inv(own.pose)).astype(np.float32)
     local = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]

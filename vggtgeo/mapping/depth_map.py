@@ -1,4 +1,4 @@
-"""Depth of every pixel of a keyframe, and how far it can be trusted."""
+"""A depth map with standard deviation and confidence of every pixel."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ import numpy as np
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 
-MANY = 200
-"""Keyframes of a map from which on its depth maps are held compressed: at 640 x 480 one takes 3.7 MB, and 0.4 so, after
-20 ms; each look at one of its three parts then takes 4 ms."""
+COMPRESS_FROM = 200
+"""Number of keyframes from which depth maps are compressed in memory. At 640 x 480: 0.4 MB in place of 3.7 MB, 20 ms to
+compress, 4 ms to decode one of the three images."""
 
 
 class DepthMap:
-    """What is known of a picture's depth, pixel by pixel.
+    """Depth, standard deviation and confidence of the pixels of an image.
 
     Args:
-        depth: float32 [H, W], z in metres (in the map's own unit where the scale is free), NaN = none.
-        sigma: float32 [H, W], its relative standard deviation.
-        confidence: float32 [H, W] in [0, 1], 0 where there is no depth.
+        depth: float32 [H, W], z in metres (arbitrary unit if the scale is free), NaN = unknown.
+        sigma: float32 [H, W], relative standard deviation.
+        confidence: float32 [H, W] in [0, 1], 0 where depth is unknown.
 
     Raises:
-        InputError: they are not of one shape.
+        InputError: the shapes differ, or are not [H, W].
 
     """
 
     def __init__(self, depth: np.ndarray, sigma: np.ndarray, confidence: np.ndarray) -> None:
         for name, part in (("depth", depth), ("sigma", sigma), ("confidence", confidence)):
             if part.shape != depth.shape or len(part.shape) != 2:
-                raise InputError(f"`{name}` has shape {part.shape}; it must be [H, W], as `depth` {depth.shape}")
+                raise InputError(f"`{name}` must be [H, W] as `depth` {depth.shape}, got shape {part.shape}")
         self._parts: tuple[np.ndarray | CompressedImage, ...] = (depth, sigma, confidence)
         self._unit = 1.0
-        self._known: float | None = None
+        self._known: float | None = None  # share of known pixels, if compressed
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -43,7 +43,7 @@ class DepthMap:
 
     @property
     def depth(self) -> np.ndarray:
-        """float32 [H, W], NaN = none."""
+        """float32 [H, W], NaN = unknown."""
         found = array_of(self._parts[0])
         return found if self._known is None else found.astype(np.float32) * np.float32(self._unit)
 
@@ -61,38 +61,38 @@ class DepthMap:
 
     @property
     def share(self) -> float:
-        """Of the pixels that have a depth."""
+        """Share of pixels with known depth."""
         return float(np.isfinite(self.depth).mean()) if self._known is None else self._known
 
     @property
     def is_compressed(self) -> bool:
-        """Whether each look decodes an image."""
+        """Whether each access decodes an image."""
         return self._known is not None
 
     @property
     def empty(self) -> bool:
-        """Whether no pixel has a depth."""
+        """Whether all depth is unknown."""
         return self.share == 0
 
     def __repr__(self) -> str:
         return f"DepthMap({self.shape[1]} x {self.shape[0]}, {self.share:.0%} known)"
 
     def compressed(self) -> Self:
-        """The same in little memory, depth and its deviation to 0.05 %; each look at one of the three decodes it."""
+        """Return a compressed copy, with depth and sigma rounded to 0.05 %; each access decodes one image."""
         if self.is_compressed or self.empty:
             return self
         small = type(self)(self.depth, self.sigma, self.confidence)
         small._known = self.share
-        small._unit = float(np.nanmedian(self.depth))  # of half precision, whatever the map's own unit is
+        small._unit = float(np.nanmedian(self.depth))  # keeps the range of half precision for any scale of the map
         scaled = (self.depth / small._unit).astype(np.float16), self.sigma.astype(np.float16)
-        shades = np.rint(255 * self.confidence).astype(np.uint8)
-        small._parts = tuple(CompressedImage.of(image) for image in (*scaled, shades))
+        levels = np.rint(255 * self.confidence).astype(np.uint8)
+        small._parts = tuple(CompressedImage.of(image) for image in (*scaled, levels))
         return small
 
-    def held_by(self, keyframes: int) -> Self:
-        """As a map of so many keyframes holds it."""
-        return self.compressed() if keyframes >= MANY else self
+    def compressed_for(self, keyframes: int) -> Self:
+        """Return the depth map, compressed if the map has many keyframes."""
+        return self.compressed() if keyframes >= COMPRESS_FROM else self
 
-    def opened(self) -> Self:
-        """The same as arrays, for several looks."""
+    def decoded(self) -> Self:
+        """Return the depth map with plain arrays, for repeated access."""
         return self if self._known is None else type(self)(self.depth, self.sigma, self.confidence)

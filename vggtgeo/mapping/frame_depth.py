@@ -1,8 +1,7 @@
-"""Depth of every frame, keyframe or not: what the sensor measured there and, where it did not, what keyframes saw.
+"""Dense depth of any frame: its own measurement, with holes filled from nearby keyframes.
 
-The keyframes' dense depth is carried into the frame by its pose, first into a coarse picture in which nearer surfaces
-hide farther ones; then each pixel's depth is read again where keyframes see that point, and kept where one confirms it
-(`consistency.py`). What no near keyframe sees stays unknown.
+The keyframes' depth is projected into the frame at a coarse resolution with a z-buffer, which resolves occlusion. Then
+each pixel's depth is read from the keyframes at that point, and kept if one confirms it (`consistency.py`).
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.mapping.consistency import AGREE, PosedDepth, confirm
-from vggtgeo.mapping.dense import filled
+from vggtgeo.mapping.consistency import DIFFERENCE_RANGE, PosedDepth, confirm
+from vggtgeo.mapping.dense import fill_holes
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.connected import piece_of
@@ -21,17 +20,17 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_poses import frame_poses
 
 NEAREST = 4
-"""Keyframes that a frame's depth is taken from."""
-APART = 0.3, np.deg2rad(20)
-"""A metre and an angle that put a keyframe equally far from a frame."""
+"""Keyframes from which a frame's depth is taken."""
+DISTANCE_SCALE, ANGLE_SCALE = 0.3, np.deg2rad(20)
+"""Metres and radians of equal weight in the distance between views."""
 COARSE = 2
-"""Pixels a pixel of the coarse picture: fine enough that nothing shines through the gaps between a keyframe's."""
-LEAST_CONFIDENCE = 0.5
-"""Of a depth that is carried over: below it lies a jump of depth."""
+"""Pixels per pixel of the z-buffer: the samples of a keyframe leave no gaps at this resolution."""
+MIN_CONFIDENCE = 0.5
+"""Of depth that is projected: less confident pixels lie at depth edges."""
 
 
 def rendered_depth(pose: np.ndarray, intrinsics: np.ndarray, views: Sequence[PosedDepth]) -> DepthMap:
-    """What `views` of one size see from another place.
+    """Return the depth that `views` of one image size give at another pose.
 
     Args:
         pose: float64 [4, 4], world -> camera.
@@ -42,8 +41,8 @@ def rendered_depth(pose: np.ndarray, intrinsics: np.ndarray, views: Sequence[Pos
     height, width = views[0].depth_map.shape
     coarse = np.full((-(-height // COARSE), -(-width // COARSE)), np.inf, np.float32)
     for view in views:
-        depth_map = view.depth_map.opened()
-        rows, columns = np.nonzero(np.isfinite(depth_map.depth) & (depth_map.confidence >= LEAST_CONFIDENCE))
+        depth_map = view.depth_map.decoded()
+        rows, columns = np.nonzero(np.isfinite(depth_map.depth) & (depth_map.confidence >= MIN_CONFIDENCE))
         pixels = np.column_stack([columns, rows]).astype(np.float32)
         local = pinhole.rays(pixels, view.intrinsics) * depth_map.depth[rows, columns, None]
         relative = (pose @ rigid.invert(view.pose)).astype(np.float32)
@@ -52,49 +51,49 @@ def rendered_depth(pose: np.ndarray, intrinsics: np.ndarray, views: Sequence[Pos
         np.minimum.at(coarse, (rows // COARSE, columns // COARSE), local[inside, 2])
     crude = np.repeat(np.repeat(coarse, COARSE, 0), COARSE, 1)[:height, :width]
     depth = np.where(np.isfinite(crude), crude, np.float32(np.nan))
-    # Said to be as unsure as views may differ, so that what the keyframes measured at the pixel itself counts alone.
-    unsure = DepthMap(depth, np.full_like(depth, AGREE[1]), np.isfinite(depth).astype(np.float32))
-    return confirm(PosedDepth(unsure, pose, intrinsics), views, least=1)
+    # With the largest sigma that `confirm` allows for, the average is that of the keyframes' own depths at the pixel.
+    coarse_map = DepthMap(depth, np.full_like(depth, DIFFERENCE_RANGE[1]), np.isfinite(depth).astype(np.float32))
+    return confirm(PosedDepth(coarse_map, pose, intrinsics), views, min_views=1)
 
 
 class FrameDepths:
-    """Depth of the frames of a run, one by one: `of` gives it for a row of `slam.frames`.
+    """Dense depth of the frames of a run; `of` returns it for a row of `slam.frames`.
 
-    slam: after the last adjustment. depth_maps: the keyframes' dense depth, one each, None where there is none.
+    slam: state after the last adjustment. depth_maps: dense depth of each keyframe, None if unknown.
     """
 
     def __init__(self, slam: Slam, depth_maps: Sequence[DepthMap | None]):
         self._slam = slam
         self._poses = frame_poses(slam)[1]
-        self._piece = piece_of(slam)
+        self._submap = piece_of(slam)
         self._views: Mapping[int, PosedDepth] = {
             keyframe.number: PosedDepth(depth_map, keyframe.pose, np.asarray(slam.intrinsics, np.float64))
             for keyframe, depth_map in zip(slam.keyframes, depth_maps, strict=True)
             if depth_map is not None and not depth_map.empty
         }
-        # A known map's keyframes are frames of another run, with numbers of their own.
+        # Keyframes of a known map have the frame numbers of another run.
         own = (keyframe for keyframe in slam.keyframes if keyframe.recorded is None)
         self._keyframe_of = {keyframe.frame: keyframe.number for keyframe in own}
 
     def of(self, row: int, own: DepthMap | None = None) -> DepthMap | None:
-        """A keyframe's dense depth; of another frame its `own`, and in the holes that of the nearest keyframes. None
-        where there is none.
+        """Return the dense depth of a keyframe; of another frame its `own`, with holes filled from the nearest
+        keyframes. None if all is unknown.
         """
         record = self._slam.frames[row]
         number = self._keyframe_of.get(record.frame)
         if number is not None and number in self._views:
             return self._views[number].depth_map
         near = list(self._near(row)) if record.tracked else []
-        return filled(own, rendered_depth(self._poses[row], self._slam.intrinsics, near) if near else None)
+        return fill_holes(own, rendered_depth(self._poses[row], self._slam.intrinsics, near) if near else None)
 
     def _near(self, row: int) -> Iterator[PosedDepth]:
-        """Keyframes with depth, of the piece of map that the frame hangs on, that stand and look most as it does."""
-        piece, pose = self._piece[self._slam.frames[row].reference], self._poses[row]
+        """The nearest keyframes with depth in the frame's submap."""
+        submap, pose = self._submap[self._slam.frames[row].reference], self._poses[row]
 
-        def away(number: int) -> float:
+        def distance(number: int) -> float:
             other = self._views[number].pose
-            distance = np.linalg.norm(rigid.centre(other) - rigid.centre(pose))
-            return float(distance) / APART[0] + float(rigid.angle_between(other, pose)) / APART[1]
+            metres = np.linalg.norm(rigid.centre(other) - rigid.centre(pose))
+            return float(metres) / DISTANCE_SCALE + float(rigid.angle_between(other, pose)) / ANGLE_SCALE
 
-        same = sorted((number for number in self._views if self._piece[number] == piece), key=away)
+        same = sorted((number for number in self._views if self._submap[number] == submap), key=distance)
         return (self._views[number] for number in same[:NEAREST])

@@ -1,4 +1,4 @@
-"""The surface of a map: all depth fused at once, and fused again where keyframes moved."""
+"""The mesh of a map: fused from all depth, and incrementally updated where keyframes moved."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from vggtgeo.mapping.tsdf import (
     GROUP,
     Block,
     View,
-    around,
     blocks_of,
-    joined,
+    merge_meshes,
     meshes_of,
-    together,
-    without_crumbs,
+    neighbourhood,
+    remove_small_parts,
+    views_near,
 )
 from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -38,15 +38,15 @@ def fused_mesh(
     voxel: float = 0.02,
     least_views: int = 2,
 ) -> Mesh:
-    """One coloured mesh of all keyframes' depth, in the world frame.
+    """Return one coloured mesh of all keyframes' depth, world frame.
 
     Args:
         keyframes: poses world -> camera.
-        depth_maps: one a keyframe, None where there is none.
+        depth_maps: one per keyframe, None if unknown.
         intrinsics: float64 [4], pixels.
         voxel: edge of a voxel, metres.
-        least_views: keyframes that must have measured at a voxel, where there are so many; 1 where each depth was
-            confirmed by other views already.
+        least_views: number of keyframes that must measure a voxel, if there are as many; 1 if other views have
+            confirmed each depth already.
 
     """
     fusion = SurfaceFusion(intrinsics, voxel, least_views)
@@ -56,8 +56,8 @@ def fused_mesh(
 
 @dataclass(frozen=True, eq=False)
 class _Fused:
-    """What was fused of a keyframe: its view, the blocks that its surface passes, corners of what it sees (camera's
-    frame, float [n, 3]), and what it was made of.
+    """A fused view: the blocks of its surface, the corners of what it sees (camera frame, float [n, 3]), and the object
+    that its depth comes from.
     """
 
     view: View
@@ -66,27 +66,27 @@ class _Fused:
     source: object
 
     def moved(self, pose: np.ndarray) -> float:
-        """Metres that what it sees moves, at most, if the view is at `pose`."""
+        """Largest motion of the visible surface, metres, if the view moves to `pose`."""
         poses = rigid.invert(np.stack([self.view.pose, pose]))
-        places = [self.corners @ to_world[:3, :3].T + to_world[:3, 3] for to_world in poses]
-        return float(np.linalg.norm(places[1] - places[0], axis=1).max())
+        before, after = (self.corners @ to_world[:3, :3].T + to_world[:3, 3] for to_world in poses)
+        return float(np.linalg.norm(after - before, axis=1).max())
 
 
 class SurfaceFusion:
-    """A mesh that is fused again where keyframes moved, and nowhere else: for a map that is looked at while it grows.
+    """A mesh that is updated only where keyframes moved, to view a map while it grows.
 
-    A view that moved cannot be taken out of a voxel's sum without a trace of rounding, so that blocks are made anew:
-    those that the view passed before, those that it passes now, and their neighbours, from all views that see them.
-    What comes out is what all views, fused at once at the poses of their last fusion, would give.
+    Subtracting a moved view from a voxel's sum would leave rounding errors. Instead, blocks are fused again from all
+    views that see them: those of the view before and after the motion, and their neighbours. The mesh is equal to that
+    of all views fused at once, at the poses of their last fusion.
 
     Args:
         intrinsics: float64 [4], pixels.
         voxel: edge of a voxel, metres.
-        least_views: as of `fused_mesh`.
-        bound: how far a view's surface may move before it is fused again, voxels; at the far end of what it sees.
+        least_views: as in `fused_mesh`.
+        bound: motion of a view's surface, voxels, above which it is fused again; measured where depth is large.
 
     Raises:
-        InputError: one of them is no such number.
+        InputError: an argument is invalid.
 
     Example:
         >>> import numpy as np, vggtgeo as vg
@@ -101,7 +101,7 @@ class SurfaceFusion:
         check_positive("voxel", voxel, "metres")
         check_real("bound", bound, "voxels, 0 or more")
         if not bound >= 0:
-            raise InputError(f"`bound` is {bound}; it must be voxels, 0 or more")
+            raise InputError(f"`bound` must be voxels, 0 or more, got {bound}")
         check_whole("least_views", least_views, 1)
         given = real_array("intrinsics", intrinsics, (4,)).astype(np.float64)
         self._intrinsics = np.array(check_intrinsics(given.tolist()))
@@ -112,26 +112,26 @@ class SurfaceFusion:
         self._least = 0
 
     def update(self, keyframes: Sequence[Keyframe], depth_maps: Sequence[DepthMap | None] | None = None) -> int:
-        """Fuse what is new or has moved; how many blocks were made anew.
+        """Fuse views that are new or have moved; return the number of updated blocks.
 
-        keyframes: all of the map, poses world -> camera. depth_maps: one each, None where there is none; by default the
-        depth that each measured.
+        keyframes: all of the map, poses world -> camera. depth_maps: one per keyframe, None if unknown; by default the
+        measured depth.
 
         Raises:
-            InputError: they are no keyframes, or the maps are not one each.
+            InputError: `keyframes` are not keyframes, or `depth_maps` has another length.
 
         """
         check_kind("keyframes", keyframes, Sequence, "a sequence of keyframes, such as `state.adjusted_keyframes`")
         for keyframe in keyframes:
             check_kind("keyframes", keyframe, Keyframe, "a sequence of keyframes, such as `state.adjusted_keyframes`")
         if depth_maps is not None and len(depth_maps) != len(keyframes):
-            raise InputError(f"`depth_maps` has {len(depth_maps)} entries; expected {len(keyframes)}, one a keyframe")
+            raise InputError(f"`depth_maps` must have an entry per keyframe ({len(keyframes)}), got {len(depth_maps)}")
         maps = [None] * len(keyframes) if depth_maps is None else depth_maps
         stale: set[Block] = set()
         for number in self._fused.keys() - {keyframe.number for keyframe in keyframes}:
             stale |= self._without(number)
         for keyframe, depth_map in zip(keyframes, maps, strict=True):
-            # Of a keyframe's own depth there is one, whatever is made of its images meanwhile.
+            # A keyframe's measured depth never changes, even if its images are compressed meanwhile.
             source: object = keyframe.frame if depth_maps is None else depth_map
             before = self._fused.get(keyframe.number)
             if before is not None and before.source == source:
@@ -143,17 +143,17 @@ class SurfaceFusion:
             stale |= self._without(keyframe.number)
             own = measured_depth(keyframe) if depth_maps is None else depth_map
             if own is not None and not own.empty:
-                own = own.held_by(len(keyframes))
+                own = own.compressed_for(len(keyframes))
                 stale |= self._with(keyframe, own, source)
         return self._fuse(stale)
 
     @property
     def mesh(self) -> Mesh:
-        """The surface, world frame."""
-        return without_crumbs(joined([self._parts[block] for block in sorted(self._parts)], self._voxel))
+        """The mesh, world frame."""
+        return remove_small_parts(merge_meshes([self._parts[block] for block in sorted(self._parts)], self._voxel))
 
     def _without(self, number: int) -> set[Block]:
-        """Take a view away; the blocks that it passed."""
+        """Remove a view; return its blocks."""
         before = self._fused.pop(number, None)
         if before is None:
             return set()
@@ -173,16 +173,16 @@ class SurfaceFusion:
         least = min(self._least_views, len(self._fused))
         if least != self._least:
             changed, self._least = set(self._touched), least
-        # Blocks share layers of voxels: all of them must see such a layer by the same views.
-        near = sorted({other for block in changed for other in around(block)} & self._touched.keys())
-        seen_by = {block: together(block, self._touched) for block in near}
+        # Blocks share layers of voxels, which must be fused from the same views in each.
+        near = sorted({other for block in changed for other in neighbourhood(block)} & self._touched.keys())
+        seen_by = {block: views_near(block, self._touched) for block in near}
         views = {number: fused.view for number, fused in self._fused.items()}
         for block in near:
             self._parts.pop(block, None)
             if not self._touched[block]:
                 del self._touched[block]
         todo = [block for block in near if block in self._touched and len(seen_by[block]) >= least]
-        count = max(-(-len(todo) // BATCH), min(2, -(-len(todo) // GROUP)))  # two at least, for two threads
+        count = max(-(-len(todo) // BATCH), min(2, -(-len(todo) // GROUP)))  # at least two, for two threads
         batches = [todo[len(todo) * i // count : len(todo) * (i + 1) // count] for i in range(count)]
         meshes = lambda batch: meshes_of(batch, seen_by, views, self._voxel, least)
         for batch, parts in zip(batches, map_in_threads(meshes, batches), strict=True):
@@ -191,7 +191,7 @@ class SurfaceFusion:
 
 
 def measured_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> DepthMap | None:
-    """The depth that a keyframe measured, or `depth` with its noise and confidence; None where there is none."""
+    """Return the keyframe's measured depth, or `depth` with its noise and confidence; None if all is unknown."""
     depth = (keyframe.depth if depth is None else depth).astype(np.float32)
     if not np.isfinite(depth).any():
         return None
@@ -200,7 +200,7 @@ def measured_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> Depth
 
 
 def _corners(view: View) -> np.ndarray:
-    """The corners of the image at the depth that one pixel in twenty exceeds, in the camera's frame, [4, 3]."""
+    """Image corners at the 95 % quantile of depth, camera frame, [4, 3]."""
     depth = view.depth_map.depth
     height, width = depth.shape
     pixels = np.array([[x, y] for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])

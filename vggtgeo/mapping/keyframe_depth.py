@@ -1,14 +1,11 @@
-"""Dense depth of the keyframes after optimisation: what the slots learnt, and what other keyframes saw.
+"""Dense depth of the keyframes after the adjustment: corrected by the adjusted points, averaged over keyframes.
 
-The depth prior of a pixel touches that pixel alone, so a pixel that carries no slot has its optimum at its prior: the
-dense problem is solved by the slots. What the slots learnt (`log z_optimised - log z_prior`) is spread to their
-neighbours by a bilateral grid (Chen, Paris, Durand 2007) over image position and log depth: it follows surfaces and
-stops at depth edges.
+In the adjustment, the depth prior of a pixel without a key point has no other residual: its optimum is the prior. The
+corrections of the key points (`log z_adjusted - log z_prior`) are therefore interpolated by a bilateral grid (Chen,
+Paris, Durand 2007) over image position and log depth, which smooths along surfaces and stops at depth edges.
 
-The depth of a network errs smoothly over a picture and differently a second later, and so does what no slot reaches.
-The other keyframes' views of a surface have errors of their own, and the poses between neighbours are known far better:
-so each depth is averaged with its neighbours' in its own view, the slots corrected once more against that mean, and the
-result averaged again.
+Errors of a depth network vary slowly within an image and change between keyframes, while relative poses of neighbours
+are accurate. So each depth map is averaged with its neighbours', corrected again by the key points, and averaged again.
 """
 
 from __future__ import annotations
@@ -20,36 +17,38 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from vggtgeo.geometry import rigid
-from vggtgeo.mapping.depth_map import MANY
+from vggtgeo.mapping.depth_map import COMPRESS_FROM
 from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 from vggtgeo.slam.threads import map_in_threads
 
 CELL = 24.0
-"""Pixels a grid cell."""
+"""Pixels per grid cell."""
 DEPTH_CELL = 0.08
-"""Log depth a grid cell."""
-LARGEST_CORRECTION = 0.2
-"""Of log depth: what differs more is a mismatch, not a correction."""
+"""Log depth per grid cell."""
+MAX_CORRECTION = 0.2
+"""Of log depth: a larger one is a mismatch."""
 OFFSETS = (1, 2, 3, 4, 6, 8, 10, 12)
-"""Neighbours before and after, in keyframes: some near, which see the same, and some far, which err differently."""
+"""Neighbours before and after, in keyframes: near ones overlap most, far ones have independent errors."""
 STEP = 4
-"""Pixels between the points that a neighbour contributes, and of a cell in which their corrections are collected."""
-SPREAD = 1.0
-"""Standard deviation of the smoothing over cells."""
-GATE = 0.15
-"""Largest difference of log depth: what differs more is another surface."""
-LEAST_MASS = 0.35
-"""Smoothed number of points in a cell below which a neighbour says nothing there."""
+"""Pixels between the points that a neighbour contributes, and width of the cells that collect them."""
+SMOOTHING = 1.0
+"""Standard deviation of the smoothing, cells."""
+MAX_DIFFERENCE = 0.15
+"""Of log depth: a larger one is another surface."""
+MIN_MASS = 0.35
+"""Smoothed number of a neighbour's points in a cell needed to use it there."""
 ROUNDS = 2
-"""Of correction by slots and averaging over views."""
+"""Of correction by key points and averaging over keyframes."""
+PRIOR_WEIGHT = 0.02
+"""Of a zero correction in each grid cell: far from all key points the depth stays."""
 
 
 def optimised_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> np.ndarray:
-    """Depth of every pixel that has a metric prior, corrected by the slots; float32 `[H, W]` metres, NaN = none.
+    """Return the dense depth corrected by the adjusted key points; float32 `[H, W]` metres, NaN = unknown.
 
-    depth: what is corrected, float32 `[H, W]`; by default the prior.
+    depth: to be corrected, float32 `[H, W]`; by default the prior.
     """
     depth = keyframe.depth.astype(np.float32) if depth is None else depth
     log_depth = np.log(depth)
@@ -70,14 +69,13 @@ def optimised_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> np.n
     np.add.at(mass, cell, weight)
     np.add.at(moment, cell, weight * correction)
     mass, moment = (gaussian_filter(grid, 1.0, mode="constant") for grid in (mass, moment))
-    # A weak pull towards no correction: far from any slot the prior stands.
-    return depth * np.exp(_sliced(moment / (mass + 0.02), (log_depth - low) / DEPTH_CELL + 1))
+    return depth * np.exp(_slice(moment / (mass + PRIOR_WEIGHT), (log_depth - low) / DEPTH_CELL + 1))
 
 
-def _sliced(field: np.ndarray, layer: np.ndarray) -> np.ndarray:
-    """`field` [h, w, d] at every pixel, float32 [H, W], by its place in the grid and its `layer` [H, W], NaN = NaN.
+def _slice(field: np.ndarray, layer: np.ndarray) -> np.ndarray:
+    """Interpolate `field` [h, w, d] at every pixel and its `layer` [H, W]; float32 [H, W], NaN where `layer` is.
 
-    Trilinear: the layers stand one below the other in one image, in which the two that enclose a pixel are looked up.
+    Trilinear: `cv2.remap` interpolates in an image of all layers below each other, in the two layers at each pixel.
     """
     rows, columns, layers = field.shape
     image = np.ascontiguousarray(field.transpose(2, 0, 1), np.float32).reshape(layers * rows, columns)
@@ -92,7 +90,7 @@ def _sliced(field: np.ndarray, layer: np.ndarray) -> np.ndarray:
 
 
 def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels, log depth corrections and weights of the slots that have both an estimate and a prior."""
+    """Pixels, log depth corrections and weights of the key points that have both an estimate and a prior."""
     slots = keyframe.points
     height, width = log_depth.shape
     here = read_at(log_depth, slots.pixels)
@@ -100,42 +98,41 @@ def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray,
     with np.errstate(invalid="ignore", divide="ignore"):
         estimate = -np.log(slots.inverse_depth)
         correction = estimate - here
-        # A slot that stands at its prior has taken no part in an adjustment.
+        # Exactly at its prior, a key point has taken no part in an adjustment.
         adjusted = estimate != -np.log(slots.prior)
-    good = inside & np.isfinite(correction) & adjusted & (np.abs(correction) < LARGEST_CORRECTION)
+    good = inside & np.isfinite(correction) & adjusted & (np.abs(correction) < MAX_CORRECTION)
     return slots.pixels[good], correction[good], slots.confidence[good] * slots.prior_confidence[good]
 
 
 def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[np.ndarray | CompressedImage | None]:
-    """Dense depth of each keyframe, corrected by its slots and averaged with its neighbours' views.
+    """Return the dense depth of each keyframe, corrected by its key points and averaged with its neighbours'.
 
     Args:
-        keyframes: in the order of time; poses world -> camera.
+        keyframes: in order of time; poses world -> camera.
         intrinsics: float64 [4], pixels.
 
     Returns:
-        float32 [H, W] metres for each keyframe, NaN where it has no depth, of many keyframes compressed; None where it
-        has none at all.
+        float32 [H, W] metres per keyframe, NaN where unknown, compressed if there are many; None without depth.
 
     """
-    many = len(keyframes) >= MANY
-    held = lambda depth: CompressedImage.of(depth.astype(np.float16)) if many else depth
+    many = len(keyframes) >= COMPRESS_FROM
+    stored = lambda depth: CompressedImage.of(depth.astype(np.float16)) if many else depth
 
     def measured(keyframe: Keyframe) -> np.ndarray | CompressedImage | None:
         return keyframe.images.depth if keyframe.images.has_depth else None
 
     def correct(i: int) -> np.ndarray | None:
-        """Its points, once it is corrected."""
+        """Correct a depth map in place; return its points."""
         if (depth := depths[i]) is None:
             return None
         corrected = optimised_depth(keyframes[i], array_of(depth).astype(np.float32))
-        depths[i] = held(corrected)
+        depths[i] = stored(corrected)
         return _points(corrected, intrinsics)
 
     def average(i: int) -> None:
         if (depth := depths[i]) is not None:
-            around = _around(clouds, keyframes, i)
-            depths[i] = held(_averaged(array_of(depth).astype(np.float32), around, intrinsics))
+            neighbours = _neighbours(clouds, keyframes, i)
+            depths[i] = stored(_averaged(array_of(depth).astype(np.float32), neighbours, intrinsics))
 
     depths, numbers = map_in_threads(measured, keyframes), range(len(keyframes))
     for _ in range(ROUNDS):
@@ -144,10 +141,10 @@ def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[
     return depths
 
 
-def _around(
+def _neighbours(
     clouds: Sequence[np.ndarray | None], keyframes: Sequence[Keyframe], i: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The neighbours' points, of those that have any, each with the motion from there to keyframe i."""
+    """Points of the neighbours that have any, with the motion from each to keyframe i."""
     numbers = [i + sign * offset for offset in OFFSETS for sign in (-1, 1)]
     return [
         (cloud, keyframes[i].pose @ rigid.invert(keyframes[j].pose))
@@ -157,7 +154,7 @@ def _around(
 
 
 def _points(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """What a keyframe contributes elsewhere, in its own frame: float32 [3, n], metres."""
+    """Sampled points of a depth map in the camera frame, float32 [3, n], metres."""
     rows, columns = np.mgrid[STEP // 2 : depth.shape[0] : STEP, STEP // 2 : depth.shape[1] : STEP].reshape(2, -1)
     z = depth[rows, columns]
     known = np.isfinite(z)
@@ -166,20 +163,20 @@ def _points(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 
 def _averaged(depth: np.ndarray, others: list[tuple[np.ndarray, np.ndarray]], intrinsics: np.ndarray) -> np.ndarray:
-    """The depth after the mean of what other keyframes measured of it; others: see `_around`."""
+    """The depth corrected by the mean difference to other keyframes; others: see `_neighbours`."""
     height, width = depth.shape
     cells = (-(-height // STEP), -(-width // STEP))
-    total, views = np.zeros(cells), np.ones(cells)  # the keyframe's own view, with no correction, counts as one
+    total, views = np.zeros(cells), np.ones(cells)  # the keyframe's own view counts as one, with correction 0
     for points, motion in others:
-        # In single precision, and by the motion between the two: far from the origin it loses nothing.
-        near = motion.astype(np.float32)
-        local = near[:3, :3] @ points + near[:3, 3:]
+        # Single precision suffices for relative motions, however far the keyframes are from the origin.
+        relative = motion.astype(np.float32)
+        local = relative[:3, :3] @ points + relative[:3, 3:]
         inside, rows, columns = pinhole.visible(local.T, intrinsics, (height, width))
         difference = np.log(local[2, inside] / depth[rows, columns])
-        same = np.abs(difference) < GATE  # false where the depth is NaN
+        same = np.abs(difference) < MAX_DIFFERENCE  # false where the depth is NaN
         cell = (rows[same] // STEP) * cells[1] + columns[same] // STEP
         mass, moment = (_smoothed(cell, weights, cells) for weights in (None, difference[same]))
-        seen = mass > LEAST_MASS
+        seen = mass > MIN_MASS
         total[seen] += moment[seen] / mass[seen]
         views[seen] += 1
     correction = cv2.resize((total / views).astype(np.float32), (cells[1] * STEP, cells[0] * STEP))
@@ -188,4 +185,4 @@ def _averaged(depth: np.ndarray, others: list[tuple[np.ndarray, np.ndarray]], in
 
 def _smoothed(cell: np.ndarray, weights: np.ndarray | None, cells: tuple[int, int]) -> np.ndarray:
     grid = np.bincount(cell, weights, cells[0] * cells[1]).reshape(cells).astype(np.float32)
-    return cv2.GaussianBlur(grid, (0, 0), SPREAD, borderType=cv2.BORDER_CONSTANT)
+    return cv2.GaussianBlur(grid, (0, 0), SMOOTHING, borderType=cv2.BORDER_CONSTANT)

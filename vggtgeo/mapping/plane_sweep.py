@@ -1,11 +1,10 @@
-"""Plane sweep: how well a picture agrees with its neighbours, for every pixel at every depth.
+"""Plane sweep: matching cost of every pixel of an image with its neighbours, at every depth.
 
-A plane at inverse depth `d`, parallel to the image, is carried into a neighbour by the homography
-`H = K' (R + d t e3^T) K^-1` (Collins, "A space-sweep approach to true multi-image matching", CVPR 1996). The
-neighbour's picture is warped by it, and compared by the zero-mean normalised cross-correlation of windows, which gain
-and offset of the exposure leave alone. A correlation is damped by the image's noise, so that a blank wall agrees with
-nothing and costs the same everywhere; it is cut off, so that a neighbour that sees something else costs the same
-everywhere, too.
+A fronto-parallel plane at inverse depth `d` maps into a neighbour by the homography `H = K' (R + d t e3^T) K^-1`
+(Collins, "A space-sweep approach to true multi-image matching", CVPR 1996). The neighbour's image is warped by it and
+compared by the zero-mean normalised cross-correlation of windows, which is invariant to exposure gain and offset. The
+image noise is added to the variances, so that untextured windows have correlation 0 at all depths. The cost is
+truncated, so that an occluded neighbour adds a constant.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ import numpy as np
 from vggtgeo.models import pinhole
 
 NOISE = 1.0
-"""Standard deviation of the image noise, grey levels: a camera has 2, and a pixel of the search is the mean of four."""
-WORST = 0.7
-"""Largest cost, 1 - correlation: what agrees less is another surface."""
+"""Standard deviation of the image noise, grey levels: 2 of a camera, halved by averaging four pixels."""
+MAX_COST = 0.7
+"""Truncation of the cost, 1 - correlation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A picture with its pose. grey: float32 [H, W]; pose: float64 [4, 4], world -> camera; intrinsics: float64 [4]."""
+    """An image with its pose. grey: float32 [H, W]; pose: float64 [4, 4], world -> camera; intrinsics: float64 [4]."""
 
     grey: np.ndarray
     pose: np.ndarray
@@ -34,16 +33,17 @@ class Photo:
 
 
 def matching_cost(reference: Photo, others: Sequence[Photo], inverse_depths: np.ndarray, window: int) -> np.ndarray:
-    """The cost of each pixel at each plane: the mean over the neighbours that see it of `min(1 - correlation, WORST)`.
+    """Return the cost of each pixel at each plane: the mean of `min(1 - correlation, MAX_COST)` over the neighbours
+    that see it.
 
     Args:
-        reference: whose pixels are asked.
+        reference: image whose pixels are matched.
         others: its neighbours.
         inverse_depths: of the planes, float [k], 1/m.
-        window: width of the compared windows, pixels, odd.
+        window: width of the correlation window, pixels, odd.
 
     Returns:
-        float32 [H, W, k]; `WORST` where no neighbour sees the place.
+        float32 [H, W, k]; `MAX_COST` where no neighbour sees the point.
 
     """
     height, width = reference.grey.shape
@@ -55,18 +55,16 @@ def matching_cost(reference: Photo, others: Sequence[Photo], inverse_depths: np.
         total = cost[plane]
         total[:], seen[:] = 0, 0
         for other, (far, by_depth) in zip(others, homographies, strict=True):
-            inside, differing = own.compared(other.grey, far + inverse_depth * by_depth)
-            total += differing
+            inside, other_cost = own.compare(other.grey, far + inverse_depth * by_depth)
+            total += other_cost
             seen += inside
         total /= np.maximum(seen, 1)
-        total[seen == 0] = WORST
+        total[seen == 0] = MAX_COST
     return np.ascontiguousarray(np.moveaxis(cost, 0, 2))
 
 
 def plane_homographies(reference: Photo, other: Photo) -> tuple[np.ndarray, np.ndarray]:
-    """From pixels of `reference` to those of `other`: that of the plane `z = 1 / d` is the first, which is that of what
-    is infinitely far, plus `d` times the second; float64 [3, 3] each.
-    """
+    """Return H0 and H1, float64 [3, 3]: `H0 + d H1` maps pixels of `reference` to `other` for the plane `z = 1 / d`."""
     relative = other.pose @ np.linalg.inv(reference.pose)
     to_rays = np.linalg.inv(pinhole.matrix(reference.intrinsics))
     to_pixels = pinhole.matrix(other.intrinsics)
@@ -74,8 +72,9 @@ def plane_homographies(reference: Photo, other: Photo) -> tuple[np.ndarray, np.n
 
 
 class _Window:
-    """A picture, with mean and inverse deviation of the window around each pixel, and room to compare others with it:
-    arrays that are made once stay in the processor's cache, and two threads do not wait for new ones.
+    """An image with mean and inverse standard deviation of each window, and buffers for comparisons.
+
+    Buffers that are reused stay in the processor's cache, and two threads do not compete for the allocator.
     """
 
     def __init__(self, image: np.ndarray, window: int) -> None:
@@ -84,15 +83,16 @@ class _Window:
         variance = np.maximum(box(cv2.multiply(image, image), window) - self._mean * self._mean, 0)
         self._scale = 1.0 / np.sqrt(variance + NOISE**2)
         self._taps = np.full(window, 1 / window, np.float32)
-        self._room = tuple(np.empty((5, *image.shape), np.float32))
+        self._buffers = tuple(np.empty((5, *image.shape), np.float32))
 
-    def compared(self, other: np.ndarray, map_to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where another picture, warped by `map_to`, has a pixel, bool [H, W], and `min(1 - correlation, WORST)` there,
-        0 elsewhere, float32 [H, W]; the latter until the next call.
+    def compare(self, other: np.ndarray, homography: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the warped `other` has a pixel, bool [H, W], and the cost there, else 0, float32 [H, W].
+
+        The cost is a buffer, valid until the next call.
         """
-        warped, mean, square, product, spare = self._room
+        warped, mean, square, product, spare = self._buffers
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        cv2.warpPerspective(other, map_to, warped.shape[::-1], dst=warped, flags=flags, borderValue=-1e4)
+        cv2.warpPerspective(other, homography, warped.shape[::-1], dst=warped, flags=flags, borderValue=-1e4)
         inside = warped >= 0
         np.maximum(warped, 0, out=warped)
         self._mean_into(mean, warped)
@@ -106,16 +106,16 @@ class _Window:
         product *= self._scale
         product /= square
         np.subtract(1.0, product, out=product)
-        np.minimum(product, WORST, out=product)
+        np.minimum(product, MAX_COST, out=product)
         product *= inside
         return inside, product
 
     def _mean_into(self, mean: np.ndarray, image: np.ndarray) -> None:
-        """As `box`, in two thirds of its time, to 1e-7 of the largest value."""
+        """As `box`, to 1e-7 of the largest value, in two thirds of its time."""
         cv2.sepFilter2D(image, cv2.CV_32F, self._taps, self._taps, dst=mean, borderType=cv2.BORDER_REFLECT_101)
 
 
 def box(image: np.ndarray, window: int) -> np.ndarray:
-    """The mean of the `window` x `window` pixels around each."""
+    """Return the mean of the `window` x `window` pixels around each pixel."""
     mean: np.ndarray = cv2.boxFilter(image, cv2.CV_32F, (window, window), borderType=cv2.BORDER_REFLECT_101)
     return mean

@@ -1,8 +1,7 @@
-"""Multi-view stereo: dense depth of each keyframe from pictures and adjusted poses alone.
+"""Multi-view stereo: dense depth of each keyframe from images and adjusted poses.
 
-Each keyframe is compared with the neighbours that see its points from a good angle (`stereo_views.py`), plane by plane
-(`plane_sweep.py`); the costs are made a surface (`semi_global.py`), the surface gets a standard deviation
-(`uncertainty.py`), and what the neighbours' own surfaces do not confirm is dropped (`consistency.py`).
+Steps: view selection (`stereo_views.py`), plane sweep (`plane_sweep.py`), semi-global matching (`semi_global.py`),
+standard deviations (`uncertainty.py`), and the check that neighbours confirm the depth (`consistency.py`).
 """
 
 from __future__ import annotations
@@ -25,20 +24,22 @@ from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 
-LEAST_POINTS = 8
-"""Known points in view, below which nobody knows between which depths to search."""
-LARGEST_SIGMA = 0.05
-"""Largest relative standard deviation of a depth: what is known worse would only blur the map."""
-BLEND = 0.03
-"""Relative difference of neighbouring depths above which nothing between them is made up in a larger image."""
+MIN_POINTS = 8
+"""Known points in view needed to set the range of depths of the search."""
+MAX_SIGMA = 0.05
+"""Largest relative standard deviation of a depth: worse ones would only blur the map."""
+MAX_BLEND = 0.03
+"""Relative difference of neighbouring depths up to which upsampling interpolates between them."""
 
 
 @dataclass(frozen=True)
 class StereoSettings:
-    """views: neighbours that a keyframe is compared with, at most. planes: depths that are tried. size: longer side of
-    the pictures in the search, pixels. window: width of the compared windows there, odd. smooth, jump: penalties of the
-    regularisation, in units of 1 - correlation. margin: least lead of a pixel's plane, in the same unit. least_views:
-    how many neighbours must agree on a depth.
+    """Settings of the stereo.
+
+    Fields: views, maximum number of neighbours. planes, number of depths. size, longer side of the images in the
+    search, pixels. window, width of the correlation window there, odd. smooth and jump, penalties of the semi-global
+    matching, in units of 1 - correlation. margin, minimum margin of a pixel's plane, same unit. least_views, number of
+    neighbours that must confirm a depth.
     """
 
     views: int = 6
@@ -51,23 +52,25 @@ class StereoSettings:
     least_views: int = 2
 
     def __post_init__(self) -> None:
-        least = {"views": 1, "planes": 8, "size": 32, "window": 3, "least_views": 1}
-        for name, bound in least.items():
-            if getattr(self, name) < bound:
-                raise InputError(f"`{name}` is {getattr(self, name)}; it must be at least {bound}")
-        if self.window % 2 == 0 or not 0 < self.smooth <= self.jump:
-            raise InputError("`window` must be odd, and 0 < `smooth` <= `jump`; correct the settings of the stereo")
+        minima = {"views": 1, "planes": 8, "size": 32, "window": 3, "least_views": 1}
+        for name, minimum in minima.items():
+            if getattr(self, name) < minimum:
+                raise InputError(f"`{name}` must be at least {minimum}, got {getattr(self, name)}")
+        if self.window % 2 == 0:
+            raise InputError(f"`window` must be odd, got {self.window}")
+        if not 0 < self.smooth <= self.jump:
+            raise InputError(f"`smooth` must be positive and at most `jump`, got {self.smooth} and {self.jump}")
 
 
 def stereo_depths(
     keyframes: Sequence[Keyframe], intrinsics: np.ndarray, settings: StereoSettings | None = None
 ) -> list[DepthMap | None]:
-    """Depth of each keyframe by its neighbours' pictures; None where no neighbour sees what it sees.
+    """Return the depth of each keyframe from its neighbours' images; None if no neighbour overlaps.
 
     Args:
         keyframes: adjusted; poses world -> camera.
         intrinsics: float64 [4], pixels.
-        settings: of the search.
+        settings: of the stereo.
 
     """
     settings = settings or StereoSettings()
@@ -78,13 +81,11 @@ def stereo_depths(
     def search(i: int) -> PosedDepth | None:
         around = np.concatenate([points[j] for j in (i, *views[i])])
         depth_map = _search(around, photos[i], [photos[j] for j in views[i]], settings)
-        return (
-            None
-            if depth_map is None
-            else PosedDepth(depth_map.held_by(len(photos)), photos[i].pose, photos[i].intrinsics)
-        )
+        if depth_map is None:
+            return None
+        return PosedDepth(depth_map.compressed_for(len(photos)), photos[i].pose, photos[i].intrinsics)
 
-    found = map_in_threads(search, range(len(photos)))  # a search holds some 150 MB
+    found = map_in_threads(search, range(len(photos)))  # about 150 MB per search
     result: list[DepthMap | None] = []
     for i, own in enumerate(found):
         others = [other for j in views[i] if (other := found[j]) is not None]
@@ -92,36 +93,36 @@ def stereo_depths(
         if confirmed is None or confirmed.empty:
             result.append(None)
         else:
-            result.append(enlarged(confirmed, keyframes[i].size).held_by(len(keyframes)))
+            result.append(upsample(confirmed, keyframes[i].size).compressed_for(len(keyframes)))
     return result
 
 
 def _photo(keyframe: Keyframe, intrinsics: np.ndarray, size: int) -> Photo:
-    """The keyframe's picture with a longer side of at most `size` pixels."""
+    """The keyframe's image, reduced to a longer side of at most `size` pixels."""
     grey = cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     height, width = grey.shape
     scale = min(1.0, size / max(height, width))
     small = (round(width * scale), round(height * scale))
     ratio = np.array([small[0] / width, small[1] / height] * 2)
-    half = np.array([0.0, 0.0, 0.5, 0.5])  # a pixel's centre lies at whole numbers, the image's border half a pixel off
+    half = np.array([0.0, 0.0, 0.5, 0.5])  # pixel centres are integers, so that the image begins at -0.5
     scaled = (np.asarray(intrinsics, np.float64) + half) * ratio - half
     return Photo(cv2.resize(grey, small, interpolation=cv2.INTER_AREA), keyframe.pose, scaled)
 
 
 def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo], settings: StereoSettings) -> DepthMap | None:
-    """The depth of one picture, not yet confirmed by others. points: float64 [n, 3], world, what the map knows."""
+    """Depth of one image, before it is confirmed by others. points: float64 [n, 3], world, sets the range of depths."""
     planes = _planes(points, photo, settings.planes)
     if planes is None or not others:
         return None
     cost = matching_cost(photo, others, planes, settings.window)
-    place, margin = (
+    position, margin = (
         np.asarray(value)
         for value in semi_global(jnp.asarray(cost), jnp.asarray(photo.grey), smooth=settings.smooth, jump=settings.jump)
     )
     step = float(planes[1] - planes[0])
-    inverse = (planes[0] + step * place).astype(np.float32)
+    inverse = (planes[0] + step * position).astype(np.float32)
     seen = support(photo, others, inverse, step, settings.window)
-    good = (seen.views >= 1) & (margin > settings.margin) & (seen.sigma < LARGEST_SIGMA * inverse)
+    good = (seen.views >= 1) & (margin > settings.margin) & (seen.sigma < MAX_SIGMA * inverse)
     nan = np.float32(np.nan)
     return DepthMap(
         np.where(good, 1.0 / inverse, nan).astype(np.float32),
@@ -131,17 +132,17 @@ def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo], settings:
 
 
 def _planes(points: np.ndarray, photo: Photo, count: int) -> np.ndarray | None:
-    """Inverse depths to try: from 0.6 of the least to 1.5 of the largest that the map's points in view have."""
+    """Inverse depths of the planes: from 0.6 of the smallest to 1.5 of the largest of the map's points in view."""
     local = points @ photo.pose[:3, :3].T + photo.pose[:3, 3]
     inside, _, _ = pinhole.visible(local, photo.intrinsics, (photo.grey.shape[0], photo.grey.shape[1]))
-    if np.count_nonzero(inside) < LEAST_POINTS:
+    if np.count_nonzero(inside) < MIN_POINTS:
         return None
     low, high = np.quantile(1.0 / local[inside, 2], [0.02, 0.98])
     return np.linspace(0.6 * low, 1.5 * high, count)
 
 
-def enlarged(depth_map: DepthMap, shape: Sequence[int]) -> DepthMap:
-    """The depth map at the size of an image (height, width): interpolated on one surface, else the nearest."""
+def upsample(depth_map: DepthMap, shape: Sequence[int]) -> DepthMap:
+    """Return the depth map at (height, width): interpolated on one surface, nearest neighbour at depth edges."""
     size = (shape[1], shape[0])
     linear = cv2.resize(1.0 / depth_map.depth, size, interpolation=cv2.INTER_LINEAR)
     nearest, sigma, confidence = (
@@ -149,5 +150,5 @@ def enlarged(depth_map: DepthMap, shape: Sequence[int]) -> DepthMap:
         for part in (1.0 / depth_map.depth, depth_map.sigma, depth_map.confidence)
     )
     with np.errstate(invalid="ignore"):
-        blend = np.abs(linear - nearest) < BLEND * nearest
+        blend = np.abs(linear - nearest) < MAX_BLEND * nearest
     return DepthMap(1.0 / np.where(blend, linear, nearest), sigma, confidence)

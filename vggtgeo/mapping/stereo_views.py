@@ -1,4 +1,4 @@
-"""Which keyframes are compared with which: those that see the same points from a useful angle."""
+"""View selection for multi-view stereo: neighbours that see the same points with enough parallax."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 GOOD_ANGLE = np.radians(3.0)
-"""Triangulation angle from which a neighbour counts in full: below it depth is uncertain."""
+"""Triangulation angle from which the weight is 1: below it depth is uncertain."""
 WIDE_ANGLE = np.radians(12.0)
-"""Above it windows of slanted surfaces, floors above all, look too different: it counts less and less."""
-LEAST_SCORE = 0.08
-"""A neighbour that sees less than this share of the points is left out."""
-MOST_POINTS = 150
+"""Above it the weight falls: windows on slanted surfaces, such as floors, look too different."""
+MIN_SCORE = 0.08
+"""Neighbours with a lower score are left out."""
+MAX_POINTS = 150
+"""Points that are scored, of a keyframe's: a sample, for speed."""
 
 
 def known_points(keyframe: Keyframe, intrinsics: np.ndarray) -> np.ndarray:
-    """World points float64 [n, 3] of the keyframe's key points and line samples whose depth is known."""
+    """Return the keyframe's key points and line samples of known depth as world points, float64 [n, 3]."""
     parts = []
     for slots in (keyframe.points, keyframe.samples):
         known = np.isfinite(slots.inverse_depth) & (slots.inverse_depth > 0.02)
@@ -28,27 +29,27 @@ def known_points(keyframe: Keyframe, intrinsics: np.ndarray) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def choose_views(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, most: int) -> list[tuple[int, ...]]:
-    """For each keyframe the places in `keyframes` of its best neighbours, at most `most`, the best first.
+def choose_views(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, max_views: int) -> list[tuple[int, ...]]:
+    """Return for each keyframe the indices in `keyframes` of its best neighbours, at most `max_views`, best first.
 
-    The score of a neighbour is the mean over the keyframe's known points of a weight that is 0 where it does not see
-    the point, and else rises with the triangulation angle to `GOOD_ANGLE` and falls beyond `WIDE_ANGLE` (as the view
-    selection of COLMAP does: Schoenberger et al., "Pixelwise view selection for unstructured multi-view stereo", ECCV
-    2016).
+    The score of a neighbour is the mean weight of the keyframe's known points: 0 where the point is not visible, else
+    rising with the triangulation angle to `GOOD_ANGLE` and falling beyond `WIDE_ANGLE`, as in COLMAP's view selection
+    (Schoenberger et al., "Pixelwise view selection for unstructured multi-view stereo", ECCV 2016).
     """
     centres = np.array([rigid.centre(keyframe.pose) for keyframe in keyframes]).reshape(-1, 3)
     chosen: list[tuple[int, ...]] = []
     for i, keyframe in enumerate(keyframes):
         points = known_points(keyframe, intrinsics)
-        points = points[:: max(1, len(points) // MOST_POINTS)]
+        points = points[:: max(1, len(points) // MAX_POINTS)]
         if not len(points):
             chosen.append(())
             continue
-        reach = float(np.median(np.linalg.norm(points - centres[i], axis=1)))
-        near = np.nonzero(np.linalg.norm(centres - centres[i], axis=1) < reach)[0]
+        # A baseline longer than the median depth gives angles beyond `WIDE_ANGLE`: such keyframes are not scored.
+        depth = float(np.median(np.linalg.norm(points - centres[i], axis=1)))
+        near = np.nonzero(np.linalg.norm(centres - centres[i], axis=1) < depth)[0]
         scores = {j: _score(points, centres[i], keyframes[j], intrinsics) for j in near.tolist() if j != i}
         ranked = sorted(scores, key=lambda j: -scores[j])
-        chosen.append(tuple(j for j in ranked[:most] if scores[j] > LEAST_SCORE))
+        chosen.append(tuple(j for j in ranked[:max_views] if scores[j] > MIN_SCORE))
     return chosen
 
 

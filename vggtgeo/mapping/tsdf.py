@@ -1,11 +1,10 @@
-"""A mesh of all depth maps: a truncated signed distance, averaged in blocks of voxels near the surface.
+"""TSDF fusion: a truncated signed distance function in sparse blocks of voxels, and its mesh.
 
-Each voxel holds the weighted mean of `min((z_measured - z_voxel) / t, 1)` over the keyframes that measure at it
-(Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996), the weight of a
-measurement being its confidence by its variance. Blocks are made only where a depth map has a surface, as in voxel
-hashing (Niessner et al., "Real-time 3D reconstruction at scale using voxel hashing", SIGGRAPH Asia 2013), and worked
-on in batches, so that memory is bounded by a batch and the mesh. Neighbouring blocks share a layer of voxels: their
-surfaces meet without a seam.
+Each voxel has the weighted mean of `min((z_measured - z_voxel) / t, 1)` over the keyframes that measure it (Curless and
+Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996), weighted by confidence over
+variance. Blocks exist only near surfaces, as in voxel hashing (Niessner et al., "Real-time 3D reconstruction at scale
+using voxel hashing", SIGGRAPH Asia 2013). They are processed in batches, which bounds the memory. Neighbouring blocks
+share a layer of voxels, so that their meshes meet without a seam.
 """
 
 from __future__ import annotations
@@ -37,24 +36,22 @@ SIDE = 16
 TRUNCATION = 4.0
 """Of the distance, in voxels."""
 FREE = 4.0
-"""As far in front of a surface a view says that nothing is there, in truncations: a block at most, see `together`."""
+"""Distance in front of a surface that a view marks as free, in truncations: at most a block, see `views_near`."""
 BATCH = 512
-"""Blocks that a thread holds at a time: 60 MB."""
+"""Blocks per thread at a time: 60 MB."""
 GROUP = 32
-"""Blocks that one compiled call works on."""
-LEAST_CONFIDENCE = 0.5
-"""Of a pixel that takes part, as in the cloud: below it lies a jump of depth, and no surface."""
-FARTHEST = 2**24 // SIDE
-"""Blocks from the origin: float32 tells the voxels apart up to there, 335 km at 2 cm."""
-LEAST_PART = 200
-"""Faces of the smallest separate piece of surface that is kept: smaller ones are false depths."""
+"""Blocks per compiled call."""
+MIN_CONFIDENCE = 0.5
+"""Of a pixel that is fused, as in the cloud: less confident pixels lie at depth edges."""
+MAX_BLOCKS = 2**24 // SIDE
+"""Blocks from the origin up to which float32 resolves voxels: 335 km at 2 cm."""
+MIN_FACES = 200
+"""Of a connected part of the mesh: smaller ones are outliers of depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A depth map with its picture (uint8 [H, W, 3], perhaps compressed) and camera. pose: world -> camera; intrinsics:
-    of both.
-    """
+    """A depth map with image (uint8 [H, W, 3], may be compressed), pose (world -> camera) and intrinsics."""
 
     depth_map: DepthMap
     image: np.ndarray | CompressedImage
@@ -62,21 +59,21 @@ class View:
     intrinsics: np.ndarray
 
 
-def around(block: Block) -> list[Block]:
-    """A block and all that touch it."""
+def neighbourhood(block: Block) -> list[Block]:
+    """Return a block and its 26 neighbours."""
     x, y, z = block
     return [(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
 
 
-def together(block: Block, seen_by: Mapping[Block, Collection[int]]) -> list[int]:
-    """The views of a block and of all that touch it: whoever says something within `FREE` of a voxel is among them."""
-    return sorted({number for other in around(block) for number in seen_by.get(other, ())})
+def views_near(block: Block, seen_by: Mapping[Block, Collection[int]]) -> list[int]:
+    """Return the views of a block and its neighbours: all that measure a voxel within `FREE` are among them."""
+    return sorted({number for other in neighbourhood(block) for number in seen_by.get(other, ())})
 
 
 def blocks_of(view: View, voxel: float) -> list[Block]:
-    """Corners, in blocks, of those that the view's surface passes within the truncation."""
+    """Return the blocks within the truncation of the view's surface."""
     depth = view.depth_map.depth
-    step = max(1, max(depth.shape) // 160)  # some centimetres apart, where a block is some tens wide
+    step = max(1, max(depth.shape) // 160)  # samples some centimetres apart; a block is some tens of centimetres wide
     rows, columns = np.nonzero(np.isfinite(depth[::step, ::step]))
     pixels = np.column_stack([columns, rows]).astype(np.float64) * step
     z = depth[::step, ::step][rows, columns].astype(np.float64)
@@ -84,7 +81,7 @@ def blocks_of(view: View, voxel: float) -> list[Block]:
     reach = TRUNCATION * voxel
     local = np.concatenate([rays * (z + offset)[:, None] for offset in (-reach, 0.0, reach)])
     places = np.floor((local - view.pose[:3, 3]) @ view.pose[:3, :3] / (SIDE * voxel))
-    cells = places[(np.abs(places) < FARTHEST).all(1)].astype(int)
+    cells = places[(np.abs(places) < MAX_BLOCKS).all(1)].astype(int)
     _, first = np.unique(cell_numbers(cells), return_index=True)
     return list(map(tuple, cells[first].tolist()))
 
@@ -96,8 +93,8 @@ def meshes_of(
     voxel: float,
     least: int,
 ) -> list[Mesh | None]:
-    """The mesh of each block, at most `BATCH` of them, None where there is none."""
-    # Always as many rows, so that one compiled function serves; the last is where the filling of a group goes to.
+    """Return the mesh of each of at most `BATCH` blocks, None without a surface. least: views a voxel needs."""
+    # A constant number of rows, so that the function compiles once; the padding of a group is added to the last row.
     sums = jnp.zeros((BATCH + 1, SIDE + 1, SIDE + 1, SIDE + 1, 6), jnp.float32)
     rows_of: dict[int, list[int]] = defaultdict(list)
     for row, block in enumerate(blocks):
@@ -120,10 +117,10 @@ def meshes_of(
 
 
 def _packed(view: View) -> Array:
-    """Depth (0 = none), weight and colour of each pixel, float32 [H, W, 5]: one read a voxel."""
-    depth_map = view.depth_map.opened()
+    """Depth (0 = unknown), weight and colour of each pixel, float32 [H, W, 5]: a single gather per voxel."""
+    depth_map = view.depth_map.decoded()
     sigma = np.maximum(depth_map.sigma * depth_map.depth, 1e-3)
-    good = np.isfinite(depth_map.depth) & (depth_map.confidence >= LEAST_CONFIDENCE)
+    good = np.isfinite(depth_map.depth) & (depth_map.confidence >= MIN_CONFIDENCE)
     packed = np.zeros((*depth_map.depth.shape, 5), np.float32)
     np.copyto(packed[..., 0], depth_map.depth, where=good)
     np.copyto(packed[..., 1], depth_map.confidence / sigma**2, where=good)
@@ -141,11 +138,10 @@ def _with_view(
     intrinsics: Float[Array, " 4"],
     reach: float | Float[Array, ""],
 ) -> Float[Array, "n i j k 6"]:
-    """The sums of blocks, in place, with what one view adds to the voxels of some rows of them: weight times distance
-    and colour, the weight, and 1.
+    """Add one view to the sums of some blocks, in place: weight times distance and colour, weight, and 1.
 
-    corners: of those blocks, in voxels. motion: from places in voxels to the view's frame. A voxel that two blocks
-    share is computed from the same numbers in the same order, so that both find the same.
+    rows, corners: row and corner in voxels of these blocks. motion: from voxel coordinates to the view's frame. A voxel
+    that two blocks share is computed by the same operations in the same order, so that both values are identical.
     """
     steps = (corners[:, :, None] + jnp.arange(SIDE + 1)).astype(jnp.float32)
     x, y, z = (
@@ -163,7 +159,7 @@ def _with_view(
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & ahead
     seen = pixels[jnp.clip(v, 0, height - 1), jnp.clip(u, 0, width - 1)]
     distance = seen[..., :1] - z[..., None]
-    # In front it is free, to a limit beyond which a view says nothing: whether a block asks it depends on the block.
+    # Beyond `FREE` in front of the surface a view must not count: whether a block includes it depends on the block.
     weight = jnp.where(inside[..., None] & (distance >= -reach) & (distance <= FREE * reach), seen[..., 1:2], 0.0)
     values = jnp.concatenate([jnp.minimum(distance / reach, 1.0), seen[..., 2:]], axis=-1)
     added = jnp.concatenate([weight * values, weight, (weight > 0).astype(jnp.float32)], axis=-1)
@@ -171,7 +167,7 @@ def _with_view(
 
 
 def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -> Mesh | None:
-    """The zero crossing in one block, in cubes that are known at all corners; None where there is none."""
+    """Marching cubes in one block, in cubes known at all corners; None without a surface."""
     weight = volume[..., 4]
     known = volume[..., 5] >= least
     distance = np.where(known, volume[..., 0] / np.where(known, weight, 1), 1.0)
@@ -179,7 +175,7 @@ def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -
         return None
     try:
         places, faces, normals, _ = marching_cubes(distance, 0.0, mask=known)
-    except (ValueError, RuntimeError):  # skimage's way to say that no cube is known at all its corners
+    except (ValueError, RuntimeError):  # raised by skimage if no cube is known at all corners
         return None
     faces = faces[_in_known_cubes(places[faces].mean(axis=1), known)]
     if not len(faces):
@@ -189,14 +185,15 @@ def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -
     return Mesh(
         ((corner + places) * voxel).astype(np.float32),
         faces.astype(np.int32),
-        -normals.astype(np.float32),  # skimage has them towards smaller values: into the surface
+        -normals.astype(np.float32),  # skimage's point towards smaller values, into the surface
         np.clip(np.stack(near, axis=1), 0, 255).round().astype(np.uint8),
     )
 
 
 def _in_known_cubes(centres: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Whether all corners of the cube around each face's centre [m, 3] are known: skimage's mask asks one corner only,
-    and would close the surface at the border of what was seen.
+    """Whether all corners of the cube around each face's centre [m, 3] are known.
+
+    skimage's mask checks one corner only, which would close the surface at the border of the measured volume.
     """
     whole = known
     for axis in range(3):
@@ -205,11 +202,11 @@ def _in_known_cubes(centres: np.ndarray, known: np.ndarray) -> np.ndarray:
     return inside
 
 
-def joined(parts: Sequence[Mesh], voxel: float) -> Mesh:
-    """One mesh; vertices that blocks share become one."""
+def merge_meshes(parts: Sequence[Mesh], voxel: float) -> Mesh:
+    """Merge the meshes of blocks and their shared vertices."""
     if not parts:
-        nothing = np.zeros((0, 3), np.float32)
-        return Mesh(nothing, np.zeros((0, 3), np.int32), nothing, nothing.astype(np.uint8))
+        empty = np.zeros((0, 3), np.float32)
+        return Mesh(empty, np.zeros((0, 3), np.int32), empty, empty.astype(np.uint8))
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)])
     vertices, normals, colours = (
@@ -222,8 +219,8 @@ def joined(parts: Sequence[Mesh], voxel: float) -> Mesh:
     return Mesh(vertices[first], faces[~flat].astype(np.int32), normals[first], colours[first])
 
 
-def without_crumbs(mesh: Mesh) -> Mesh:
-    """The mesh without pieces of fewer than `LEAST_PART` faces, and without vertices that no face has."""
+def remove_small_parts(mesh: Mesh) -> Mesh:
+    """Remove connected parts of fewer than `MIN_FACES` faces, and unused vertices."""
     count = len(mesh.vertices)
     if not len(mesh.faces):
         return mesh
@@ -231,7 +228,7 @@ def without_crumbs(mesh: Mesh) -> Mesh:
     graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, piece = connected_components(graph, directed=False)
     size = np.bincount(piece[mesh.faces[:, 0]], minlength=piece.max() + 1)
-    faces = mesh.faces[size[piece[mesh.faces[:, 0]]] >= LEAST_PART]
+    faces = mesh.faces[size[piece[mesh.faces[:, 0]]] >= MIN_FACES]
     used = np.unique(faces)
     renumbered = np.zeros(count, np.int32)
     renumbered[used] = np.arange(len(used), dtype=np.int32)

@@ -1,18 +1,17 @@
-"""How sure a depth from pictures is: what image noise, the grid of planes and the width of windows leave.
+"""Uncertainty of stereo depth: image noise, discretisation by planes, and window size.
 
-At inverse depth `d(x)`, neighbour `j` shows at pixel `x` of the reference `W_j(x) = I_j(u_j(x, d(x)))`. In a window
-around `x`, with means removed and the contrast adapted, the residual is `r_j = I - W_j` and its derivative by a common
-shift of `d` is `g_j = grad I_j . du_j/dd`. The noise `n` of the reference's own pixels is in every `r_j = n - n_j`, so
-that the residuals of several neighbours are no independent measurements. With all images of one noise `s`, least
-squares over the window has
+At inverse depth `d(x)`, neighbour `j` shows `W_j(x) = I_j(u_j(x, d(x)))` at pixel `x` of the reference. In a window
+around `x`, after removing means and matching contrast, the residual is `r_j = I - W_j`, and its derivative with respect
+to a common shift of `d` is `g_j = grad I_j . du_j/dd`. The noise `n` of the reference is in every `r_j = n - n_j`, so
+that the residuals of several neighbours are correlated. If all images have noise `s`, least squares over the window
+has the variance
 
     var_photo(d) = s^2 sum_x ((sum_j g_j)^2 + sum_j g_j^2) / (sum_x sum_j g_j^2)^2,     s^2 = mean of r^2 / 2.
 
-The regularisation spreads what one window knows over its surroundings: `POOL` independent windows' worth within `REACH`
-windows. To it come the sub-plane fraction, which the parabola finds to `GRID` of a step between planes, and the place
-of the window: its depth is that of a pixel within `PLACE` of its middle, which matters where depth is slanted. Within
-half a window of a jump of depth a pixel may belong to either side (`JUMP` of the difference). Poses are as good as the
-images allow, which `FLOOR` says in pixels.
+The regularisation shares information between windows: that of `POOL` independent windows within `REACH` windows. Added
+to it are the error of the sub-plane parabola (`GRID` steps between planes), of the position in the window to which its
+depth belongs (`POSITION` pixels, times the slope of depth), of pixels within half a window of a depth edge, which may
+belong to either side (`JUMP` times the difference), and of the poses (`POSE` pixels).
 """
 
 from __future__ import annotations
@@ -25,23 +24,22 @@ import numpy as np
 
 from vggtgeo.mapping.plane_sweep import NOISE, Photo, box
 
-AGREES = 0.3
-"""Least correlation of windows, damped by noise, at which a neighbour takes part: below it sees something else."""
+MIN_CORRELATION = 0.3
+"""Of windows, with noise in the variances: neighbours below it are occluded."""
 POOL = 4.0
 REACH = 5
 GRID = 0.15
-PLACE = 0.7
-FLOOR = 0.05
+POSITION = 0.7
+POSE = 0.05
 JUMP = 0.3
-NO_JUMP = 2.0
-"""Steps between planes by which the surface may bend within half a window without a jump: what its noise makes
-there."""
+MAX_BEND = 2.0
+"""Steps between planes by which noise bends the surface within half a window; more is a depth edge."""
 
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """sigma: float32 [H, W], standard deviation of the inverse depth, 1/m. views: int [H, W], in how many neighbours'
-    pictures the pixel's point falls.
+    """sigma: float32 [H, W], standard deviation of the inverse depth, 1/m. views: int [H, W], number of neighbours
+    whose image contains the pixel's point.
     """
 
     sigma: np.ndarray
@@ -49,14 +47,14 @@ class Support:
 
 
 def support(reference: Photo, others: Sequence[Photo], inverse_depth: np.ndarray, step: float, window: int) -> Support:
-    """What the pictures say of each pixel's inverse depth.
+    """Return standard deviation and number of views of each pixel's inverse depth.
 
     Args:
-        reference: whose pixels are asked.
+        reference: image of the inverse depth.
         others: its neighbours.
         inverse_depth: float32 [H, W], 1/m.
-        step: between the planes that were searched, 1/m.
-        window: width of the windows, pixels, odd.
+        step: between the searched planes, 1/m.
+        window: width of the correlation window, pixels, odd.
 
     """
     zero = np.zeros(reference.grey.shape, np.float32)
@@ -69,7 +67,7 @@ def support(reference: Photo, others: Sequence[Photo], inverse_depth: np.ndarray
         centred = np.where(inside, warped, 0) - box(np.where(inside, warped, 0), window)
         variance = box(centred * centred, window)
         correlation = box(own * centred, window) / np.sqrt((variance + NOISE**2) * (own_variance + NOISE**2))
-        good = inside & (correlation > AGREES)
+        good = inside & (correlation > MIN_CORRELATION)
         gain = np.sqrt((own_variance + NOISE**2) / (variance + NOISE**2))
         rate = gain * (rate - box(rate, window))
         information += np.where(good, box(rate * rate, window), 0)
@@ -83,14 +81,14 @@ def support(reference: Photo, others: Sequence[Photo], inverse_depth: np.ndarray
     known = window**2 * np.maximum(information, 0) ** 2 / (noise * spread)
     photometric = 1.0 / np.maximum(known + POOL * box(known, REACH * window), 1e-12)
     slope = np.hypot(*(cv2.Scharr(inverse_depth, cv2.CV_32F, *axis) / 32 for axis in ((1, 0), (0, 1))))
-    poses = FLOOR * views / np.maximum(lever, 1e-9)
-    jump = JUMP * np.maximum(_bend(inverse_depth, window // 2) - NO_JUMP * step, 0)
-    sigma = np.sqrt(photometric + (GRID * step) ** 2 + (PLACE * slope) ** 2 + jump**2 + poses**2)
+    poses = POSE * views / np.maximum(lever, 1e-9)
+    jump = JUMP * np.maximum(_bend(inverse_depth, window // 2) - MAX_BEND * step, 0)
+    sigma = np.sqrt(photometric + (GRID * step) ** 2 + (POSITION * slope) ** 2 + jump**2 + poses**2)
     return Support(sigma.astype(np.float32), views.astype(np.int32))
 
 
 def _bend(inverse_depth: np.ndarray, reach: int) -> np.ndarray:
-    """By how much the inverse depth departs from a plane (on which it is affine) within `reach` pixels."""
+    """Deviation of the inverse depth from a plane (on which it is affine) within `reach` pixels."""
     padded = cv2.copyMakeBorder(inverse_depth, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
     middle = slice(reach, -reach)
     across = np.abs(padded[middle, 2 * reach :] - 2 * inverse_depth + padded[middle, : -2 * reach])
@@ -100,8 +98,8 @@ def _bend(inverse_depth: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _seen(reference: Photo, other: Photo, inverse_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each pixel: what `other` shows there (-1 outside), its derivative by the inverse depth, and by how many
-    pixels the place moves; float32 [H, W] each.
+    """Grey level of `other` at each pixel's point (below 0 outside), its derivative with respect to inverse depth, and
+    the pixels that the projection moves per inverse depth; float32 [H, W] each.
     """
     height, width = inverse_depth.shape
     relative = (other.pose @ np.linalg.inv(reference.pose)).astype(np.float32)

@@ -1,3 +1,3 @@
-"""The page of a run: one self-contained HTML file with everything that a person looks at first."""
+"""The report of a run: a self-contained HTML file."""
 
 from vggtgeo.report.page import write_page as write_page

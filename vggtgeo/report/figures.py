@@ -1,4 +1,4 @@
-"""The drawings of a run's page, as SVG that takes its colours from the page, and its pictures, as data URIs."""
+"""Figures of the report: SVG with the colours of the page's style sheet, and images as data URIs."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ COLOURS = {
     "#bbbbbb": "var(--rule)",
     "#e3e3e3": "var(--grid)",
 }
-"""Colours of the drawings, and the variables of the page that stand in for them."""
+"""Colours of the figures, and the variables of the style sheet that replace them."""
 _TERMS = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8e5fb0", "#b0413e")
-"""Of the terms of a window, in their order, then from the first again."""
+"""Colours of the terms of a window, repeated if there are more."""
 _WIDTH = 4.6
-"""Inches: read at about its own size, on a desk as on a phone."""
+"""Inches: legible at its own size on a desktop and on a phone."""
 
 
 def trajectory_svg(
     estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory, with_scale: bool, metres: bool = True
 ) -> str:
-    """Top and side view of the path; metres: the unit of the truth."""
+    """Return the top and side view of the path. metres: whether the ground truth is in metres."""
     figure = trajectory_figure(estimate, truth, keyframes, with_scale, None, _WIDTH + 0.4, metres)
     return svg(figure)
 
 
 def residuals_svg(records: Sequence[WindowRecord]) -> str:
-    """RMS residual of each term over the frames' times, the terms of one unit together."""
+    """Return the RMS residuals of all terms over time, one panel per unit."""
     figure = Figure(figsize=(_WIDTH, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     units = {name: unit for record in records for name, unit in record.units.items()}
@@ -61,12 +61,12 @@ def residuals_svg(records: Sequence[WindowRecord]) -> str:
         calm(axes)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize=9, labelcolor="#333333", ncols=2)
-    rows[kinds[-1]].set_xlabel("seconds of the sequence")
+    rows[kinds[-1]].set_xlabel("time [s]")
     return svg(figure)
 
 
 def picture(image: UInt8[np.ndarray, "h w 3"], width: int, quality: int = 82) -> str:
-    """An RGB image as the data URI of a JPEG, at most `width` pixels wide."""
+    """Return an RGB image as the data URI of a JPEG, at most `width` pixels wide."""
     scale = min(1.0, width / image.shape[1])
     if scale < 1.0:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -76,7 +76,7 @@ def picture(image: UInt8[np.ndarray, "h w 3"], width: int, quality: int = 82) ->
 
 
 def depth_colours(depth: Float[np.ndarray, "h w"], low: float, high: float) -> UInt8[np.ndarray, "h w 3"]:
-    """Depth from `low` (bright) to `high` (dark) metres; what is not known is grey."""
+    """Colour depth from `low` (bright) to `high` (dark) metres; unknown depth is grey."""
     share = np.clip((high - np.nan_to_num(depth, nan=high)) / max(high - low, 1e-6), 0.0, 1.0)
     image = _map_colours(share)
     image[~np.isfinite(depth)] = 128
@@ -84,7 +84,7 @@ def depth_colours(depth: Float[np.ndarray, "h w"], low: float, high: float) -> U
 
 
 def confidence_colours(confidence: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Confidence from none (dark) to full (bright)."""
+    """Colour confidence from 0 (dark) to 255 (bright)."""
     return _map_colours(confidence / 255.0)
 
 
@@ -93,7 +93,7 @@ def _map_colours(share: np.ndarray) -> np.ndarray:
 
 
 def calm(axes: Any) -> None:
-    """Axes in the quiet colours of the page."""
+    """Style axes with the colours of the page."""
     axes.grid(color="#e3e3e3", lw=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(colors="#333333", labelsize=9)
@@ -104,7 +104,7 @@ def calm(axes: Any) -> None:
 
 
 def svg(figure: Figure) -> str:
-    """The `<svg>` element, text as text, transparent, its colours the page's; the same bytes for the same figure."""
+    """Return the `<svg>` element: transparent, with text elements and the page's colours; deterministic."""
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "vggtgeo"}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
@@ -120,7 +120,7 @@ def svg(figure: Figure) -> str:
 
 
 def _unique_ids(svg: str) -> str:
-    """Identifiers with a prefix of their own: two drawings of one page must not share them."""
+    """Prefix the identifiers: two figures in one page must not share them."""
     prefix = f"f{zlib.crc32(svg.encode())}-"
     svg = re.sub(r'\bid="', f'id="{prefix}', svg)
     return re.sub(r'(url\(#|href="#)', rf"\1{prefix}", svg)

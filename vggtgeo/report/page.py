@@ -1,4 +1,4 @@
-"""From the end of a run to `report.html`: what is shown is chosen here, how it looks is `page.html.j2`'s business."""
+"""Write `report.html`: this file selects the content, `page.html.j2` has the layout."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _Value = TypeVar("_Value")
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""
 VERDICT_LINES = {
-    "good": "Good: nothing that was checked contradicts this result.",
-    "degraded": "Degraded: something contradicts this result, or is missing from it.",
-    "failed": "Failed: this result is not to be used.",
+    "good": "Good: no check contradicts this result.",
+    "degraded": "Degraded: a check contradicts this result, or parts of it are missing.",
+    "failed": "Failed: do not use this result.",
 }
 _SAMPLE_WIDTH = 300
 """Pixels."""
@@ -37,7 +37,7 @@ _SAMPLE_WIDTH = 300
 
 @dataclass(frozen=True)
 class Fact:
-    """A number at the head of the page."""
+    """A number at the top of the page."""
 
     value: str
     name: str
@@ -45,7 +45,7 @@ class Fact:
 
 @dataclass(frozen=True)
 class Sample:
-    """A keyframe's pictures, as data URIs; no depth where there is none."""
+    """Images of a keyframe as data URIs; depth and confidence may be None."""
 
     name: str
     image: str
@@ -55,7 +55,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Stage:
-    """Seconds of a stage, and its share of the longest."""
+    """Duration of a stage, s, and its share of the longest."""
 
     name: str
     seconds: float
@@ -75,19 +75,19 @@ def write_page(
     verdict: Verdict,
     warnings: Sequence[str] = (),
 ) -> None:
-    """Writes the page of a run, one HTML file that needs nothing else, atomically.
+    """Write the report of a run, a self-contained HTML file, atomically.
 
     Args:
-        path: the file.
-        slam: the last state, with at least one frame.
+        path: of the file.
+        slam: last state, with at least one frame.
         title: of the page.
-        truth: camera -> world, drawn beside the estimate where it is known.
+        truth: ground truth, camera -> world, drawn beside the estimate.
         cloud: the map.
         depth_maps: dense depth of each keyframe.
-        records: one an adjustment of the window, in order.
-        summary: what `summary.json` holds.
-        verdict: how far the result can be trusted; the first thing on the page.
-        warnings: what was said about the input; the state's own notes come after them.
+        records: one per adjustment of the window, in order.
+        summary: content of `summary.json`.
+        verdict: how far the result can be trusted; the first part of the page.
+        warnings: about the input; the state's notes follow.
 
     """
     trajectory = frame_trajectory(slam)
@@ -104,7 +104,7 @@ def write_page(
         verdict_line=VERDICT_LINES[verdict.level],
         timeline=_timeline(verdict),
         warnings=[*warnings, *slam.notes],
-        trajectory=_path_drawn(slam, trajectory, truth, summary.get("truth", {}).get("in_metres", True)),
+        trajectory=_draw_trajectory(slam, trajectory, truth, summary.get("truth", {}).get("in_metres", True)),
         has_truth=truth is not None,
         residuals=figures.residuals_svg(records) if records else None,
         map_above=_map_picture(map_view.from_above, cloud, trajectory),
@@ -124,24 +124,22 @@ def write_page(
     write_text(path, text)
 
 
-def _path_drawn(slam: Slam, trajectory: Trajectory, truth: Trajectory | None, metres: bool) -> str:
-    """Empty where no frame has a pose: one that is sought in a map that is known may be in another place. metres: the
-    unit of the truth.
-    """
+def _draw_trajectory(slam: Slam, trajectory: Trajectory, truth: Trajectory | None, metres: bool) -> str:
+    """The figure as SVG; empty if no frame was localised in a known map. metres: whether the truth is in metres."""
     if not len(trajectory):
         return ""
     return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric, metres)
 
 
 def template(package: str, name: str) -> jinja2.Template:
-    """The template of a page, a file of `package`; what is put into it is escaped."""
+    """Load a page's template, a file of `package`, with autoescaping."""
     text = (files(package) / name).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(text)
 
 
 def style() -> str:
-    """The style sheet of all pages: light and dark, desk and phone."""
+    """Return the style sheet of all pages: light and dark mode, desktop and phone."""
     return (files("vggtgeo.report") / "style.css").read_text(encoding="utf-8")
 
 
@@ -151,9 +149,9 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
         Fact(f"{summary['keyframes']}", "keyframes"),
     ]
     if "frames_per_second" in summary:
-        facts.append(Fact(f"{summary['frames_per_second']:.1f}", "frames a second"))
+        facts.append(Fact(f"{summary['frames_per_second']:.1f}", "frames per second"))
     if summary["scale"] == "metric":
-        facts.append(Fact(f"{trajectory.length:.2f} m", "length of the path"))
+        facts.append(Fact(f"{trajectory.length:.2f} m", "path length"))
     if (truth := summary.get("truth")) is not None:
         aligned, name = ("ate_se3_m", "SE(3)") if slam.metric and truth["in_metres"] else ("ate_sim3_m", "Sim(3)")
         error = truth[aligned]["rmse"]
@@ -165,7 +163,7 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
 
 
 def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
-    """Level, share of the run in percent, and a text of each segment; empty where the whole run is of one kind."""
+    """Level, share of the run in percent, and description of each segment; empty for a single segment."""
     frames = sum(part.end - part.start + 1 for part in verdict.segments)
     if len(verdict.segments) < 2:
         return []
@@ -174,16 +172,14 @@ def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
             part.level,
             100 * (part.end - part.start + 1) / frames,
             f"frames {part.start} to {part.end}, {part.start_time:.2f} to {part.end_time:.2f} s: "
-            + (", ".join(part.checks) or "nothing to say"),
+            + (", ".join(part.checks) or "no finding"),
         )
         for part in verdict.segments
     ]
 
 
 def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[str, list[str]]]:
-    """Rows of errors: RMSE, mean, median, largest; of a free scale, or a truth without metres, those after a Sim(3)
-    alignment only.
-    """
+    """Rows of RMSE, mean, median, maximum; for a free scale of estimate or truth, after Sim(3) alignment only."""
     if truth is None:
         return []
     metric = metric and truth["in_metres"]
@@ -213,7 +209,7 @@ def _spread(values: Sequence[_Value], count: int) -> list[_Value]:
 
 
 def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
-    """The 2nd and 98th percentile of the depth in the samples, metres; NaN where there is none."""
+    """2nd and 98th percentile of the samples' depth, metres; NaN without depth."""
     depths = [depth_map.depth[::8, ::8] for depth_map in depth_maps]
     known = np.concatenate([np.zeros(0, np.float32), *(depth[np.isfinite(depth)] for depth in depths)])
     if not len(known):
@@ -230,7 +226,7 @@ def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: fl
         confidence = figures.picture(figures.confidence_colours(shades), _SAMPLE_WIDTH)
     title = f"frame {keyframe.frame}, {keyframe.timestamp:.2f} s"
     if keyframe.recorded is not None:
-        title = f"of the map, recorded at {keyframe.recorded:.2f} s"
+        title = f"from the known map, recorded at {keyframe.recorded:.2f} s"
     return Sample(title, image, depth, confidence)
 
 
@@ -239,7 +235,7 @@ def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | 
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Each setting as text; those of a table by the names of table and field."""
+    """Settings as text, by name or `group.name`."""
     rows: dict[str, str] = {}
     for name, value in settings.items():
         if isinstance(value, Mapping):

@@ -1,8 +1,8 @@
-"""What a run keeps of itself while it goes on, so that it goes on after a kill to the same bits: a state file with what
-the callbacks have gathered, the warnings, the times, and what the run is of.
+"""Checkpoints of a run: a killed run that is resumed gives bit-identical results.
 
-It is written in a thread of its own, as a state never changes, and takes its place in one step. The next one waits so
-long that all of them take at most `SHARE` of the run: of the processor's time, which is what the thread takes from it.
+A checkpoint has the SLAM state, the state of the callbacks, warnings, times, and the identity of the run (settings,
+input, versions). Since a state is immutable, a thread writes it while the run continues; the file is replaced
+atomically. The interval grows so that all checkpoints take at most `SHARE` of the run's processor time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.record_file import AGAIN, Layout
 from vggtgeo.io.records import by_name
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.output_checks import check_place
+from vggtgeo.results.output_checks import check_checkpoint_path
 from vggtgeo.results.summary import versions
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -37,18 +37,18 @@ from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_st
 from vggtgeo.slam.trust.evidence import EvidenceSoFar, FrameEvidence
 from vggtgeo.slam.window.window_recorder import WindowRecord
 
-_BEFORE, _SHOWN = 30, 110
-"""Letters of a long setting that are shown, and those of them that lie before where it is another one."""
+_CONTEXT, _EXCERPT = 30, 110
+"""Characters of a long setting that an error shows, and how many of them lie before the first difference."""
 
 
 @dataclass(frozen=True)
 class Checkpoints:
-    """Where a run keeps its state, and whether it goes on from the one that is there.
+    """Where and how often a run writes its checkpoint, and whether it resumes from an existing one.
 
     Fields:
-        path: of the file.
-        resume: go on from it; where there is none, the run begins at its first frame.
-        every: seconds between two states, or more where they are large; 0: after each frame, whatever it takes.
+        path: file of the checkpoint.
+        resume: resume from the file; if it does not exist, the run begins at its first frame.
+        every: minimum seconds between checkpoints, more if they are large; 0: after each frame.
 
     Example:
         >>> from pathlib import Path
@@ -67,30 +67,32 @@ class Checkpoints:
         path_of("path", self.path)
         check_real("checkpoint-every", self.every, "seconds, at least 0")
         if not (math.isfinite(self.every) and self.every >= 0):
-            raise InputError(f"`checkpoint-every` is {self.every:g}; it must be seconds, at least 0")
+            raise InputError(f"`checkpoint-every` must be seconds, at least 0, got {self.every:g}")
 
 
 @dataclass(frozen=True)
 class Notice:
-    """A warning about the input. frames: that were left out, None of another kind."""
+    """A warning about the input. frames: number of frames left out; None for other warnings."""
 
     text: str
     frames: int | None = None
 
     @classmethod
     def of(cls, warning: Warning | str) -> Notice:
-        """Of a warning that was collected."""
+        """Return the notice of a warning."""
         return cls(str(warning), warning.frames if isinstance(warning, LeftOutWarning) else None)
 
     def warning(self) -> Warning:
-        """The warning again."""
+        """Return the warning of a notice."""
         return InputWarning(self.text) if self.frames is None else LeftOutWarning(self.text, self.frames)
 
 
 @dataclass(frozen=True, eq=False)
 class RunSoFar:
-    """A run between two frames. callbacks: what each gave, by the name of its class. refused: by role, the counts of
-    `Refusals`. seconds: by stage; tracking, whole: since the first frame, and since the run began.
+    """A run between two frames, as a checkpoint stores it.
+
+    callbacks: state of each callback by class name. refused: counts of `Refusals` by role. seconds: time by stage, s;
+    tracking and whole: time since the first frame, and since the start of the run, s.
     """
 
     slam: Slam
@@ -101,8 +103,8 @@ class RunSoFar:
     tracking: float
     whole: float
 
-    def unsaid(self, collected: Iterable[Warning | str]) -> list[Warning | str]:
-        """All warnings of the run, those of this part after those before: what is read again says the same again."""
+    def merge_warnings(self, collected: Iterable[Warning | str]) -> list[Warning | str]:
+        """Return the checkpoint's warnings, then those of `collected` that are not repeated by rereading the input."""
         known = Counter(self.notices)
         fresh: list[Warning | str] = []
         for warning in collected:
@@ -113,14 +115,14 @@ class RunSoFar:
         return [*(notice.warning() for notice in self.notices), *fresh]
 
     def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
-        """Counts on from those of before; InputError where they are of other networks, or no counts."""
+        """Add the checkpoint's counts to `refusals`; raise InputError if they are invalid or of other networks."""
         known = {role: len(dataclasses.fields(counts)) for role, counts in refusals.items()}
         found = {role: len(counts) for role, counts in self.refused.items()}
-        strange = any(known.get(role) != count for role, count in found.items())
-        if strange or min((value for counts in self.refused.values() for value in counts), default=0) < 0:
+        invalid = any(known.get(role) != count for role, count in found.items())
+        if invalid or min((value for counts in self.refused.values() for value in counts), default=0) < 0:
             raise InputError(
-                f"the run that goes on kept {dict(self.refused)} of what networks refused; expected "
-                f"counts of {', '.join(known) or 'none'}: begin anew with `--no-resume`"
+                f"`refused` in the checkpoint is {dict(self.refused)}; expected counts of "
+                f"{', '.join(known) or 'no network'}: start again with `--no-resume`"
             )
         for role, counts in self.refused.items():
             for entry, value in zip(dataclasses.fields(Refusals), counts, strict=True):
@@ -131,101 +133,100 @@ KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, 
 CHECKPOINT = Layout("checkpoint", VERSION, by_name(KEPT_CLASSES), UPGRADES)
 
 
-def identity(
+def run_identity(
     settings: SlamSettings, roles: Roles, source: Mapping[str, Any], networks: Mapping[str, str], **more: Any
 ) -> dict[str, str]:
-    """What a run is of, as texts by their names; a run goes on only where all are the same.
+    """Return everything that the result of a run depends on, as text by name; a resumed run must have the same.
 
-    source: what is known of the sequence. networks: digest of each file. more: what else the result depends on.
+    source: `Source.identity`. networks: digest of each network file. more: further values.
     """
     by_stage = {
         f"{group.name}.{entry.name}": getattr(getattr(settings, group.name), entry.name)
         for group in dataclasses.fields(settings)
         for entry in dataclasses.fields(getattr(settings, group.name))
     }
-    played = {entry.name: getattr(roles, entry.name) for entry in dataclasses.fields(roles)}
-    every = {**versions(), **source, **by_stage, **played, **networks, **more}
-    # An object without a `repr` of its own tells its address, which is another in each process.
+    by_role = {entry.name: getattr(roles, entry.name) for entry in dataclasses.fields(roles)}
+    every = {**versions(), **source, **by_stage, **by_role, **networks, **more}
+    # The default `repr` of an object contains its address, which differs between processes.
     return {name: re.sub(r" at 0x[0-9a-f]+", "", repr(value)) for name, value in every.items()}
 
 
 @in_double_precision
-def resumed(asked: Checkpoints | None, wanted: Mapping[str, str]) -> RunSoFar | None:
-    """The run to go on with; None where nothing is asked, or there is none.
+def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> RunSoFar | None:
+    """Return the run to resume; None if `asked` does not resume, or the file does not exist.
 
     Raises:
-        InputError: the file is damaged, or of a run of something else; or the path is that of no file.
+        InputError: the file is damaged, its run has another identity, or the path is not a file.
 
     """
     if asked is not None:
-        check_place(asked.path)
+        check_checkpoint_path(asked.path)
     if asked is None or not asked.resume or not asked.path.is_file():
         return None
-    known = _facts(asked.path)["identity"]
-    others = [name for name in {**known, **wanted} if known.get(name) != wanted.get(name)]
-    if others:  # the plainest: a seed is also in all that draws samples
-        name = min(others, key=lambda one: len(known.get(one, "")) + len(wanted.get(one, "")))
-        was, has = _where_they_differ(known.get(name), wanted.get(name))
+    saved = _header(asked.path)["identity"]
+    differing = [name for name in {**saved, **identity} if saved.get(name) != identity.get(name)]
+    if differing:  # report the shortest: a seed, for example, also appears in every role that samples
+        name = min(differing, key=lambda one: len(saved.get(one, "")) + len(identity.get(one, "")))
+        before, now = _excerpts(saved.get(name), identity.get(name))
         raise InputError(
-            f"`{asked.path}` is of a run with `{name}` {was}, and this one has {has}: give the same, or begin anew "
-            "with `--no-resume`"
+            f"`{name}` is {now}, but the run in `{asked.path}` had {before}: use the same, or start again with "
+            "`--no-resume`"
         )
     try:
         found, _ = CHECKPOINT.read(asked.path)
         if not isinstance(found, RunSoFar) or not found.slam.frames:
-            raise InputError(f"`{asked.path}` holds no run")
+            raise InputError(f"`{asked.path}` contains no run")
         checked_state(asked.path, found.slam)
         if not all(0 <= took < math.inf for took in (*found.seconds.values(), found.tracking, found.whole)):
-            raise InputError(f"`{asked.path}` says that a part of the run took {dict(found.seconds)} s: {AGAIN}")
+            raise InputError(f"`seconds` in `{asked.path}` is {dict(found.seconds)}, must be positive: {AGAIN}")
     except InputError as error:
-        raise InputError(f"{error}; begin anew with `--no-resume`") from None
+        raise InputError(f"{error}; start again with `--no-resume`") from None
     return found
 
 
-def _facts(path: Path) -> dict[str, Any]:
-    """What the header says of a run, before its data are read."""
+def _header(path: Path) -> dict[str, Any]:
     try:
         found = CHECKPOINT.facts(path)
     except InputError as error:
-        raise InputError(f"{error}; begin anew with `--no-resume`") from None
-    kinds = {"identity": dict, "frames": int, "last": int, "digest": str}
-    whole = found.keys() == kinds.keys() and all(type(found[name]) is kind for name, kind in kinds.items())
-    if not whole or not all(type(value) is str for value in found["identity"].values()):
-        raise InputError(f"`{path}` holds no run; begin anew with `--no-resume`")
+        raise InputError(f"{error}; start again with `--no-resume`") from None
+    types = {"identity": dict, "frames": int, "last": int, "digest": str}
+    valid = found.keys() == types.keys() and all(type(found[name]) is kind for name, kind in types.items())
+    if not valid or not all(type(value) is str for value in found["identity"].values()):
+        raise InputError(f"`{path}` contains no run; start again with `--no-resume`")
     return found
 
 
-def _where_they_differ(before: str | None, now: str | None) -> tuple[str, str]:
-    """Both texts; of long ones the part where they first differ, so that it does not lie in what is cut away."""
+def _excerpts(before: str | None, now: str | None) -> tuple[str, str]:
+    """Both texts, long ones shortened to the part around their first difference."""
     same = next((at for at, (a, b) in enumerate(zip(before or "", now or "", strict=False)) if a != b), 0)
-    start = max(same - _BEFORE, 0)
-    return _cut(before, start), _cut(now, start)
+    start = max(same - _CONTEXT, 0)
+    return _excerpt(before, start), _excerpt(now, start)
 
 
-def _cut(value: str | None, start: int) -> str:
-    if value is None or len(value) <= _SHOWN:
+def _excerpt(value: str | None, start: int) -> str:
+    if value is None or len(value) <= _EXCERPT:
         return "nothing" if value is None else value
-    return f"{'...' * (start > 0)}{value[start : start + _SHOWN]}{'...' * (start + _SHOWN < len(value))}"
+    return f"{'...' * (start > 0)}{value[start : start + _EXCERPT]}{'...' * (start + _EXCERPT < len(value))}"
 
 
 def frames_kept(path: Path) -> str:
-    """How far the run in a file had come, in words."""
-    count = _facts(path)["frames"]
+    """Return the number of frames in a checkpoint, as text."""
+    count = _header(path)["frames"]
     return f"{count} frame{'s' * (count != 1)}"
 
 
 def check_same_frame(asked: Checkpoints, frame: Frame | None) -> None:
-    """InputError unless `frame` is the last one of the run that goes on."""
-    known = _facts(asked.path)
-    if frame is None or known["digest"] != digest_of(frame):
+    """Raise InputError unless `frame` is the last one of the checkpoint."""
+    saved = _header(asked.path)
+    if frame is None or saved["digest"] != digest_of(frame):
         raise InputError(
-            f"frame {known['last']} is another one than when the run in `{asked.path}` was killed: give the same "
-            "source, or begin anew with `--no-resume`"
+            f"frame {saved['last']} differs from the one of the run in `{asked.path}`: use the same input, or start "
+            "again with `--no-resume`"
         )
 
 
 def digest_of(frame: Frame) -> str:
-    """SHA-256 of time, image and depth."""
+    """Return the SHA-256 of time, image and depth."""
     digest = hashlib.sha256(repr((frame.index, float(frame.timestamp), frame.image.shape)).encode())
     for image in (frame.image, frame.depth):
         if image is not None:
@@ -234,7 +235,7 @@ def digest_of(frame: Frame) -> str:
 
 
 def digest_of_map(known: Slam) -> str:
-    """SHA-256 of the poses and the key points of a map."""
+    """Return the SHA-256 of the poses and the key points of a map."""
     digest = hashlib.sha256(repr(len(known.pairs)).encode())
     for keyframe in known.keyframes:
         digest.update(keyframe.pose.tobytes())
@@ -243,15 +244,15 @@ def digest_of_map(known: Slam) -> str:
 
 
 @dataclass(eq=False)
-class Keeper:
-    """Keeps the state of one run. gather: what there is beside the state, asked between two frames. tell: says a
-    sentence to the user.
+class CheckpointWriter:
+    """Writes the checkpoints of one run. gather: returns the run so far, called between two frames. message: shows a
+    text to the user.
     """
 
     asked: Checkpoints
     identity: Mapping[str, str]
     gather: Callable[[Slam], RunSoFar]
-    tell: Callable[[str], None]
+    message: Callable[[str], None]
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="checkpoint"))
     _writing: Future[float] | None = None
     _next: float = 0.0
@@ -262,20 +263,20 @@ class Keeper:
         self._next = time.monotonic() + self.asked.every
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        """Keeps the state after a frame, if it is time."""
+        """Start to write a checkpoint after a frame, if it is time."""
         if self._writing is not None and (self._writing.done() or self.asked.every == 0):
             self._ended(self._writing)
         if self._writing is None and not self._failed and time.monotonic() >= self._next:
             self._begin(slam, frame)
 
     def on_end(self, slam: Slam, frame: Frame | None) -> None:
-        """Keeps the state after the last frame, if the run took so long that it is worth it."""
+        """Write a checkpoint after the last frame, if the run was long enough for an earlier one."""
         self._wait()
         if self._kept and frame is not None and not self._failed:
             self._begin(slam, frame)
 
     def close(self) -> None:
-        """Waits until the last file is written."""
+        """Wait until the last file is written."""
         self._wait()
         self._pool.shutdown()
 
@@ -288,7 +289,7 @@ class Keeper:
         self._writing = self._pool.submit(self._write, so_far, frame)
 
     def _write(self, so_far: RunSoFar, frame: Frame) -> float:
-        """Writes the file, waiting for a window that is adjusted meanwhile; returns the processor's seconds it took."""
+        """Write the file, once a window that is being adjusted is done; return the processor time, s."""
         began = time.thread_time()
         count = len(so_far.slam.frames)
         facts = {"identity": self.identity, "frames": count, "last": frame.index, "digest": digest_of(frame)}
@@ -296,13 +297,13 @@ class Keeper:
         return time.thread_time() - began
 
     def _ended(self, writing: Future[float]) -> None:
-        """A run whose state cannot be kept goes on without."""
+        """Schedule the next checkpoint; after an error the run continues without checkpoints."""
         self._writing = None
         try:
             took = writing.result()
         except (OSError, TypeError, ValueError) as error:
             self._failed = True
-            self.tell(f"the state of the run cannot be kept, so that it could not be resumed: {error}")
+            self.message(f"cannot write the checkpoint `{self.asked.path}`, this run cannot be resumed: {error}")
             return
         self._kept += 1
         self._next = time.monotonic() + (max(self.asked.every, took / SHARE) if self.asked.every else 0.0)

@@ -1,5 +1,6 @@
-"""What is asked of the folder that a run is to write, before anything is read or JAX is loaded, and again when it is
-taken: that nothing of somebody else is there which a run would replace.
+"""Checks of a run's output folder: a run must not replace files that are not results.
+
+They run before the import of JAX, and again when the folder is locked.
 """
 
 from __future__ import annotations
@@ -36,24 +37,24 @@ NAMES = (
     "run.rrd",
     "view.rrd",
 )
-"""All that a run may leave, as patterns, in the order in which what is old is taken away."""
+"""Patterns of all files that a run may write, in the order in which `publish` removes old ones."""
 NOTE = "README.txt"
-"""In `unfinished/`, for whoever finds it."""
-_MARKS = ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "camera-intrinsics.txt")
+"""In `unfinished/`: explains the folder to the user."""
+_SEQUENCE_FILES = ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "camera-intrinsics.txt")
 
 
 def check_output(place: Path, source: Path | None = None) -> None:
-    """InputError for a folder that a run must not write: a file, the folder that is read, one of images, the root of
-    the file system, or one that holds things of somebody else in the places of results.
+    """Raise InputError for an invalid output folder: a file, the input itself, a folder of images, the root of the file
+    system, or a folder with other files under the names of results.
 
     source: file or folder that the run reads.
     """
-    _refuse_input(place, source)
-    _refuse_strange(place / UNFINISHED)
+    _check_not_input(place, source)
+    _check_stage(place / UNFINISHED)
 
 
 def check_can_be_written(place: Path) -> None:
-    """InputError for a folder in which no file can be made, or that cannot be made."""
+    """Raise InputError if `place` is not writable, or cannot be created."""
     there = next(folder for folder in (place, *place.absolute().parents) if folder.exists())
     try:
         tempfile.TemporaryFile(dir=there).close()
@@ -61,64 +62,63 @@ def check_can_be_written(place: Path) -> None:
         raise not_written(place, error) from None
 
 
-def _refuse_input(place: Path, source: Path | None) -> None:
+def _check_not_input(place: Path, source: Path | None) -> None:
     check_may_be_folder(place)
     if source is not None and place.exists() and source.is_dir() and place.samefile(source):
-        raise InputError(f"`{place}` is the folder that is read; give another folder for the results with `-o`")
+        raise InputError(f"`{place}` is the input folder; give another folder for the results with `-o`")
     if not place.is_dir():
         return
     if source is not None:
         inside = _inside(place, source)
         if inside is not None and is_known(inside):
             raise InputError(
-                f"`{source}` is read, and a run into `{place}` replaces `{place / inside}`; give another folder for "
-                "the results with `-o`"
+                f"the input `{source}` is inside `{place / inside}`, which the run would replace; give another folder "
+                "for the results with `-o`"
             )
     if (place / SUMMARY).is_file():
         return
     for path in place.iterdir():
-        if path.name in _MARKS or (path.suffix.lower() in IMAGE_SUFFIXES and not is_known(path.name)):
+        if path.name in _SEQUENCE_FILES or (path.suffix.lower() in IMAGE_SUFFIXES and not is_known(path.name)):
             raise InputError(
-                f"`{place}` holds images or a sequence (`{path.name}`); give another folder for the results with `-o`"
+                f"`{place}` contains images or a sequence (`{path.name}`); give another folder for the results with "
+                "`-o`"
             )
-    if not (place / UNFINISHED).is_dir():  # a run that was killed while its files were moved has no summary, either
+    if not (place / UNFINISHED).is_dir():  # a run killed while its files were moved has no summary either
         for path in sorted(place.iterdir()):
             if any(fnmatchcase(path.name, pattern) for pattern in NAMES):
                 raise InputError(
-                    f"`{place}` holds `{path.name}`, which a run replaces, and no `{SUMMARY}`: it is not of a run; "
-                    "give another folder for the results with `-o`"
+                    f"`{place}` contains `{path.name}`, which the run would replace, but no `{SUMMARY}`: it is not "
+                    "the folder of a run; give another folder for the results with `-o`"
                 )
 
 
-def _refuse_strange(stage: Path) -> None:
-    """InputError for an `unfinished` that no run left there: a run takes away what it finds in its place. The root of
-    the file system is nobody's folder for results.
-    """
+def _check_stage(stage: Path) -> None:
+    """Raise InputError for an `unfinished/` with other files than a run's: the run would delete them."""
     if whole_path(stage.parent) == Path(whole_path(stage).anchor):
         raise InputError(f"`{stage.parent}` is the root of the file system; give a folder for the results with `-o`")
     if stage.is_symlink() or not stage.exists():
         return
     if not stage.is_dir():
-        raise InputError(f"`{stage}` is a file, and a run makes a folder of this name; give another folder with `-o`")
-    check_place(stage / CHECKPOINT)
+        raise InputError(f"`{stage}` is a file, and a run creates a folder there; give another folder with `-o`")
+    check_checkpoint_path(stage / CHECKPOINT)
     for path in sorted(stage.iterdir()):
         if not (is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, NOTE)):
             raise InputError(
-                f"`{stage}` holds `{path.name}`, which no run left there, and a run would take it away; give another "
+                f"`{stage}` contains `{path.name}`, which is not a run's and which the run would delete; give another "
                 "folder with `-o`"
             )
 
 
-def check_place(path: Path) -> None:
-    """InputError for a path at which something lies that is no file: no state could be kept there."""
+def check_checkpoint_path(path: Path) -> None:
+    """Raise InputError if `path` exists and is not a file."""
     if os.path.lexists(path) and not path.is_file():
-        found = "a link that leads nowhere" if path.is_symlink() and not path.exists() else "no file"
+        found = "a broken link" if path.is_symlink() and not path.exists() else "not a file"
         found = "a folder" if path.is_dir() else "a pipe" if path.is_fifo() else found
-        raise InputError(f"`{path}` is {found}, and a run keeps its state there, in a file: take it away")
+        raise InputError(f"`{path}` is {found}, but the run writes its checkpoint there: remove it")
 
 
 def _inside(place: Path, source: Path) -> str | None:
-    """The first part of the way from `place` to `source`; None where it does not lie in it."""
+    """The entry of `place` that contains `source`; None if `source` is elsewhere."""
     try:
         parts = whole_path(source).relative_to(whole_path(place)).parts
     except ValueError:
@@ -127,16 +127,16 @@ def _inside(place: Path, source: Path) -> str | None:
 
 
 def is_result(folder: Path, file: Path) -> bool:
-    """Whether `file` has the name and place of a result of a run into `folder`, or lies in a folder of them."""
+    """Return whether `file` is, or is inside, a path that a run into `folder` writes."""
     part = _inside(folder, file)
     return part is not None and (is_known(part) or part == UNFINISHED)
 
 
 def is_in_results(folder: Path, file: Path) -> bool:
-    """Whether `file` lies in a folder that a run into `folder` replaces: `images`, `depth`, `unfinished`."""
+    """Return whether `file` is in a folder that a run into `folder` replaces: `images`, `depth`, `unfinished`."""
     return is_result(folder, file) and whole_path(file).parent != whole_path(folder)
 
 
 def is_known(name: str) -> bool:
-    """Whether a run leaves a file or folder of this name."""
+    """Return whether a run writes a file or folder of this name."""
     return name.endswith(".rrd") or any(fnmatchcase(name, pattern) for pattern in NAMES)

@@ -1,4 +1,4 @@
-"""What lies on the disk, read back; and errors of an estimate against a truth, wherever the two come from."""
+"""Read results and sequences from disk, and evaluate an estimate against the ground truth."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, path_of
 from vggtgeo.results.result import Result
-from vggtgeo.results.summary_file import check_count
+from vggtgeo.results.summary_file import warn_if_truncated
 
 
 def read(path: str | os.PathLike[str]) -> Result | Sequence:
-    """What lies at `path`: the `Result` in a run's folder, else a sequence of frames (folder or video).
+    """Read what is at `path`: the `Result` of a run's folder, else a sequence of frames (folder or video).
 
     Raises:
-        InputError: nothing that can be read is there.
+        InputError: `path` does not exist or cannot be read.
 
     Example:
         >>> import vggtgeo as vg
@@ -39,15 +39,15 @@ def evaluate(
     truth: Trajectory | Sequence | str | os.PathLike[str],
     **options: Any,
 ) -> TrajectoryReport:
-    """ATE after SE(3) and Sim(3) alignment, and RPE, of an estimate against the truth.
+    """Return ATE after SE(3) and Sim(3) alignment, and RPE, of an estimate against the ground truth.
 
     Args:
-        estimate: a trajectory, a result, or where one lies: a file (TUM, KITTI, EuRoC) or a run's folder.
-        truth: a trajectory, a sequence with truth, or where one lies.
+        estimate: a trajectory, a result, or a path: a file (TUM, KITTI, EuRoC) or a run's folder.
+        truth: a trajectory, a sequence with ground truth, or the path of one.
         options: `max_dt`, `delta`, `all_pairs` of `vggtgeo.evaluate_trajectory`.
 
     Raises:
-        InputError: there is no trajectory, or fewer than three poses match in time.
+        InputError: a trajectory is missing, or fewer than three poses match in time.
 
     Example:
         >>> import vggtgeo as vg
@@ -57,7 +57,7 @@ def evaluate(
 
     """
     known = Trajectory | Result | str | os.PathLike
-    check_kind("estimate", estimate, known, "a trajectory, a result, or where one of them lies")
+    check_kind("estimate", estimate, known, "a trajectory, a result, or a path")
     true = _truth(truth)
     return evaluate_trajectory(_estimate(estimate, true), true, **options)
 
@@ -69,7 +69,7 @@ def _estimate(given: Any, truth: Trajectory) -> Trajectory:
         return given.trajectory
     place = path_of("estimate", given)
     file = place / "trajectory.txt" if place.is_dir() else place
-    return check_count(file, load_trajectory(file, truth))
+    return warn_if_truncated(file, load_trajectory(file, truth))
 
 
 def _truth(given: Any) -> Trajectory:
@@ -79,8 +79,8 @@ def _truth(given: Any) -> Trajectory:
         if path_of("truth", given).is_file():
             return load_trajectory(given)
         given = open_sequence(given)
-    check_kind("truth", given, Sequence, "a trajectory, a sequence with truth, or where one of them lies")
+    check_kind("truth", given, Sequence, "a trajectory, a sequence with ground truth, or a path")
     found: Trajectory | None = given.ground_truth()
     if found is None:
-        raise InputError(f"`truth` is `{given.name}`, which has no truth; give a trajectory in the TUM format")
+        raise InputError(f"`truth` is `{given.name}`, which has no ground truth; give a trajectory in the TUM format")
     return found

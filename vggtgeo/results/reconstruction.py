@@ -1,4 +1,4 @@
-"""A whole run in one call: frames in, a `Result` out. The command line calls the same function."""
+"""A whole run in one call: frames in, a `Result` out. The command line uses the same function."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from vggtgeo.datasets import Sequence
-from vggtgeo.evaluation import TrajectoryReport
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_kind, check_plain, check_whole
@@ -22,12 +19,12 @@ from vggtgeo.io.process_settings import program_settings
 from vggtgeo.io.warned import collected_warnings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, identity, resumed
+from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, load_checkpoint, run_identity
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.run_callbacks import RunCallbacks
-from vggtgeo.results.source import Source, as_read, opened
-from vggtgeo.results.still_search import StillSearch
-from vggtgeo.results.summary import OWN, compare, summarise
+from vggtgeo.results.source import Source, open_source, reduction_summary
+from vggtgeo.results.static_overlay import StaticOverlaySearch
+from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.first_pass import begin_with_found_camera
@@ -47,8 +44,8 @@ from vggtgeo.slam.trust.judge import judged_or_told
 from vggtgeo.slam.window.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
-    "`known_map` was made without depth, so that its lengths have no unit: the depth of these frames, in metres, is "
-    "not used; begin a new map to have it in metres"
+    "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not used; start "
+    "a new map for a metric one"
 )
 
 
@@ -71,41 +68,38 @@ def reconstruct(
     checkpoints: Checkpoints | None = None,
     known_map: Slam | None = None,
 ) -> Result:
-    """Track and map every frame, adjust the whole map, judge the result.
+    """Track all frames, map them, adjust the whole map, and judge the result.
 
-    Ctrl-C (in a notebook: the stop button) ends the run early with the result of the frames so far, whose `summary`
-    says `interrupted`: after the frame at hand, while none comes, or in place of the last adjustment. A second one
-    ends it at once.
+    Ctrl-C (in a notebook: the stop button) ends the run with the result of the frames so far, and the summary's
+    `interrupted` is true; a second Ctrl-C ends it at once, without a result.
 
-    Compiled code is kept in the user's cache folder, as by the program: the first call takes half a minute longer than
-    those of later processes. A folder that JAX was given (`jax_compilation_cache_dir`) is taken in its place, and with
-    JAX's `JAX_ENABLE_COMPILATION_CACHE=0` nothing is kept.
+    Compiled code is cached in the user's cache folder, or in JAX's `jax_compilation_cache_dir` if that is set: the
+    first call takes half a minute longer. `JAX_ENABLE_COMPILATION_CACHE=0` disables the cache.
 
-    Of runs in several threads of one process each counts the warnings about the input of all of them, as Python shows
-    warnings for the process: give each a process where that matters.
+    Python's warnings are per process: if several threads run at once, each result counts the input warnings of all.
 
     Args:
-        frames: a folder or a video file, a sequence (`vggtgeo.read`, `vggtgeo.simulate`), or any iterable of `Frame`,
-            of images uint8 [H, W, 3] RGB, or of pairs of an image and depth (float [H, W], metres, NaN = none).
-        roles: perception objects, or those of `vggtgeo.perception`; by default the classical ones, without depth where
+        frames: a folder or a video file, a sequence (`vggtgeo.read`, `vggtgeo.simulate`), or an iterable of `Frame`,
+            of images uint8 [H, W, 3] RGB, or of pairs of image and depth (float [H, W], metres, NaN = unknown).
+        roles: perception objects, or those of `vggtgeo.perception`; by default the classical ones, without depth if
             the frames have none.
         settings: of the pipeline.
-        camera: of the frames, in place of what their folder says; by default a guess for an iterable.
+        camera: of the frames; overrides the calibration of the folder. By default a guess for an iterable.
         start: first frame.
         end: frame to stop before.
         stride: take every n-th frame.
-        seed: of the samples that robust estimators draw; a run is repeatable for each.
-        dense: whose depth the map is made of: auto, mvs, sensor, network or none (`vggtgeo/mapping/dense.py`).
+        seed: of the random samples of robust estimators; equal seeds give equal results.
+        dense: source of the dense depth: auto, mvs, sensor, network or none (`vggtgeo/mapping/dense.py`).
         title: of the report; by default the name of the sequence.
         callbacks: called with every frame.
-        facts: what the summary shall say besides.
-        warned: warnings about the input that came before, for the verdict and the report.
-        checkpoints: where the state of the run is kept while it goes on, and whether it goes on from the one there.
-        known_map: what `vggtgeo.load_map` gave: the frames are placed in this map, and extend it, or, with the setting
-            `keyframes.localise_only`, leave it as it is.
+        facts: more entries of the summary.
+        warned: earlier warnings about the input, for the verdict and the report.
+        checkpoints: where to write checkpoints, and whether to resume from an existing one.
+        known_map: map of `vggtgeo.load_map` to localise in and extend; with the setting `keyframes.localise_only` it
+            is not changed.
 
     Raises:
-        InputError: the frames cannot be read, none of them can be used, or the run to go on with is of something else.
+        InputError: an argument is invalid, no frame is usable, or the checkpoint belongs to another run.
 
     Example:
         >>> import vggtgeo as vg
@@ -118,59 +112,56 @@ def reconstruct(
     _check_arguments(roles, settings, camera, known_map, callbacks, facts, warned, checkpoints, title, seed)
     settings = settings or SlamSettings()
     with program_settings(), interruption() as stop, collected_warnings() as collected:
-        with stop.at_once():  # a camera may give no frame
-            source = opened(frames, camera, settings)
+        with stop.at_once():  # a live camera may not deliver any frame
+            source = open_source(frames, camera, settings)
         source.check(start, end, stride)
         perception = _perception(roles, source.has_depth, seed)
         check_dense(dense, perception.roles.metric, perception.roles.depth)
         selection = (start, end, stride)
         first = _first_state(known_map, source, settings, perception.roles)
-        wanted = identity(
-            *(settings, perception.roles, source.known(selection)),
+        identity = run_identity(
+            *(settings, perception.roles, source.identity(selection)),
             {name: session.digest for name, session in perception.networks.items()},
             dense=dense,
             seed=seed,
             known_map=None if first is None else digest_of_map(first),
         )
-        before = resumed(source.resumable(checkpoints), wanted)
-        # The verdict takes the lens of a known map out of these corners, as it does with one that this run finds.
-        seen_by = source.camera if first is None or first.lens is None else source.camera.pinhole
-        windows, evidence, still = WindowRecorder(), EvidenceRecorder(seen_by), StillSearch()
-        hooks = RunCallbacks((windows, evidence, still, CompileAhead(settings), *callbacks), clock)
+        before = load_checkpoint(source.resumable(checkpoints), identity)
+        # Corners for the verdict are undistorted by the known map's camera, or later by the one of this run.
+        evidence_camera = source.camera if first is None or first.lens is None else source.camera.pinhole
+        windows, evidence, overlay = WindowRecorder(), EvidenceRecorder(evidence_camera), StaticOverlaySearch()
+        hooks = RunCallbacks((windows, evidence, overlay, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles, source.camera)
-        perception = _without_still_parts(perception, source, selection, settings, hooks, (still, evidence), stop)
+        if settings.camera.still_parts and source.repeatable(selection):
+            with stop.at_once():
+                perception = _without_overlay(perception, source, selection, hooks, overlay, evidence)
         if first is None and before is None:
-            first = _first_pass(source, selection, perception, settings, hooks, stop)
+            first = _calibrate(source, selection, perception, settings, hooks, stop)
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
-        with loop.keeping(checkpoints, wanted) as keeper:
-            tracked = loop.track(keeper)
+        with loop.checkpoint_writer(checkpoints, identity) as writer:
+            tracked = loop.track(writer)
             slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
-        began -= 0.0 if before is None else before.whole
-        report = compare(slam, source.truth)
-        known = {
+        summary_facts = {
             **perception.facts(),
             **(facts or {}),
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
-            **as_read(source, slam),
-            **({} if still.found is None else {"still_parts": round(still.found.share, 4)}),
+            **reduction_summary(source, slam),
+            **({} if overlay.found is None else {"still_parts": round(overlay.found.share, 4)}),
         }
-        notices = (*warned, *(collected if before is None else before.unsaid(collected)))
-        ending = _Ending(
-            slam,
-            source,
-            report,
-            notices,
-            perception.refusals,
-            title or source.name,
-            known,
-            clock,
-            began,
-            dense,
-            (slam.lens or source.camera).undistorter().valid,
+        finished = _FinishedRun(
+            slam=slam,
+            source=source,
+            warned=(*warned, *(collected if before is None else before.merge_warnings(collected))),
+            refusals=perception.refusals,
+            title=title or source.name,
+            facts=summary_facts,
+            clock=clock,
+            began=began - (0.0 if before is None else before.whole),
+            dense=dense,
         )
-        return _concluded(ending, settings, hooks, windows.records, (still, evidence))
+        return _conclude(finished, settings, hooks, windows.records, overlay, evidence)
 
 
 def _check_arguments(
@@ -185,17 +176,17 @@ def _check_arguments(
     title: Any,
     seed: Any,
 ) -> None:
-    """What is no argument of `reconstruct` is refused before the first frame, not where it is used: at the end, say."""
+    """Validate before the first frame what is used after the last one."""
     check_run_arguments(roles.roles if isinstance(roles, Perception) else roles, settings, camera, known_map)
     check_kind("callbacks", callbacks, Iterable, "a list of `vggtgeo.Callback`")
     check_kind("checkpoints", checkpoints, Checkpoints | None, "`vggtgeo.Checkpoints`, or None")
     check_kind("title", title, str | None, "a text")
     check_plain("facts", {} if facts is None else facts)
-    wrong = [key for key in facts or {} if not isinstance(key, str) or key in OWN]
-    if wrong:
+    invalid = [key for key in facts or {} if not isinstance(key, str) or key in RESERVED_KEYS]
+    if invalid:
         raise InputError(
-            f"`facts` has {wrong[0]!r:.60}; its names must be texts, and none that every summary has: "
-            f"{', '.join(sorted(OWN))}"
+            f"`facts` has the key {invalid[0]!r:.60}; keys must be texts other than the summary's own: "
+            f"{', '.join(sorted(RESERVED_KEYS))}"
         )
     if isinstance(warned, str) or not isinstance(warned, Iterable):
         check_kind("warned", warned, (), "a list of warnings or texts")
@@ -203,12 +194,11 @@ def _check_arguments(
 
 
 @dataclass(frozen=True, eq=False)
-class _Ending:
-    """A run after its last adjustment: what it is judged and described by."""
+class _FinishedRun:
+    """A run after its last adjustment."""
 
     slam: Slam
     source: Source
-    report: TrajectoryReport | None
     warned: tuple[Warning | str, ...]
     refusals: Mapping[str, Refusals]
     title: str
@@ -216,29 +206,29 @@ class _Ending:
     clock: Clock
     began: float
     dense: str
-    seen: np.ndarray | None
 
 
-def _concluded(
-    run: _Ending,
+def _conclude(
+    run: _FinishedRun,
     settings: SlamSettings,
     hooks: RunCallbacks,
     windows: Iterable[WindowRecord],
-    witnesses: tuple[StillSearch, EvidenceRecorder],
+    overlay: StaticOverlaySearch,
+    evidence: EvidenceRecorder,
 ) -> Result:
-    """The map, the verdict, the summary."""
+    """Build the dense map and, in a thread beside it, the verdict; then the summary."""
     slam, clock = run.slam, run.clock
-    still, evidence = witnesses
+    report = compare_with_truth(slam, run.source.truth)
 
     @in_double_precision
-    def judged() -> Verdict:
+    def judge() -> Verdict:
         with clock.measure("verdict (own thread)"):
-            of_input = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals) + still.findings()
+            of_input = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals) + overlay.findings()
             return judged_or_told(slam, evidence.frames, of_input)
 
     hooks.each("on_stage", "dense map and verdict")
     with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:
-        judging = pool.submit(judged)
+        judging = pool.submit(judge)
         with clock.measure("dense map"):
             built = dense_map(slam, run.dense)
         hooks.each("on_finish", slam, built.cloud)
@@ -249,7 +239,7 @@ def _concluded(
             verdict,
             settings=changed(settings),
             seconds={**clock.seconds, "all": time.perf_counter() - run.began},
-            report=run.report,
+            report=report,
             truth_in_metres=run.source.truth_in_metres,
             map_points=len(built.cloud),
             dense=run.dense,
@@ -257,25 +247,25 @@ def _concluded(
         **run.facts,
     }
     notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
-    return Result.assemble(
-        RunRecord(slam, built, tuple(windows), run.source.truth, notices, run.title, run.seen), verdict, summary
-    )
+    valid = (slam.lens or run.source.camera).undistorter().valid
+    record = RunRecord(slam, built, tuple(windows), run.source.truth, notices, run.title, valid)
+    return Result.assemble(record, verdict, summary)
 
 
 def _first_state(known: Slam | None, source: Source, settings: SlamSettings, roles: Roles) -> Slam | None:
-    """Before the first frame, in a map that is known; InputError for one of another camera or matcher, or where one is
-    needed.
+    """The state before the first frame in a known map; raise InputError if it is missing, or has another camera or
+    matcher.
     """
     if known is not None:
         if source.has_depth and not known.metric:
             warnings.warn(FREE_MAP, InputWarning, stacklevel=4)
         return entered(known, source.camera, roles.points)
     if settings.keyframes.localise_only:
-        raise InputError("`keyframes.localise_only` needs a map to place frames in: give `known_map` (`--map FILE`)")
+        raise InputError("`keyframes.localise_only` needs a map: pass `known_map` (`--map FILE`)")
     return None
 
 
-def _first_pass(
+def _calibrate(
     source: Source,
     selection: tuple[int, int | None, int],
     perception: Perception,
@@ -283,16 +273,16 @@ def _first_pass(
     hooks: RunCallbacks,
     stop: Interruption,
 ) -> Slam | None:
-    """The state before the first frame, where nobody gave the camera and a first pass over the frames finds it. What it
-    warns of and refuses is told when the run itself comes to it.
+    """Self-calibrate an unknown camera on the first frames; return the state before the first frame, or None.
+
+    Warnings and refusals are restored: the run itself reports them.
     """
     start, _, stride = selection
-    count = source.count(*selection)
-    most = settings.camera.first_pass
-    if source.camera.known or not count or not most or not settings.refinement.global_adjustment:
+    count = min(source.count(*selection) or 0, settings.camera.first_pass)
+    if source.camera.known or not count or not settings.refinement.global_adjustment:
         return None
-    end = start + min(count, most) * stride
-    hooks.each("on_stage", f"finding the camera in the first {min(count, most)} frames")
+    end = start + count * stride
+    hooks.each("on_stage", f"calibrating the camera on the first {count} frames")
     refused = {role: replace(counts) for role, counts in perception.refusals.items()}
     with hooks.clock.measure("first pass"), stop.at_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
@@ -303,26 +293,22 @@ def _first_pass(
     return found
 
 
-def _without_still_parts(
+def _without_overlay(
     perception: Perception,
     source: Source,
     selection: tuple[int, int | None, int],
-    settings: SlamSettings,
     hooks: RunCallbacks,
-    witnesses: tuple[StillSearch, EvidenceRecorder],
-    stop: Interruption,
+    overlay: StaticOverlaySearch,
+    evidence: EvidenceRecorder,
 ) -> Perception:
-    """Roles, and the verdict's witness, that look for nothing where the picture moves with the camera."""
-    search, evidence = witnesses
-    if not (settings.camera.still_parts and source.comes_again(selection)):
+    """Search for a static overlay; mask it in perception and in the verdict's evidence."""
+    hooks.each("on_stage", "searching for a static overlay in the images")
+    with hooks.clock.measure("still parts"):
+        overlay.search(source, selection)
+    if overlay.found is None:
         return perception
-    hooks.each("on_stage", "looking for what stays in its place in the picture")
-    with hooks.clock.measure("still parts"), stop.at_once():
-        search.look(source, selection)
-    if search.found is None:
-        return perception
-    evidence.leave_out(search.found.mask)
-    return replace(perception, roles=replace(perception.roles, still_parts=search.found))
+    evidence.leave_out(overlay.found.mask)
+    return replace(perception, roles=replace(perception.roles, still_parts=overlay.found))
 
 
 def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:
@@ -333,7 +319,7 @@ def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) ->
 def _adjust(
     tracked: Tracked, roles: Roles, settings: SlamSettings, hooks: RunCallbacks, stop: Interruption
 ) -> tuple[Slam, bool]:
-    """The state after the last adjustment, and whether Ctrl-C ended the run; after Ctrl-C there is none."""
+    """The state after the last adjustment, and whether Ctrl-C ended the run, which skips it."""
     hooks.each("on_adjust", tracked.slam)
     if tracked.interrupted:
         return tracked.slam, True
@@ -342,5 +328,5 @@ def _adjust(
         with stop.at_once():
             return finish(tracked.slam, roles, settings, hooks.clock), False
     except KeyboardInterrupt:
-        hooks.each("on_message", "interrupted: keeping what there is, without the last adjustment")
+        hooks.each("on_message", "interrupted: keeping the result without the last adjustment")
         return tracked.slam, True

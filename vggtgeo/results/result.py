@@ -1,4 +1,4 @@
-"""The result of a run: trajectory, map, verdict; from its last state, or from the folder it was saved in."""
+"""The result of a run: trajectory, map and verdict, from the last state or loaded from a folder."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from vggtgeo.datasets.frame import Sequence
+from vggtgeo.figures.map_view import result_figure
 from vggtgeo.figures.plot import check_truth, plot
 from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
-from vggtgeo.figures.result_figure import result_figure
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
@@ -25,7 +25,6 @@ from vggtgeo.io.files import write_json
 from vggtgeo.io.given import check_kind, check_plain, path_of
 from vggtgeo.mapping.dense import DenseMap, dense_map
 from vggtgeo.report import write_page
-from vggtgeo.results.every_depth import every_depth
 from vggtgeo.results.files import (
     read_uncertainty,
     write_depth,
@@ -34,11 +33,12 @@ from vggtgeo.results.files import (
     write_trajectories,
     write_uncertainty,
 )
-from vggtgeo.results.run_folder import RunFolder, taken_beside
+from vggtgeo.results.reread_frames import depth_of_frames
+from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
 from vggtgeo.results.scene import write_scene
-from vggtgeo.results.summary import compare, summarise, with_writing
-from vggtgeo.results.summary_file import poses_in, read_summary, unusable
-from vggtgeo.results.unfinished import check_finished
+from vggtgeo.results.summary import add_writing_time, compare_with_truth, summarise
+from vggtgeo.results.summary_file import load_poses, read_summary, summary_error
+from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.known_map import save_map
@@ -50,17 +50,16 @@ from vggtgeo.slam.window.pending_window import settled
 from vggtgeo.slam.window.window_recorder import WindowRecord
 
 DepthChoice = bool | Literal["every"]
-"""Whose depth a folder of results holds: nobody's, that of the keyframes, or of every frame."""
+"""Which depth images to save: none, those of the keyframes, or those of every frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """What a result is made of, as long as it is in memory; the page and the depth images are drawn from it.
+    """The data of a result in memory, from which report and depth images are made.
 
-    slam: the last state. dense: the dense map after adjustment.
-    windows: one an adjustment of the window. truth: camera -> world, where it is known. warnings: about the input, and
-    about the weights of networks. title: of the run. seen: bool [H, W], pixels of the undistorted images that come
-    from the image; None where all do.
+    slam: the last state. dense: the dense map after the last adjustment. windows: one per adjustment of the window.
+    truth: ground truth, camera -> world. warnings: about the input and the weights of networks. title: of the report.
+    valid: bool [H, W], pixels of the undistorted images inside the original one; None if all are.
     """
 
     slam: Slam
@@ -69,7 +68,7 @@ class RunRecord:
     truth: Trajectory | None = None
     warnings: tuple[str, ...] = ()
     title: str = "run"
-    seen: np.ndarray | None = None
+    valid: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,16 +76,16 @@ class Result:
     """The result of a run.
 
     Fields:
-        trajectory: camera -> world of every frame that has a pose.
-        keyframes: those of the keyframes.
+        trajectory: poses of all tracked frames, camera -> world.
+        keyframes: poses of the keyframes, camera -> world.
         cloud: the map, world frame.
-        intrinsics: fx, fy, cx, cy, pixels, as adjusted, of undistorted images, as large as those of the keyframes.
+        intrinsics: adjusted fx, fy, cx, cy, pixels, of the undistorted images at the size of the keyframes.
         metric: whether lengths are metres; without metric depth they have no unit.
-        verdict: how far all this can be trusted, by segment of time.
-        summary: counts, times and settings, as `summary.json` has them.
-        record: what it was made of; None for a result that was read from a folder.
-        saved_mesh: the surface that was read from a folder, if there was one.
-        saved_uncertainty: the deviations that were read from a folder, if there were any.
+        verdict: how far the result can be trusted, by segment of time.
+        summary: counts, times and settings, as in `summary.json`.
+        record: the data of the run; None for a result loaded from a folder.
+        saved_mesh: the mesh loaded from a folder, if any.
+        saved_uncertainty: the standard deviations loaded from a folder, if any.
 
     Example:
         >>> import vggtgeo as vg
@@ -109,7 +108,7 @@ class Result:
 
     @property
     def intrinsics_as_read(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy, pixels of the images as they were read, where those were larger (`camera.most_pixels`)."""
+        """fx, fy, cx, cy, pixels of the original images, if the run reduced them (`camera.most_pixels`)."""
         reduced = self.summary.get("images_reduced")
         if reduced is None:
             return self.intrinsics
@@ -118,7 +117,7 @@ class Result:
 
     @property
     def mesh(self) -> Mesh | None:
-        """The map's surface, world frame; None where there is no dense depth. It is made when first asked for."""
+        """Mesh of the map, world frame, computed on first access; None without dense depth."""
         return self.saved_mesh if self.record is None else self.record.dense.mesh
 
     @property
@@ -130,21 +129,22 @@ class Result:
 
     @classmethod
     def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
-        """The result of a state: the last one that `vggtgeo.run` gave, or what `vggtgeo.finish` made of it.
+        """Return the result of a state of `vggtgeo.run` or `vggtgeo.finish`.
 
-        evidence: what an `EvidenceRecorder` noted of all frames; without it the verdict rests on the run's own record.
-        truth: camera -> world, where it is known. dense: whose depth the map is made of, as of `vggtgeo.reconstruct`.
+        evidence: frame data of an `EvidenceRecorder`; without it the verdict uses the state alone. truth: ground truth,
+        camera -> world. dense: source of the dense depth, as in `vggtgeo.reconstruct`.
         """
-        check_kind("slam", slam, Slam, "a state that `vggtgeo.run` gave")
+        check_kind("slam", slam, Slam, "a state of `vggtgeo.run`")
         slam = settled(slam)
         verdict, built = judge(slam, evidence), dense_map(slam, dense)
         count = len(built.cloud)
-        summary = summarise(slam, verdict, settings={}, seconds={}, report=compare(slam, truth), map_points=count)
+        report = compare_with_truth(slam, truth)
+        summary = summarise(slam, verdict, settings={}, seconds={}, report=report, map_points=count)
         return cls.assemble(RunRecord(slam, built, truth=truth), verdict, summary)
 
     @classmethod
     def assemble(cls, record: RunRecord, verdict: Verdict, summary: Mapping[str, Any]) -> Self:
-        """The result of parts that are there already."""
+        """Return the result of a finished record, verdict and summary."""
         slam = record.slam
         fx, fy, cx, cy = (float(value) for value in slam.intrinsics)
         poses = frame_trajectory(slam), keyframe_trajectory(slam)
@@ -153,19 +153,19 @@ class Result:
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Self:
-        """Reads the folder that `Result.save` or `vggtgeo run` wrote; InputError where a file of it is missing."""
+        """Load the folder of `Result.save` or `vggtgeo run`; raise InputError if a file is missing or invalid."""
         place = path_of("folder", folder)
-        unfinished = check_finished(place)
+        unfinished = unfinished_message(place)
         if unfinished:
             warnings.warn(unfinished, InputWarning, stacklevel=2)
         summary, verdict = read_summary(place)
         try:
             fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
         except (KeyError, TypeError, ValueError) as error:
-            raise unusable(place, error) from None
+            raise summary_error(place, error) from None
         return cls(
-            poses_in(place, "trajectory.txt"),
-            poses_in(place, "keyframes.txt"),
+            load_poses(place, "trajectory.txt"),
+            load_poses(place, "keyframes.txt"),
             PointCloud.load_ply(place / "map.ply"),
             (fx, fy, cx, cy),
             verdict.metric,
@@ -183,36 +183,34 @@ class Result:
         frames: Sequence | None = None,
         settings: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """Writes the folder of a run: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (where there is dense
-        depth), `images/`, `scene.npz`, `trajectory.png`, `report.html`, `summary.json` and `settings.toml`;
-        `vggtgeo.read` reads it. They are written beside and take their places
-        together; what an earlier run left there is replaced as a whole. The state of a run into that folder that was
-        killed stays, with a warning.
+        """Write the folder of a run; `vggtgeo.read` loads it.
 
-        A result that was read from a folder has neither images nor windows, so it is saved without page and depth.
+        Files: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (with dense depth), `images/`, `scene.npz`,
+        `trajectory.png`, `report.html`, `summary.json`, `settings.toml`. They replace those of an earlier run all at
+        once. A checkpoint in the folder is kept, with a warning. A result loaded from a folder has no images and no
+        record of its windows: it is saved without images, report and depth.
 
         Args:
-            folder: made where it does not exist.
-            depth: write each keyframe's dense depth and confidence as well, or, where it is "every", each frame's: its
-                own where `frames` have some, else what the nearest keyframes saw of its view; and, where `frames` are
-                given, each frame's picture.
-            frames: what the run read; needed for the sensor's depth of frames that are no keyframes.
-            settings: flags of the command line that tell how the run was made, beside the pipeline's own settings.
+            folder: created if it does not exist.
+            depth: also write dense depth and confidence: True for keyframes; "every" for every frame, from the sensor
+                if `frames` have depth, else from the nearest keyframes, and the images of `frames`.
+            frames: what the run read; needed for depth and images of frames that are not keyframes.
+            settings: options of the command line, saved beside the pipeline's own settings.
 
         Returns:
-            What `summary.json` holds: the summary, and of a run how long it took with all its files.
+            The content of `summary.json`: the summary, with the writing time for a run.
 
         Raises:
-            InputError: `frames` are of another size than those of the run, `depth` is none of these or is asked of a
-                result that was read from a folder, `settings` are no plain values, or the folder cannot be written, is
-                in use by a run, or holds a sequence of images.
+            InputError: the image size of `frames` differs from the run's; `depth` is invalid, or asked of a result
+                loaded from a folder; `settings` are not plain values; or the folder is not writable, in use by a run,
+                or contains images of a sequence.
 
         """
         if not (depth == "every" or isinstance(depth, bool | np.bool_)):
-            raise InputError(f"`depth` is {depth!r:.60}; expected True, False or 'every'")
-        check_kind("frames", frames, Sequence | None, "what the run read, such as `vggtgeo.open_sequence` gives")
+            raise InputError(f"`depth` must be True, False or 'every', got {depth!r:.60}")
+        check_kind("frames", frames, Sequence | None, "what the run read, for example of `vggtgeo.open_sequence`")
         check_plain("settings", settings or {})
-        with taken_beside(path_of("folder", folder)) as place:
+        with open_folder_for_result(path_of("folder", folder)) as place:
             return self.save_into(place, depth=depth, frames=frames, settings=settings)
 
     def save_into(
@@ -223,10 +221,10 @@ class Result:
         frames: Sequence | None = None,
         settings: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """The same, into a folder that is taken already."""
+        """Write the folder as `save`, into one that is locked already."""
         place = run.stage
         if depth and self.record is None:
-            raise InputError("`depth` needs a result that is still in memory; this one was read from a folder")
+            raise InputError("`depth` needs a result of a run in memory; this one was loaded from a folder")
         began = time.perf_counter()
         run.release_reserve()
         used = {**(settings or {}), **self.summary.get("settings", {})}
@@ -240,34 +238,34 @@ class Result:
             self.keyframes.save_tum(place / "keyframes.txt")
             if self.saved_uncertainty is not None:
                 write_uncertainty(place / "uncertainty.txt", self.saved_uncertainty)
-        with ThreadPoolExecutor(1, thread_name_prefix="mesh") as pool:  # beside the page: both take as long
+        with ThreadPoolExecutor(1, thread_name_prefix="mesh") as pool:  # mesh and report take equally long
             meshed = pool.submit(self._save_mesh, place / "mesh.ply")
             self.cloud.save_ply(place / "map.ply")
             self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
             if self.record is not None:
-                write_scene(place, self.record.slam, self.record.seen, frames if depth == "every" else None)
+                write_scene(place, self.record.slam, self.record.valid, frames if depth == "every" else None)
             meshed.result()
         if depth and self.record is not None:
             slam, depth_maps = self.record.slam, self.record.dense.depth_maps
             if depth == "every":
-                write_depth_maps(place, every_depth(slam, depth_maps, frames), slam.metric)
+                write_depth_maps(place, depth_of_frames(slam, depth_maps, frames), slam.metric)
             else:
                 write_depth(place, slam.keyframes, depth_maps, slam.metric)
         if self.record is not None:
-            plain = with_writing(plain, time.perf_counter() - began)
+            plain = add_writing_time(plain, time.perf_counter() - began)
         write_json(place / "summary.json", plain)
         run.publish()
         return plain
 
     def save_map(self, path: str | os.PathLike[str]) -> None:
-        """Writes the map that another run can go on in (`vggtgeo.load_map`, `vggtgeo run --map`), atomically.
+        """Write the map, atomically, for another run to extend (`vggtgeo.load_map`, `vggtgeo run --map`).
 
         Raises:
-            InputError: the result was read from a folder, or has no keyframe.
+            InputError: the result was loaded from a folder, or has no keyframe.
 
         """
         if self.record is None:
-            raise InputError("a map needs a result that is still in memory; this one was read from a folder")
+            raise InputError("`save_map` needs a result of a run in memory; this one was loaded from a folder")
         save_map(path, self.record.slam)
 
     def _save_mesh(self, path: Path) -> None:
@@ -301,7 +299,7 @@ class Result:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers: counts, length, intrinsics, and the summary."""
+        """Return counts, path length, intrinsics and summary as plain values."""
         return {
             "frames": len(self.trajectory),
             "keyframes": len(self.keyframes),

@@ -1,4 +1,4 @@
-"""What is called while a run goes on: its own witnesses, and what the caller gave."""
+"""Callbacks of a run: its own recorders and the user's."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from vggtgeo.slam.window.sliding_window import warm_up
 
 @dataclass(frozen=True, eq=False)
 class RunCallbacks:
-    """All callbacks of a run, their time measured apart from that of the run."""
+    """All callbacks of a run; their time is measured as a stage of its own."""
 
     members: tuple[Callback, ...]
     clock: Clock
 
     def __post_init__(self) -> None:
         for member in self.members:
-            check_kind("callbacks", member, Callback, "objects of `vggtgeo.Callback` in it")
+            check_kind("callbacks", member, Callback, "instances of `vggtgeo.Callback`")
 
     def warm_up(self, settings: SlamSettings, roles: Roles, camera: Camera) -> None:
-        """Compile what every window needs, every alignment with depth, and what the callbacks make of windows."""
+        """Compile the window adjustment, the RGB-D alignment, and what the callbacks compute from windows."""
         self.each("on_stage", "compiling")
         compiled = warm_up(settings, roles.metric)
         if roles.alignment is not None and roles.metric:
@@ -37,24 +37,24 @@ class RunCallbacks:
             member.on_warm_up(*compiled)
 
     def so_far(self) -> dict[str, Any]:
-        """What those that have something to keep give, by the names of their classes."""
+        """Return the state of each callback that has one, by class name, for a checkpoint."""
         found = {type(member).__name__: member.so_far() for member in self.members}
         return {name: value for name, value in found.items() if value is not None}
 
     def resume(self, before: RunSoFar) -> None:
-        """Each goes on from what it gave; InputError where that is something else than what it gives."""
+        """Restore each callback from a checkpoint; raise InputError for a state of another type."""
         for member in self.members:
             name = type(member).__name__
             kept, fresh = before.callbacks.get(name), member.so_far()
             if fresh is not None and not isinstance(kept, type(fresh)):
                 raise InputError(
-                    f"the run that was killed kept {type(kept).__name__} of `{name}`; expected "
-                    f"{type(fresh).__name__}: begin anew with `--no-resume`"
+                    f"`{name}` in the checkpoint must be {type(fresh).__name__}, got {type(kept).__name__}: start "
+                    "again with `--no-resume`"
                 )
             member.on_resume(kept, before.slam)
 
     def each(self, hook: str, *arguments: Any) -> None:
-        """Call one hook of every member."""
+        """Call a hook of every callback."""
         with self.clock.measure("record and draw"):
             for member in self.members:
                 getattr(member, hook)(*arguments)

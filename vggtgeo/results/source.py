@@ -1,4 +1,4 @@
-"""Where a run's frames come from: a folder, a file, a reader, a stream of images; opened, checked and reduced."""
+"""The input of a run: a folder, a file, a sequence or a stream of images; opened, validated, reduced in size."""
 
 from __future__ import annotations
 
@@ -22,28 +22,27 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.results.checkpoints import Checkpoints
-from vggtgeo.results.summary import lens_of
+from vggtgeo.results.summary import lens_parameters
 from vggtgeo.simulation.sequence import SyntheticSequence
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
 
-LEAST_SIDE = 32
-"""Pixels: windows of features and of the image pyramid do not fit into less."""
+MIN_SIDE = 32
+"""Pixels: the windows of features and of the image pyramid need as many."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What an estimator may see, and the truth, set apart for the comparison.
+    """Frames for the estimator and, apart from them, the ground truth for the evaluation.
 
-    simulated: whether frames are rendered. truth_in_metres: whether lengths of the truth are metres; those of COLMAP
-    have a unit of their own.
+    read: camera of the images before they were reduced. simulated: whether frames are rendered. truth_in_metres:
+    whether the ground truth is metric; poses of COLMAP have a free scale.
     """
 
     name: str
     frames: Sequence | FrameStream
     truth: Trajectory | None
     read: Camera
-    """Of the images before they were reduced."""
     simulated: bool = False
     truth_in_metres: bool = True
 
@@ -56,18 +55,18 @@ class Source:
         return self.frames.has_depth
 
     def check(self, start: int, end: int | None, stride: int) -> None:
-        """InputError for a selection that is none, or images too small for features, before anything is compiled."""
-        if min(self.camera.width, self.camera.height) < LEAST_SIDE:
+        """Raise InputError for an invalid selection, or images too small for features, before anything is compiled."""
+        if min(self.camera.width, self.camera.height) < MIN_SIDE:
             size, read = (f"{camera.width} x {camera.height}" for camera in (self.camera, self.read))
             smaller = "" if size == read else f", {size} after they were reduced"
             raise InputError(
-                f"the images of `{self.name}` are {read} pixels{smaller}; both sides must be at least {LEAST_SIDE}"
+                f"the images of `{self.name}` are {read} pixels{smaller}; both sides must be at least {MIN_SIDE}"
             )
         length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames) or sys.maxsize
         check_selection(self.name, length, start, end, stride)
 
-    def known(self, selection: tuple[int, int | None, int]) -> dict[str, Any]:
-        """What tells this source from another before a frame is read."""
+    def identity(self, selection: tuple[int, int | None, int]) -> dict[str, Any]:
+        """Return what distinguishes this source from others before a frame is read."""
         length = None if isinstance(self.frames, FrameStream) else len(self.frames)
         size = f"{self.camera.width} x {self.camera.height}"
         return {
@@ -76,25 +75,27 @@ class Source:
         }
 
     def resumable(self, asked: Checkpoints | None) -> Checkpoints | None:
-        """InputError for a resumed run over frames that do not come again."""
+        """Return `asked`; raise InputError if it resumes a stream, whose frames cannot be read again."""
         if asked is not None and asked.resume and self.count(0, None, 1) is None:
-            raise InputError(f"the frames of `{self.name}` come once: such a run cannot be resumed")
+            raise InputError(f"`{self.name}` is a stream, whose frames cannot be read again: it cannot be resumed")
         return asked
 
-    def comes_again(self, selection: tuple[int, int | None, int]) -> bool:
-        """Whether frames can be looked at before the run; simulated ones cost more to render than that is worth."""
+    def repeatable(self, selection: tuple[int, int | None, int]) -> bool:
+        """Return whether frames can be read before the run; simulated frames are too slow to render twice."""
         return bool(self.count(*selection)) and not self.simulated
 
-    def some_pictures(
-        self, start: int, end: int | None, stride: int, most: int, apart: int
+    def sample_images(
+        self, start: int, end: int | None, stride: int, max_images: int, max_step: int
     ) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """At most `most` of the first images of a selection that comes again, at most `apart` of its frames apart."""
+        """Return up to `max_images` of the first images of a selection, every `max_step` frames or less; none of a
+        stream.
+        """
         count = self.count(start, end, stride)
         if not count or isinstance(self.frames, FrameStream):
             return []
-        step = max(min(apart, count // most), 1)
-        until = start + min(count, most * step) * stride
-        # What is wrong with a frame, or with all of them, is told when the run comes to it.
+        step = max(min(max_step, count // max_images), 1)
+        until = start + min(count, max_images * step) * stride
+        # The run itself reports invalid frames.
         with warnings.catch_warnings(), suppress(InputError):
             warnings.simplefilter("ignore", InputWarning)
             frames = SequenceView(self.frames, self.camera, False).frames(start, until, step * stride)
@@ -102,19 +103,19 @@ class Source:
         return []
 
     def count(self, start: int, end: int | None, stride: int) -> int | None:
-        """Frames of a selection; None where only their end will tell."""
+        """Return the number of frames of a selection; None for a stream."""
         if isinstance(self.frames, FrameStream):
             return None
         length = len(self.frames)
-        if not length:  # a camera that is running
+        if not length:  # a live camera
             return None
         return len(range(start, length if end is None else min(length, end), stride))
 
 
-def opened(
+def open_source(
     frames: str | os.PathLike[str] | Sequence | Iterable[Any], camera: Camera | None, settings: SlamSettings
 ) -> Source:
-    """Opens what a run was given, as `reconstruct` takes it; images are reduced to `camera.most_pixels`."""
+    """Open the `frames` of `reconstruct`; reduce images to at most `camera.most_pixels`."""
     most = settings.camera.most_pixels
     if isinstance(frames, str | os.PathLike):
         frames = open_sequence(Path(frames))
@@ -129,26 +130,26 @@ def opened(
 
 
 def _truth(sequence: Sequence) -> Trajectory | None:
-    """The truth for the comparison; one that cannot be read costs that only."""
+    """The ground truth; warn and return None if it cannot be read, since the run itself does not need it."""
     try:
         truth = sequence.ground_truth()
         if truth is not None and not getattr(sequence, "truth_in_metres", True):
-            text = "are in a unit of their own, and errors against them in the same, after Sim(3) alignment"
-            warnings.warn(f"the true poses of `{sequence.name}` {text}", NoteWarning, stacklevel=4)
+            text = "has a free scale: errors are in its own unit, after Sim(3) alignment"
+            warnings.warn(f"the ground truth of `{sequence.name}` {text}", NoteWarning, stacklevel=4)
         return truth
     except InputError as error:
-        warnings.warn(f"the truth cannot be used and is left out: {error}", InputWarning, stacklevel=4)
+        warnings.warn(f"the ground truth is invalid and is left out: {error}", InputWarning, stacklevel=4)
         return None
 
 
-def as_read(source: Source, slam: Slam) -> dict[str, Any]:
-    """What the summary says of images that were reduced: both sizes, and the camera of the images as they were read."""
+def reduction_summary(source: Source, slam: Slam) -> dict[str, Any]:
+    """Return the summary's entries on reduced images: both sizes, and the camera of the original ones."""
     size, read = (f"{camera.width} x {camera.height}" for camera in (source.camera, source.read))
     if size == read:
         return {}
     fx, fy, cx, cy = map(float, slam.intrinsics)
-    enlarged = lambda camera: camera.resized(source.read.width, source.read.height)
-    found = enlarged(replace(source.camera, intrinsics=(fx, fy, cx, cy)))
-    camera = dict(zip(("fx", "fy", "cx", "cy"), found.intrinsics, strict=True))
-    lens = {} if slam.lens is None else {"lens": lens_of(enlarged(slam.lens))}
+    enlarge = lambda camera: camera.resized(source.read.width, source.read.height)
+    original = enlarge(replace(source.camera, intrinsics=(fx, fy, cx, cy)))
+    camera = dict(zip(("fx", "fy", "cx", "cy"), original.intrinsics, strict=True))
+    lens = {} if slam.lens is None else {"lens": lens_parameters(enlarge(slam.lens))}
     return {"images_reduced": {"from": read, "to": size, "intrinsics_as_read": camera}, **lens}

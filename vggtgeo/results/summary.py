@@ -1,4 +1,4 @@
-"""The numbers of a run, as `summary.json` holds them."""
+"""The summary of a run, as written to `summary.json`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.results.files import piece_file
+from vggtgeo.results.files import submap_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.sparse_map.connected import pieces_by_size
@@ -25,9 +25,10 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.finding import Verdict
 
 
-def compare(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:
-    """Errors against the truth; None where there is none, for fewer than three poses and, with a warning, where the
-    truth does not match them in time.
+def compare_with_truth(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:
+    """Return the errors against the ground truth.
+
+    None without ground truth, with fewer than three poses, or, with a warning, if the times do not match.
     """
     estimate = frame_trajectory(slam)
     if truth is None or len(estimate) < 3:
@@ -35,11 +36,11 @@ def compare(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:
     try:
         return evaluate_trajectory(estimate, truth)
     except InputError as error:
-        warnings.warn(f"there is no comparison with the truth: {error}", InputWarning, stacklevel=2)
+        warnings.warn(f"the ground truth is not evaluated: {error}", InputWarning, stacklevel=2)
         return None
 
 
-OWN = frozenset(
+RESERVED_KEYS = frozenset(
     {
         *("verdict", "settings", "versions", "frames", "frames_tracked", "keyframes", "pairs", "pieces"),
         *("peak_memory_gb", "scale", "scale_basis", "pose_sigma", "intrinsics", "lens", "rolling_shutter"),
@@ -47,7 +48,7 @@ OWN = frozenset(
         *("still_parts", "truth", "frames_per_second_whole_run"),
     }
 )
-"""What a summary says of every run by itself; no fact of a caller may have such a name."""
+"""Keys of every summary, which `facts` of `vggtgeo.reconstruct` must not use."""
 
 
 def summarise(
@@ -60,9 +61,9 @@ def summarise(
     truth_in_metres: bool = True,
     **counts: Any,
 ) -> dict[str, Any]:
-    """Verdict, settings, versions, counts, time by stage, final intrinsics, errors where the truth is known.
+    """Return verdict, settings, versions, counts, time by stage, final intrinsics, and errors against the ground truth.
 
-    truth_in_metres: whether those errors are metres, as their names say; `in_metres` beside them.
+    truth_in_metres: whether lengths of the ground truth are metres; written as `in_metres` beside the errors.
     """
     tracked = sum(record.tracked for record in slam.frames)
     values = {
@@ -73,13 +74,13 @@ def summarise(
         "frames_tracked": tracked,
         "keyframes": len(slam.keyframes),
         "pairs": len(slam.pairs),
-        "pieces": pieces(slam),
+        "pieces": list_submaps(slam),
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
         "scale": scale_name(slam, verdict),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
-        **stated_uncertainty(slam),
+        **_pose_sigma(slam),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
-        **({} if slam.lens is None else {"lens": lens_of(slam.lens)}),
+        **({} if slam.lens is None else {"lens": lens_parameters(slam.lens)}),
         **({} if slam.readout is None else {"rolling_shutter": asdict(slam.readout)}),
         "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
         "notes": list(slam.notes),
@@ -88,35 +89,36 @@ def summarise(
     return values if report is None else {**values, "truth": {**report.as_dict(), "in_metres": truth_in_metres}}
 
 
-def stated_uncertainty(slam: Slam) -> dict[str, Any]:
-    """Median and largest standard deviation of the poses of the largest piece; nothing where it is not known."""
-    found = frame_uncertainty(slam) if slam.keyframes else None
-    if found is None or not np.isfinite(found.translation).any():
+def _pose_sigma(slam: Slam) -> dict[str, Any]:
+    """Median and largest standard deviation of the poses of the largest submap; empty if unknown."""
+    sigma = frame_uncertainty(slam) if slam.keyframes else None
+    if sigma is None or not np.isfinite(sigma.translation).any():
         return {}
-    ends = lambda values: {"median": float(np.nanmedian(values)), "largest": float(np.nanmax(values))}
+    describe = lambda values: {"median": float(np.nanmedian(values)), "largest": float(np.nanmax(values))}
     unit = "m" if slam.metric else "unit"
-    moved, turned = ends(found.translation), ends(np.rad2deg(found.rotation))
-    return {"pose_sigma": {f"translation_{unit}": moved, "rotation_deg": turned}}
+    translation, rotation = describe(sigma.translation), describe(np.rad2deg(sigma.rotation))
+    return {"pose_sigma": {f"translation_{unit}": translation, "rotation_deg": rotation}}
 
 
-def pieces(slam: Slam) -> list[dict[str, Any]]:
-    """The pieces of the map, the one of most frames first: their file, first and last frame, poses, keyframes.
+def list_submaps(slam: Slam) -> list[dict[str, Any]]:
+    """Return file, first and last frame, number of poses and of keyframes of each submap, the largest first.
 
-    Nothing ties pieces to each other; of a map in one piece this is one entry.
+    No factor connects two submaps, so that their relative pose and scale are unknown.
     """
     found = []
-    for piece, numbers in enumerate(pieces_by_size(slam)):
+    for rank, numbers in enumerate(pieces_by_size(slam)):
         inside = set(numbers)
         own = [record.frame for record in slam.frames if record.tracked and record.reference in inside]
         ends = [min(own), max(own)] if own else []
-        file = piece_file("trajectory", piece)
+        file = submap_file("trajectory", rank)
         found.append({"trajectory": file, "frames": ends, "poses": len(own), "keyframes": len(numbers)})
     return found
 
 
-def with_writing(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-    """The summary of a run whose files took `seconds` to write: with that stage, and the frames a second of the whole,
-    from compilation to the last file. One without times stays as it is.
+def add_writing_time(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+    """Return the summary with the stage `write` of `seconds`, and the frames per second of the whole run.
+
+    A summary without times is returned unchanged.
     """
     stages = dict(summary.get("seconds_by_stage", {}))
     if "all" not in stages:
@@ -126,23 +128,23 @@ def with_writing(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
     return {**summary, "seconds_by_stage": stages, "frames_per_second_whole_run": round(summary["frames"] / whole, 2)}
 
 
-def lens_of(lens: Camera) -> dict[str, float]:
-    """The camera of the images as they were read, OpenCV's model; `intrinsics` are those of the undistorted ones."""
+def lens_parameters(lens: Camera) -> dict[str, float]:
+    """Return the parameters of the distorted camera, OpenCV's model; `intrinsics` are of the undistorted images."""
     return dict(zip(RadialTangential.names, (*lens.intrinsics, *lens.distortion), strict=True))
 
 
-SCALE_BASIS = "the depth alone: images do not tell a constant factor on it"
+SCALE_BASIS = "depth only: a constant factor on the depth cannot be observed in the images"
 
 
 def scale_name(slam: Slam, verdict: Verdict) -> str:
-    """What lengths are: "metric" only where nothing speaks against it."""
+    """Return the kind of scale; "metric" only if no check of the verdict doubts it."""
     if not slam.metric:
         return "free (no metric depth): lengths have no unit"
-    return "metric" if verdict.metric else "doubtful (see the verdict): lengths may be no metres"
+    return "metric" if verdict.metric else "doubtful (see the verdict): lengths may not be metres"
 
 
 def versions() -> dict[str, str]:
-    """The versions that a result depends on."""
+    """Return the versions of the packages that a result depends on."""
     names = ("vggtgeo", "jax", "optimistix", "lineax", "equinox", "jaxlie", "numpy", "opencv-python-headless")
     found = {"python": platform.python_version()}
     for name in names:

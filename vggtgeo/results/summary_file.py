@@ -1,4 +1,4 @@
-"""`summary.json` of a run's folder, read back."""
+"""Read `summary.json` and the pose files of a run's folder."""
 
 from __future__ import annotations
 
@@ -14,55 +14,56 @@ from vggtgeo.slam.trust.finding import Verdict
 
 
 def read_summary(folder: Path) -> tuple[dict[str, Any], Verdict]:
-    """The summary of the run in `folder`, and its verdict; InputError where the file is missing or no summary."""
+    """Return summary and verdict of the run in `folder`; raise InputError if the file is missing or invalid."""
     try:
         summary = json.loads(whole_text(folder / "summary.json", errors="strict"))
         return summary, Verdict.from_dict(summary["verdict"], summary["scale"] == "metric")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise unusable(folder, error) from None
+        raise summary_error(folder, error) from None
 
 
-def unusable(folder: Path, error: Exception) -> InputError:
-    """What is said of a summary that lacks something."""
+def summary_error(folder: Path, error: Exception) -> InputError:
+    """Return the InputError for a summary whose reading raised `error`."""
     return InputError(
-        f"`{folder}` has no usable `summary.json` ({lack(error)}); give a folder that `vggtgeo run` wrote"
+        f"`summary.json` in `{folder}` is invalid ({describe_error(error)}); give a folder that `vggtgeo run` wrote"
     )
 
 
-def lack(error: Exception) -> str:
-    """What a summary lacks that reading it raised this of: Python's own words name none of its entries."""
+def describe_error(error: Exception) -> str:
+    """Describe why a JSON file is invalid: the messages of Python's own exceptions do not name its entries."""
     if isinstance(error, KeyError):
-        return f"no `{error.args[0]}` in it"
+        return f"`{error.args[0]}` is missing"
     if isinstance(error, TypeError | AttributeError):
-        return "an entry of it is of another kind"
+        return "an entry has the wrong type"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return "brackets in brackets without end" if isinstance(error, RecursionError) else str(error)
+    return "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
 
 
 POSES = {"trajectory.txt": "poses", "keyframes.txt": "keyframes"}
-"""Files of poses in a run's folder, and where the summary counts those of its largest piece."""
+"""Pose files of a run's folder, and the summary's key for the number of poses in the largest submap."""
 
 
-def poses_in(folder: Path, name: str) -> Trajectory:
-    """The poses in one of `POSES`; InputError where it cannot be read, InputWarning as of `check_count`."""
-    return check_count(folder / name, Trajectory.load_tum(folder / name))
+def load_poses(folder: Path, name: str) -> Trajectory:
+    """Load one of the files of `POSES`; raise InputError if it is invalid, warn as `warn_if_truncated`."""
+    return warn_if_truncated(folder / name, Trajectory.load_tum(folder / name))
 
 
-def check_count(file: Path, found: Trajectory) -> Trajectory:
-    """The same poses; an InputWarning where the summary beside the file counts others. A file that was cut off at the
-    end of a line shows it by nothing else.
+def warn_if_truncated(file: Path, poses: Trajectory) -> Trajectory:
+    """Return `poses`; warn if the summary beside `file` states another number of them.
+
+    A file cut off at the end of a line is still valid: only the number of poses shows it.
     """
     try:
         largest = json.loads(whole_text(file.with_name("summary.json"), errors="strict"))["pieces"][0]
         count = largest[POSES[file.name]]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # no run's, or of one that does not say
-        return found
-    if type(count) is int and count != len(found):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # not a run's, or without the number
+        return poses
+    if type(count) is int and count != len(poses):
         warnings.warn(
-            f"`{file}` has {len(found)} poses, and the run's `summary.json` counts {count}: it was cut off, or changed "
-            "since; used as it is",
+            f"`{file}` has {len(poses)} poses, expected {count} from `summary.json`: it is truncated or was edited; "
+            "used as it is",
             InputWarning,
             stacklevel=3,
         )
-    return found
+    return poses

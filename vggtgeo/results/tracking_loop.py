@@ -1,29 +1,63 @@
-"""The loop over the frames of a run: tracked one by one, kept as checkpoints, ended after a whole frame by Ctrl-C."""
+"""The loop over the frames of a run: track each, write checkpoints, stop after a whole frame on Ctrl-C."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 from vggtgeo.datasets import Frame
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.interruption import Interruption
-from vggtgeo.results.checkpoints import Checkpoints, Keeper, Notice, RunSoFar, check_same_frame
-from vggtgeo.results.frames_in_hand import FramesInHand, read_only
+from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, Notice, RunSoFar, check_same_frame
 from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.state import FramePose, Slam
 from vggtgeo.slam.window.pending_window import settled
+
+
+class PendingFrames:
+    """Frames between the reading thread and the loop, which takes each, as read, once it is tracked.
+
+    `deque.append` and `popleft` are atomic, so no lock is needed.
+    """
+
+    def __init__(self, frames: Iterable[Frame]) -> None:
+        self._frames = frames
+        self._read: deque[Frame] = deque()
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._frames:
+            self._read.append(frame)
+            yield frame
+
+    def take(self, record: FramePose) -> Frame:
+        """Return the frame of a record; drop the frames before it, which tracking left out."""
+        while True:
+            frame = self._read.popleft()
+            if (frame.index, frame.timestamp) == (record.frame, record.timestamp):
+                return frame
+
+
+def read_only(frame: Frame) -> Frame:
+    """Return the frame with read-only arrays: callbacks must not change those that the map holds."""
+    views = [None if array is None else array.view() for array in (frame.image, frame.depth)]
+    for view in views:
+        if view is not None:
+            view.setflags(write=False)
+    image, depth = views
+    assert image is not None
+    return replace(frame, image=image, depth=depth)
 
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """The state after the last frame that was tracked."""
+    """The state after the last tracked frame."""
 
     slam: Slam
     interrupted: bool
@@ -32,8 +66,10 @@ class Tracked:
 
 @dataclass(frozen=True, eq=False)
 class TrackingLoop:
-    """The loop over frames. collected: warnings so far. began: of the run, s. before: the run that this one goes on.
-    first: the state before the first frame, where there is a map.
+    """The loop over frames.
+
+    collected: warnings so far. began: start of the run, s. before: the run that this one resumes. first: the state
+    before the first frame, if there is a map.
     """
 
     source: Source
@@ -48,27 +84,31 @@ class TrackingLoop:
     first: Slam | None
 
     @contextmanager
-    def keeping(self, asked: Checkpoints | None, wanted: Mapping[str, str]) -> Iterator[Keeper | None]:
-        """What keeps the state, where it is asked for and could be gone on with; its last file is whole at the end."""
+    def checkpoint_writer(
+        self, asked: Checkpoints | None, identity: Mapping[str, str]
+    ) -> Iterator[CheckpointWriter | None]:
+        """Yield a writer of checkpoints, None if they are not asked for or the frames are a stream; wait for its last
+        file at the end.
+        """
         if asked is None or self.source.count(*self.selection) is None:
             yield None
             return
         first = time.perf_counter()
-        keeper = Keeper(asked, wanted, lambda slam: self._so_far(slam, first), self._tell)
+        writer = CheckpointWriter(asked, identity, lambda slam: self._so_far(slam, first), self._message)
         try:
-            yield keeper
+            yield writer
         finally:
-            keeper.close()
+            writer.close()
 
-    def track(self, keeper: Keeper | None) -> Tracked:
-        """Ctrl-C ends it after a whole frame, or while none comes, an input error of the sequence without a result."""
+    def track(self, writer: CheckpointWriter | None) -> Tracked:
+        """Track all frames; Ctrl-C ends the loop after a whole frame, or at once while it waits for one."""
         known = self.first if self.before is None else self.before.slam
         slam, frame, interrupted = known, None, False
         self.hooks.each("on_begin", self.source.name, self.source.count(*self.selection))
         began = time.perf_counter()
         try:
-            before, rest = self._frames(keeper)
-            frames = FramesInHand(rest)
+            before, rest = self._frames(writer)
+            frames = PendingFrames(rest)
             roles, clock = self.perception.roles, self.hooks.clock
             run = run_frames(
                 frames, self.source.camera, roles, self.settings, clock, known, before, waiting=self.stop.at_once
@@ -76,8 +116,8 @@ class TrackingLoop:
             for slam in run:
                 frame = read_only(frames.take(slam.frames[-1]))
                 self.hooks.each("on_frame", slam, frame)
-                if keeper is not None:
-                    keeper.on_frame(slam, frame)
+                if writer is not None:
+                    writer.on_frame(slam, frame)
                 if self.stop.asked:
                     break
         except KeyboardInterrupt:
@@ -86,21 +126,19 @@ class TrackingLoop:
         if slam is None or not slam.frames:
             if interrupted:
                 raise KeyboardInterrupt
-            raise InputError(f"`{self.source.name}` gave no frame that could be used; nothing was written")
+            raise InputError(f"`{self.source.name}` has no usable frame; nothing was written")
         if interrupted:
-            self._tell("interrupted: keeping what there is")
-        elif keeper is not None:
-            keeper.on_end(slam, frame)
+            self._message("interrupted: keeping the frames so far")
+        elif writer is not None:
+            writer.on_end(slam, frame)
         slam = settled(slam)
         earlier = 0.0 if self.before is None else self.before.tracking
         return Tracked(slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began))
 
-    def _frames(self, keeper: Keeper | None) -> tuple[list[Frame], Iterator[Frame]]:
-        """The last two frames that were tracked, if any, of which one is looked at, and what is left of the
-        selection.
-        """
+    def _frames(self, writer: CheckpointWriter | None) -> tuple[list[Frame], Iterator[Frame]]:
+        """The last two frames of the resumed run, if any, and the frames that are left."""
         start, end, stride = self.selection
-        if self.before is None or keeper is None:
+        if self.before is None or writer is None:
             return [], iter(self.source.frames.frames(start, end, stride))
         tracked = [record.frame for record in self.before.slam.frames[-2:]]
         frames = iter(self.source.frames.frames(tracked[0], end, stride))
@@ -110,7 +148,7 @@ class TrackingLoop:
                 before.append(frame)
             if frame.index >= tracked[-1]:
                 break
-        check_same_frame(keeper.asked, before[-1] if before else None)
+        check_same_frame(writer.asked, before[-1] if before else None)
         self.before.restore_refusals(self.perception.refusals)
         for stage, seconds in self.before.seconds.items():
             self.hooks.clock.seconds[stage] += seconds
@@ -119,16 +157,16 @@ class TrackingLoop:
 
     def _so_far(self, slam: Slam, first: float) -> RunSoFar:
         now, before = time.perf_counter(), self.before
-        said = self.collected if before is None else before.unsaid(self.collected)
+        notices = self.collected if before is None else before.merge_warnings(self.collected)
         return RunSoFar(
             slam,
             self.hooks.so_far(),
-            tuple(map(Notice.of, said)),
+            tuple(map(Notice.of, notices)),
             {role: astuple(counts) for role, counts in self.perception.refusals.items()},
             dict(self.hooks.clock.seconds),
             now - first + (0.0 if before is None else before.tracking),
             now - self.began + (0.0 if before is None else before.whole),
         )
 
-    def _tell(self, text: str) -> None:
+    def _message(self, text: str) -> None:
         self.hooks.each("on_message", text)

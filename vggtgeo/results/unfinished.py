@@ -1,6 +1,4 @@
-"""What commands ask of a folder before JAX is loaded, which takes seconds: whether it holds a run, whole or one that
-has not ended, and whether one can be written there.
-"""
+"""Checks of a run's folder that need no JAX, so that commands fail before its import, which takes seconds."""
 
 from __future__ import annotations
 
@@ -9,43 +7,44 @@ from pathlib import Path
 from vggtgeo.io.errors import InputError
 
 UNFINISHED = "unfinished"
-"""Folder, inside that of the run, of what a run has written before it is done."""
+"""Subfolder for the files of a run that is still going on."""
 SUMMARY = "summary.json"
 CHECKPOINT = "checkpoint.npz"
-"""In `unfinished/`: the state that a killed run can go on from."""
+"""In `unfinished/`: the state from which a killed run can be resumed."""
 
 
-def check_finished(folder: Path) -> str | None:
-    """A sentence if a run into `folder` has not ended, or was killed; None for any other folder."""
+def unfinished_message(folder: Path) -> str | None:
+    """Return a message if the run into `folder` is still going on or was killed, else None."""
     stage = folder / UNFINISHED
     if not stage.is_dir():
         return None
-    older = ", and the files beside that are of the run before" if (folder / SUMMARY).is_file() else ""
-    further = "; `vggtgeo run --resume` goes on with it" if (stage / CHECKPOINT).is_file() else ""
-    return f"a run into `{folder}` goes on or was killed: what it has so far is in `{stage}`{older}{further}"
+    older = "; the other files in the folder are from the previous run" if (folder / SUMMARY).is_file() else ""
+    resume = "; `vggtgeo run --resume` continues it" if (stage / CHECKPOINT).is_file() else ""
+    return f"the run into `{folder}` is unfinished (running or killed), its files are in `{stage}`{older}{resume}"
 
 
 def check_is_run(folder: Path) -> None:
-    """InputError unless `folder` is that of a run."""
+    """Raise InputError unless `folder` contains a finished run."""
     if not (folder / SUMMARY).is_file():
         raise InputError(
-            check_finished(folder)
-            or f"`{folder}` holds no run (no `{SUMMARY}`); give a folder that `vggtgeo run` wrote"
+            unfinished_message(folder)
+            or f"`{folder}` contains no run (`{SUMMARY}` is missing); give a folder that `vggtgeo run` wrote"
         )
 
 
 def check_can_be_shown(folder: Path) -> None:
-    """InputError unless `folder` has the path and the map of a run."""
+    """Raise InputError unless `folder` has the trajectory and the map of a run."""
     if not folder.is_dir():
-        raise InputError(f"`{folder}` is no folder; give the folder that `vggtgeo run -o` wrote")
+        raise InputError(f"`{folder}` is not a folder; give the folder that `vggtgeo run -o` wrote")
     for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
         if not (folder / name).is_file():
             raise InputError(
-                check_finished(folder) or f"`{folder}` has no `{name}`; give the folder that `vggtgeo run -o` wrote"
+                unfinished_message(folder)
+                or f"`{name}` is missing in `{folder}`; give the folder that `vggtgeo run -o` wrote"
             )
 
 
 def check_may_be_folder(place: Path) -> None:
-    """InputError where a file lies in the place of a run's folder."""
+    """Raise InputError if `place` is an existing file."""
     if place.exists() and not place.is_dir():
-        raise InputError(f"`{place}` is a file; the results need a folder: give another name with `-o`")
+        raise InputError(f"`{place}` is a file, expected a folder for the results; give another path with `-o`")

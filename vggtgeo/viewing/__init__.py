@@ -1,1 +1,1 @@
-"""Views of a run in the Rerun viewer. Rerun is imported in this folder alone, when a view is asked for."""
+"""Views of a run in the Rerun viewer. Rerun is optional: only this package imports it, inside functions."""

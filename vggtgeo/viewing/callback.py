@@ -1,4 +1,4 @@
-"""Logs a run while it goes on: every frame's camera, every keyframe's window, every iteration of its solver."""
+"""Log a run to Rerun: the camera of each frame, the window of each keyframe, the iterations of its solver."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from vggtgeo.viewing.target import flush
 
 
 class RerunCallback(Callback):
-    """Logs to `stream`. Timelines: `frame`, `time` (seconds of the sequence) and `iteration` (tried
-    steps of the window's solver, counted through the run). window: keyframes of a window; a pair that is farther apart
-    is a loop. file: where the stream goes, if that is a file. cut_short: whether it could not be written to its end,
-    which costs a warning, never the run.
+    """Logs to `stream`, with the timelines `frame`, `time` (s) and `iteration` (tried steps of all windows' solvers).
+
+    window: keyframes of a window; pairs farther apart are loop closures. file: file of the stream, if any. cut_short:
+    whether the recording is incomplete, which is a warning and does not stop the run.
     """
 
     def __init__(self, stream: Any, window: int = WindowSettings().size, file: Path | None = None):
@@ -65,7 +65,7 @@ class RerunCallback(Callback):
         self._log_adjusted(slam)
 
     def on_finish(self, slam: Slam, cloud: PointCloud) -> None:
-        """The path after the last adjustment, and the map in place of the live one."""
+        """Log the path after the last adjustment, and replace the live map by the dense map."""
         self._log_path(slam)
         self._live.clear()
         entities.log_map(self.stream, cloud)
@@ -77,7 +77,7 @@ class RerunCallback(Callback):
 
     @in_double_precision
     def _log_adjusted(self, slam: Slam) -> None:
-        """Keyframes appear once their window is adjusted."""
+        """Log new keyframes, once their window is adjusted."""
         self._live.update(slam)
         self._recorder.on_adjust(slam)
         if len(slam.adjusted_keyframes) > self._keyframes:
@@ -88,8 +88,8 @@ class RerunCallback(Callback):
         numbers = slam.window if slam.solved is None else slam.solved[0].keyframes
         members = [slam.keyframes[number] for number in numbers]
         newest = members[-1].number
-        joined = [pair for pair in slam.pairs if pair.second == newest]
-        entities.log_keyframe(self.stream, members[-1], max(joined, key=lambda pair: pair.first, default=None))
+        matched = [pair for pair in slam.pairs if pair.second == newest]
+        entities.log_keyframe(self.stream, members[-1], max(matched, key=lambda pair: pair.first, default=None))
         entities.log_window(self.stream, members, list(slam.pairs))
         self._log_path(slam)
         entities.log_points(self.stream, members, slam.intrinsics)

@@ -1,4 +1,4 @@
-"""What is logged, one function an entity or a small group; each takes plain values and a stream whose time is set."""
+"""The logged entities, one function each; they take plain values and a stream whose time is set."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ ENTITIES = (
     "/plots/tracking/lost",
     "/notes",
 )
-"""All paths that a recording of a run with depth and lines holds."""
+"""All entity paths in the recording of a run with depth and lines."""
 SIGMAS = 20.0
-"""Standard deviations that the ellipsoids reach: those of a good window are millimetres."""
+"""Size of the ellipsoids, standard deviations: one is only millimetres in a good window."""
 _BLUE, _ORANGE, _GREEN, _GREY = (31, 95, 191), (224, 123, 26), (58, 143, 92), (150, 150, 150)
 _RED, _PURPLE = (200, 40, 40), (142, 95, 176)
 _GRAPH_RADIUS = 160.0
@@ -62,7 +62,7 @@ _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
 
 def log_camera(stream: Any, pose: np.ndarray, intrinsics: np.ndarray, image: np.ndarray) -> None:
-    """The current frame's camera (`pose` world -> camera, float [4, 4]) with its image at half size."""
+    """Log the current frame's camera (`pose` world -> camera, float [4, 4]) with its image at half size."""
     import rerun as rr
 
     height, width = image.shape[:2]
@@ -78,7 +78,7 @@ def log_camera(stream: Any, pose: np.ndarray, intrinsics: np.ndarray, image: np.
 
 
 def log_path(stream: Any, trajectory: Trajectory, keyframes: Trajectory) -> None:
-    """The path through all frames so far, and the keyframes on it."""
+    """Log the path of all frames so far, and the keyframes on it."""
     import rerun as rr
 
     stream.log("world/trajectory", rr.LineStrips3D([trajectory.positions], colors=[_BLUE], radii=-1.5))
@@ -86,7 +86,7 @@ def log_path(stream: Any, trajectory: Trajectory, keyframes: Trajectory) -> None
 
 
 def log_loops(stream: Any, slam: Slam, apart: int) -> None:
-    """Lines between keyframes that a loop joins, see `loop_edges`."""
+    """Log lines between the keyframes of loop closures, see `loop_edges`."""
     import rerun as rr
 
     ends = [[rigid.centre(slam.keyframes[number].pose) for number in edge] for edge in loop_edges(slam, apart)]
@@ -94,28 +94,28 @@ def log_loops(stream: Any, slam: Slam, apart: int) -> None:
 
 
 def log_lost(stream: Any, slam: Slam) -> None:
-    """Where frames have no pose: a point where the camera was lost and, in one piece of map, a line to where it was
-    found; and the paths of the pieces of map that nothing joins with the largest, whose places are only guesses.
+    """Log where tracking was lost: a point there and, within one submap, a line to where it was relocalised. Also the
+    paths of submaps that are not connected with the largest; their pose relative to it is a guess.
     """
     import rerun as rr
 
     label = piece_of(slam) if slam.keyframes else np.zeros(0, int)
-    begun, gaps = [], []
+    losses, gaps = [], []
     for first, last in lost_stretches(slam):
         around = [slam.frames[row] for row in (first - 1, last + 1) if 0 <= row < len(slam.frames)]
         centres = [rigid.centre(slam.pose(record)) for record in around]
         if first:
-            begun.append(centres[0])
+            losses.append(centres[0])
         if len(around) == 2 and label[around[0].reference] == label[around[1].reference]:
             gaps.append(centres)
     stream.log("world/lost", rr.LineStrips3D(gaps, colors=[_RED] * len(gaps), radii=-2.0))
-    stream.log("world/lost/begun", rr.Points3D(np.reshape(begun, (-1, 3)), colors=[_RED], radii=-6.0))
+    stream.log("world/lost/begun", rr.Points3D(np.reshape(losses, (-1, 3)), colors=[_RED], radii=-6.0))
     paths = [frame_trajectory(slam, piece).positions for piece in range(1, label.max(initial=0) + 1)]
     stream.log("world/unjoined", rr.LineStrips3D(paths, colors=[_ORANGE] * len(paths), radii=-1.5))
 
 
 def log_covariance(stream: Any, keyframes: list[Keyframe], covariances: np.ndarray) -> None:
-    """Ellipsoids of the camera centres; `covariances` [n, 6, 6] of the left tangents, translation first."""
+    """Log ellipsoids of the camera centres; `covariances` [n, 6, 6] of the left tangents, translation first."""
     import rerun as rr
 
     known = [
@@ -133,7 +133,7 @@ def log_covariance(stream: Any, keyframes: list[Keyframe], covariances: np.ndarr
 
 
 def ellipsoid(pose: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centre [3], half sizes [3] and quaternion (x, y, z, w) of the `SIGMAS` ellipsoid of a camera's centre.
+    """Return centre [3], half sizes [3] and quaternion (x, y, z, w) of the `SIGMAS` ellipsoid of a camera's centre.
 
     A step `rho` of the translation moves the centre by `-R' rho`, so its covariance is `R' Sigma R`.
     """
@@ -147,7 +147,7 @@ def ellipsoid(pose: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def log_window(stream: Any, keyframes: list[Keyframe], pairs: list[Pair]) -> None:
-    """The window's keyframes and the pairs that share matches, as a graph and as lines in the world."""
+    """Log the window's keyframes and matched pairs, as a graph and as lines in the world."""
     import rerun as rr
 
     names = {keyframe.number: str(keyframe.number) for keyframe in keyframes}
@@ -163,7 +163,7 @@ def log_window(stream: Any, keyframes: list[Keyframe], pairs: list[Pair]) -> Non
 
 
 def log_keyframe(stream: Any, keyframe: Keyframe, pair: Pair | None) -> None:
-    """Image, matches to the keyframe `pair` joins it with, line segments, depth and confidence of a keyframe."""
+    """Log image, matches of `pair`, line segments, depth and confidence of a keyframe."""
     import rerun as rr
 
     stream.log("keyframe/image", _jpeg(keyframe.image))
@@ -185,7 +185,7 @@ def log_keyframe(stream: Any, keyframe: Keyframe, pair: Pair | None) -> None:
 
 
 def log_points(stream: Any, keyframes: list[Keyframe], intrinsics: np.ndarray) -> None:
-    """The window's adjusted points, in the colours of their pixels."""
+    """Log the window's adjusted points, in the colours of their pixels."""
     import rerun as rr
 
     points, colours = [], []
@@ -198,7 +198,7 @@ def log_points(stream: Any, keyframes: list[Keyframe], intrinsics: np.ndarray) -
 
 
 def log_mesh(stream: Any, mesh: Mesh) -> None:
-    """The map's surface; at all times."""
+    """Log the mesh of the map, at all times."""
     import rerun as rr
 
     shape = rr.Mesh3D(
@@ -211,14 +211,14 @@ def log_mesh(stream: Any, mesh: Mesh) -> None:
 
 
 def log_map(stream: Any, cloud: PointCloud) -> None:
-    """The dense map, from the time that is set on: before it the map was what `LiveMap` shows."""
+    """Log the dense map from the current time on; before it, `LiveMap` shows the map."""
     import rerun as rr
 
     stream.log("world/map", rr.Points3D(cloud.points, colors=cloud.colours, radii=0.011))
 
 
 def log_residuals(stream: Any, record: WindowRecord) -> None:
-    """RMS residual of each term after an adjustment."""
+    """Log the RMS residual of each term after an adjustment."""
     import rerun as rr
 
     for name, value in record.rms.items():
@@ -227,8 +227,8 @@ def log_residuals(stream: Any, record: WindowRecord) -> None:
 
 
 def log_iteration(stream: Any, row: int, energy: float, record: IterationRecord | None, members: int) -> None:
-    """Energy after try `row` of the window's solver and, of a `record`, the cameras it left and how it went:
-    logarithms (base 10) of the damping, of the gradient norm, and of the largest motion of a camera's centre, metres.
+    """Log the energy after step `row` of the window's solver and, from a `record`, the cameras, and base-10 logarithms
+    of damping, gradient norm, and largest motion of a camera centre, metres.
     """
     import rerun as rr
 
@@ -253,7 +253,7 @@ def _centres(poses: Any) -> np.ndarray:
 
 
 def log_tracking(stream: Any, slam: Slam) -> None:
-    """How many points the last frame was tracked with, and for how many frames the camera has been lost."""
+    """Log the inliers of the last frame, and the number of frames since tracking was lost."""
     import rerun as rr
 
     stream.log("plots/tracking/inliers", rr.Scalars(float(slam.frames[-1].inliers)))
@@ -261,7 +261,7 @@ def log_tracking(stream: Any, slam: Slam) -> None:
 
 
 def log_note(stream: Any, text: str, level: str = "WARN") -> None:
-    """A message of the run."""
+    """Log a message of the run."""
     import rerun as rr
 
     stream.log("notes", rr.TextLog(text, level=level))

@@ -1,4 +1,4 @@
-"""A recording of a run's folder: what is on the disk, without running anything again."""
+"""Log a finished run from its folder."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
-from vggtgeo.results.summary_file import poses_in
+from vggtgeo.results.summary_file import load_poses
 from vggtgeo.results.unfinished import check_can_be_shown
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import STAND_IN
 
 
 def recording_of(folder: Path) -> Path | None:
-    """The recording that the run in `folder` made there, or None.
+    """Return the recording that the run in `folder` made there, or None.
 
-    The run's settings name it, so that the recording of an earlier run into the same folder is not taken for it. A run
-    that was killed left no settings: then any recording that is there, the newest of several.
+    It is named in the run's settings, which excludes recordings of earlier runs. A killed run has no settings: then the
+    newest recording in the folder.
     """
     try:
         target = tomllib.loads(whole_text(folder / "settings.toml", errors="strict")).get("rerun")
@@ -37,19 +37,19 @@ def recording_of(folder: Path) -> Path | None:
 
 
 def log_folder(stream: Any, folder: Path) -> None:
-    """Path, keyframes, map and mesh, and each keyframe's depth and confidence where the run saved them.
+    """Log path, keyframes, map and mesh, and each keyframe's saved depth and confidence.
 
     Raises:
-        InputError: `folder` has no `trajectory.txt`, `keyframes.txt` or `map.ply`.
+        InputError: `trajectory.txt`, `keyframes.txt` or `map.ply` is missing in `folder`.
 
     """
     import rerun as rr
 
     check_can_be_shown(folder)
-    trajectory = poses_in(folder, "trajectory.txt")
+    trajectory = load_poses(folder, "trajectory.txt")
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.set_time("frame", sequence=0)
-    entities.log_path(stream, trajectory, poses_in(folder, "keyframes.txt"))
+    entities.log_path(stream, trajectory, load_poses(folder, "keyframes.txt"))
     entities.log_map(stream, PointCloud.load_ply(folder / "map.ply"))
     if (folder / "mesh.ply").is_file():
         entities.log_mesh(stream, Mesh.load_ply(folder / "mesh.ply"))
@@ -62,7 +62,7 @@ def _log_depth(stream: Any, file: Path) -> None:
 
     number = file.name.split(".")[0]
     if not number.isdecimal():
-        raise InputError(f"`{file}` is no depth of a run: expected the number of a frame before `.depth.png`")
+        raise InputError(f"`{file}` must be named by a frame number before `.depth.png`, as `vggtgeo run` writes it")
     stream.set_time("frame", sequence=int(number))
     stream.log("keyframe/depth", rr.DepthImage(_read(file, np.uint16), meter=DEPTH_UNIT, colormap="viridis"))
     confidence = file.with_name(f"{number}.confidence.png")

@@ -1,8 +1,8 @@
-"""The map while a run goes on: what each keyframe saw, logged once in its own coordinates, and where the keyframe is.
+"""The map during a run: the cloud of each keyframe, logged once in its own frame, and the keyframe's pose.
 
-A cloud under a pose is fused again by logging the pose: where the window moves a keyframe its points follow, at the
-price of one transform. So the cost of a frame is bounded: `AT_ONCE` clouds of `MOST_POINTS` points, and a transform for
-each keyframe that moved, which are those of the window (all of them where a piece of map is joined).
+When an adjustment moves a keyframe, logging its pose moves its points as well. So the cost per frame is bounded: at
+most `MAX_CLOUDS` clouds of `MAX_POINTS` points, and a transform per moved keyframe: those of the window, or all of them
+when submaps are merged.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots, read_at
 from vggtgeo.slam.state import Slam
 
-MOST_POINTS = 4000
-"""Of a keyframe's cloud: 60 kB, as much as three of the frames' pictures."""
-AT_ONCE = 4
-"""Clouds logged at a frame: a run that goes on in a known map, or is resumed, has all of its keyframes at once."""
-LEAST_CONFIDENCE = 128
-"""Of a depth that is shown, of 255: as in the map."""
+MAX_POINTS = 4000
+"""Of a keyframe's cloud: 60 kB, as much as three of the frames' images."""
+MAX_CLOUDS = 4
+"""Clouds logged per frame: a run in a known map, or a resumed one, starts with many keyframes."""
+MIN_CONFIDENCE = 128
+"""Of depth that is shown, of 255: as in the map."""
 RADIUS = 0.011
 """Metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Logged:
-    """What was logged of a keyframe: its frame, pose and slots, by which a change is seen."""
+    """Frame, pose and points of a keyframe as logged, to detect changes."""
 
     frame: int
     pose: np.ndarray
@@ -37,15 +37,15 @@ class _Logged:
 
 
 class LiveMap:
-    """Logs to `world/live/NUMBER`: the cloud of each keyframe, and the keyframe's camera -> world."""
+    """Logs the cloud of each keyframe and its pose, camera -> world, to `world/live/NUMBER`."""
 
     def __init__(self, stream: Any):
         self._stream = stream
         self._logged: dict[int, _Logged] = {}
 
     def update(self, slam: Slam) -> None:
-        """Log what is new, and the pose of what moved."""
-        room = AT_ONCE
+        """Log new clouds, and the poses of moved keyframes."""
+        room = MAX_CLOUDS
         for keyframe in slam.adjusted_keyframes:
             before = self._logged.get(keyframe.number)
             if room and _is_stale(keyframe, before, slam):
@@ -58,7 +58,7 @@ class LiveMap:
                 self._logged[keyframe.number] = replace(before, pose=keyframe.pose)
 
     def clear(self) -> None:
-        """Take all of it away, and the window's points, from the time on that is set."""
+        """Remove the clouds and the window's points, from the current time on."""
         import rerun as rr
 
         for path in ("world/live", "world/points"):
@@ -80,31 +80,33 @@ class LiveMap:
 
 
 def _is_stale(keyframe: Keyframe, before: _Logged | None, slam: Slam) -> bool:
-    """Whether the cloud of a keyframe is to be logged (again): its points may have been adjusted since, where they are
-    what is shown. Those of the window are adjusted with the next keyframe, and shown by `world/points`.
+    """Whether to log the cloud of a keyframe (again).
+
+    Without dense depth the cloud is that of the adjusted points, which may have changed. Those of the window change
+    with each keyframe and are shown by `world/points`.
     """
-    if before is None or before.frame != keyframe.frame:  # a map may begin again: another frame by the same number
+    if before is None or before.frame != keyframe.frame:  # a new map reuses keyframe numbers
         return True
     return not slam.metric and keyframe.points is not before.points and keyframe.number not in slam.window
 
 
 def own_cloud(keyframe: Keyframe, intrinsics: np.ndarray, *, dense: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Points float32 [n, 3] in the keyframe's camera, and colours uint8 [n, 3], at most `MOST_POINTS`.
+    """Return points float32 [n, 3] in the keyframe's camera frame, and colours uint8 [n, 3]; at most `MAX_POINTS`.
 
-    dense: of its depth, on a regular grid, where it has any; else of its adjusted points.
+    dense: use its depth on a regular grid, if it has any; else its adjusted points.
     """
     if dense:
         height, width = keyframe.size
-        step = int(np.ceil(np.sqrt(height * width / MOST_POINTS)))
+        step = int(np.ceil(np.sqrt(height * width / MAX_POINTS)))
         grid = np.s_[step // 2 :: step, step // 2 :: step]
         z = keyframe.depth[grid].astype(np.float64)
-        rows, columns = np.nonzero(np.isfinite(z) & (keyframe.depth_confidence[grid] >= LEAST_CONFIDENCE))
+        rows, columns = np.nonzero(np.isfinite(z) & (keyframe.depth_confidence[grid] >= MIN_CONFIDENCE))
         if len(rows):
             pixels = np.column_stack([columns, rows]) * float(step) + step // 2
             points = pinhole.rays(pixels, intrinsics) * z[rows, columns, None]
             return points.astype(np.float32), keyframe.image[grid][rows, columns]
     inverse = keyframe.points.inverse_depth
-    known = np.nonzero(np.isfinite(inverse) & (inverse > 0.1))[0][:MOST_POINTS]
+    known = np.nonzero(np.isfinite(inverse) & (inverse > 0.1))[0][:MAX_POINTS]
     pixels = keyframe.points.pixels[known]
     points = pinhole.rays(pixels, intrinsics) / inverse[known, None]
     return points.astype(np.float32), read_at(keyframe.image, pixels)

@@ -1,4 +1,4 @@
-"""Where a recording goes: a file, a viewer on this machine, or a port that a browser connects to."""
+"""The target of a recording: a file, a viewer on this machine, or a web server; and its blueprint."""
 
 from __future__ import annotations
 
@@ -17,29 +17,31 @@ from urllib.parse import quote
 
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import make_parent, whole_path
-from vggtgeo.viewing.blueprint import blueprint
 
+ORIGINS = (
+    *("/world", "/world/camera/image", "/keyframe/image", "/keyframe/depth", "/keyframe/confidence", "/window"),
+    *("/plots/residuals", "/plots/solver", "/plots/convergence", "/plots/tracking", "/notes"),
+)
+"""Entities that the views of the blueprint show."""
 APPLICATION = "vggtgeo"
 STAND_IN = "run.rrd"
-"""In the run's folder: the recording of a run whose window could not open."""
+"""In the run's folder: the recording in place of a viewer that could not be opened."""
 VIEWER_PORT = 9876
-"""Where the viewer listens, and where a served recording is to be had if the port is free."""
+"""Usual port of the viewer, and of a served recording."""
 WEB_PORT = 9090
-"""The same of the page that shows a served recording."""
+"""Usual port of the page that shows a served recording."""
 _MAGIC = b"RRF"
-_PATIENCE = 10.0
-"""Seconds: for a viewer to open, and for it to take what was logged last."""
-_STANDSTILL = 5.0
-"""Seconds in which a file that is being written grows, on a slow disk, too."""
-_SOME = 2**20
-"""Bytes that a disk with room takes; what Rerun writes first is 30 kB."""
+_TIMEOUT = 10.0
+"""Seconds for a viewer to open, and to receive the last data."""
+_STALL_TIMEOUT = 5.0
+"""Seconds without growth after which a file is given up."""
+_PROBE_SIZE = 2**20
+"""Bytes written to test the disk; Rerun's first write is 30 kB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """A target that is open: `stream` takes what is logged; `url` is where a browser shows a served one, `file` what is
-    written where no viewer listens.
-    """
+    """An open target: `stream` to log to; `url` of a served recording; `file` that is written, if any."""
 
     stream: Any
     url: str | None = None
@@ -47,39 +49,39 @@ class Opened:
 
 
 def check_target(target: str) -> str:
-    """`target` itself; InputError unless it is `spawn`, `serve` or a file name that ends with `.rrd`."""
+    """Return `target`; raise InputError unless it is `spawn`, `serve` or a file name that ends with `.rrd`."""
     if target not in ("spawn", "serve") and Path(target).suffix != ".rrd":
         raise InputError(
-            f"`--rerun` is {target!r}; it must be `spawn` (a window), `serve` (a browser) or a file ending with `.rrd`"
+            f"`--rerun` must be `spawn` (a window), `serve` (a browser) or a file ending with `.rrd`, got {target!r}"
         )
     if "://" in target:
         raise InputError(
-            f"`--rerun` is `{target}`, an address; give a file, or `serve`, which says where a viewer can connect"
+            f"`--rerun` is `{target}`, an address; give a file, or `serve`, which prints the address for a viewer"
         )
     if Path(target).is_dir():
         raise InputError(f"`--rerun` is `{target}`, which is a folder; give a new file ending with `.rrd`")
-    if whole_path(Path(target)).is_symlink():  # Rerun would tell it in words of its own, after a second
-        raise InputError(f"`--rerun` is `{target}`, a link that leads nowhere; give a new file ending with `.rrd`")
+    if whole_path(Path(target)).is_symlink():  # Rerun's own error comes later and does not name the option
+        raise InputError(f"`--rerun` is `{target}`, a broken link; give a new file ending with `.rrd`")
     if Path(target).is_file() and not _is_recording(Path(target)):
-        raise InputError(f"`--rerun` is `{target}`, which is there and is no recording; give the name of a new file")
+        raise InputError(f"`--rerun` is `{target}`, which exists and is not a recording; give the name of a new file")
     return target
 
 
 def _is_recording(file: Path) -> bool:
-    """Whether Rerun wrote the file, so that a new recording may take its place."""
+    """Whether Rerun wrote the file, so that a new recording may replace it."""
     with file.open("rb") as handle:
         return handle.read(len(_MAGIC)) in (_MAGIC, b"")
 
 
 def open_target(target: str, name: str, instead: Path) -> Opened:
-    """A stream that sends what is logged to `target`, arranged by the blueprint of this package.
+    """Open a stream to `target`, with the blueprint of this package.
 
-    A file grows while the run goes on, so that an interrupted run leaves one that opens.
+    A file is written continuously, so that the recording of an interrupted run can be opened.
 
     Args:
-        target: `spawn`, `serve` or a file, as `check_target` takes it.
+        target: `spawn`, `serve` or a file, see `check_target`.
         name: of the recording.
-        instead: the file that is written in place of a window where there is no screen, with a warning.
+        instead: file to write, with a warning, if no viewer can be opened.
 
     """
     import rerun as rr
@@ -97,31 +99,31 @@ def open_target(target: str, name: str, instead: Path) -> Opened:
 
 
 def flush(stream: Any, file: Path | None = None) -> str:
-    """Waits until everything that was logged has arrived; says what went wrong, in a sentence, empty where nothing did.
+    """Wait until all data has been sent or written; return an error message, empty on success.
 
     Args:
-        stream: as `open_target` gives it.
-        file: where it goes, if that is a file.
+        stream: of `open_target`.
+        file: of the stream, if any.
 
     """
-    reason = _unsent(stream, _PATIENCE) if file is None else _unwritten(stream, file)
+    reason = _send_error(stream, _TIMEOUT) if file is None else _write_error(stream, file)
     if not reason or file is None:
-        return reason and f"the Rerun viewer did not take all of the recording ({reason})"
-    return f"the recording `{file}` is cut short: {reason}; make room there, or give another file"
+        return reason and f"the Rerun viewer did not receive all of the recording ({reason})"
+    return f"the recording `{file}` is incomplete: {reason}; free disk space, or give another file"
 
 
 def has_screen() -> bool:
-    """Whether a window can be opened, as far as the environment tells."""
+    """Return whether a window can be opened, by the environment variables."""
     if sys.platform in ("win32", "darwin"):
         return True
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))
 
 
 def _save(stream: Any, path: Path) -> Path:
-    """The file, asked for first whether the disk takes it: else Rerun may wait for ever, see `_unwritten`."""
+    """Record to a file, after a test that the disk is writable: else Rerun may never return, see `_write_error`."""
     make_parent(path)
     try:
-        reason = _refused(path.parent)
+        reason = _disk_error(path.parent)
         if not reason:
             stream.save(path, default_blueprint=blueprint())
     except RuntimeError as error:
@@ -131,7 +133,7 @@ def _save(stream: Any, path: Path) -> Path:
     return path
 
 
-def _unsent(stream: Any, seconds: float) -> str:
+def _send_error(stream: Any, seconds: float) -> str:
     try:
         stream.flush(timeout_sec=seconds)
     except RuntimeError as error:
@@ -139,49 +141,49 @@ def _unsent(stream: Any, seconds: float) -> str:
     return ""
 
 
-def _unwritten(stream: Any, file: Path) -> str:
-    """Why the file is not whole.
+def _write_error(stream: Any, file: Path) -> str:
+    """Why the file is incomplete; empty if it is complete.
 
-    Rerun's thread that writes it ends at the first error. A flush that was sent before is then never answered
-    (rerun-sdk 0.41), and whatever ends the stream waits for that one. So once the file no longer grows, it is given up.
+    Rerun's writing thread ends at the first error. A flush sent before is then never answered (rerun-sdk 0.41), and
+    closing the stream waits for it. So the stream is abandoned once the file no longer grows.
     """
     size = -1
-    while reason := _unsent(stream, _STANDSTILL):
+    while reason := _send_error(stream, _STALL_TIMEOUT):
         before, size = size, file.stat().st_size if file.is_file() else 0
         if size <= before:
-            _leave_open(stream)
-            return _refused(file.parent) or reason
+            _abandon(stream)
+            return _disk_error(file.parent) or reason
     return ""
 
 
-def _leave_open(stream: Any) -> None:
-    """Rerun waits neither at the end of the program nor where the stream is deleted: one reference more keeps it."""
+def _abandon(stream: Any) -> None:
+    """Keep a reference to the stream for ever: deleting it, or Rerun's exit handler, would wait for ever."""
     import rerun as rr
 
     rr.unregister_shutdown()
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
 
 
-def _refused(folder: Path) -> str:
-    """What the system says of one more file there; empty where it takes it."""
+def _disk_error(folder: Path) -> str:
+    """The error of writing a file in `folder`; empty if it can be written."""
     try:
         with tempfile.TemporaryFile(dir=folder) as probe:
-            probe.write(bytes(_SOME))
+            probe.write(bytes(_PROBE_SIZE))
     except OSError as error:
         return error.strerror or str(error)
     return ""
 
 
 def _spawn(stream: Any, instead: Path) -> Path | None:
-    """A window, or the file `instead` where none opens."""
+    """Open a viewer, or record to the file `instead` if that fails."""
     reason = "there is no screen" if not has_screen() else _start_viewer(stream)
     if reason is None:
         stream.connect_grpc(default_blueprint=blueprint())
         return None
     _save(stream, instead)
     warnings.warn(
-        f"{reason}, so the recording goes to `{instead}`; look at it with `rerun {instead}` where there is one, or "
-        "with `--rerun serve` in a browser",
+        f"{reason}, so the recording goes to `{instead}`; view it with `rerun {instead}` on a machine with a screen, "
+        "or with `--rerun serve` in a browser",
         InputWarning,
         stacklevel=2,
     )
@@ -189,9 +191,9 @@ def _spawn(stream: Any, instead: Path) -> Path | None:
 
 
 def _start_viewer(stream: Any) -> str | None:
-    """Start the viewer, or find one that runs; says why where there is none in the end."""
+    """Start the viewer, or find a running one; return an error message if that fails."""
     path = os.environ.get("PATH", "")
-    # The viewer's program lies beside Python, which is not on the path of whoever calls it by its whole name.
+    # The viewer is installed beside Python, whose folder need not be in PATH.
     os.environ["PATH"] = os.pathsep.join([sysconfig.get_path("scripts"), path])
     try:
         stream.spawn(connect=False)
@@ -199,7 +201,7 @@ def _start_viewer(stream: Any) -> str | None:
         return f"the viewer did not start ({str(error).splitlines()[0]})"
     finally:
         os.environ["PATH"] = path
-    end = time.monotonic() + _PATIENCE
+    end = time.monotonic() + _TIMEOUT
     while time.monotonic() < end:
         if _listens(VIEWER_PORT):
             return None
@@ -208,7 +210,7 @@ def _start_viewer(stream: Any) -> str | None:
 
 
 def _serve(stream: Any) -> str:
-    """A page and the recording behind it, at the usual ports or at free ones."""
+    """Serve the recording and a web viewer, at the usual ports or at free ones; return the URL."""
     import rerun as rr
 
     source = stream.serve_grpc(grpc_port=_port(VIEWER_PORT), default_blueprint=blueprint())
@@ -225,12 +227,42 @@ def _listens(port: int) -> bool:
 
 
 def _port(usual: int) -> int:
-    """`usual` if it is free, else one that is."""
+    """Return `usual` if it is free, else a free port."""
     with socket.socket() as probe:
-        if os.name == "posix":  # as the server itself does: a port that was just given up is free
+        if os.name == "posix":  # as the server itself: a recently closed port counts as free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("", usual))
         except OSError:
             probe.bind(("", 0))
         return int(probe.getsockname()[1])
+
+
+def blueprint() -> Any:
+    """Return the arrangement of the views: world on the left, current keyframe on the right, curves below."""
+    import rerun.blueprint as rrb
+
+    world = rrb.Spatial3DView(
+        name="World: path, map, covariance ellipsoids of 20 sigma",
+        origin="/world",
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+    pictures = rrb.Tabs(
+        rrb.Spatial2DView(name="Matches and lines", origin="/keyframe/image"),
+        rrb.Spatial2DView(name="Depth", origin="/keyframe/depth"),
+        rrb.Spatial2DView(name="Confidence", origin="/keyframe/confidence"),
+        rrb.GraphView(name="Window and covisibility", origin="/window"),
+        name="Keyframe",
+    )
+    now = rrb.Spatial2DView(name="Frame", origin="/world/camera/image")
+    curves = rrb.Tabs(
+        rrb.TimeSeriesView(name="Residuals [px], depth [sigma]", origin="/plots/residuals"),
+        rrb.TimeSeriesView(name="Energy by iteration", origin="/plots/solver"),
+        rrb.TimeSeriesView(name="Damping, gradient, step [m]: log10", origin="/plots/convergence"),
+        rrb.TimeSeriesView(name="Tracked points", origin="/plots/tracking"),
+        rrb.TextLogView(name="Notes", origin="/notes"),
+    )
+    left = rrb.Vertical(world, curves, row_shares=[3, 1])
+    right = rrb.Vertical(now, pictures, row_shares=[1, 1])
+    time = rrb.TimePanel(timeline="frame", play_state="following")  # opens at the end, with the whole map
+    return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[2, 1]), time, collapse_panels=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.results.frames_in_hand import FramesInHand, read_only
+from vggtgeo.results.tracking_loop import PendingFrames, read_only
 from vggtgeo.slam.state import FramePose
 
 
@@ -36,7 +36,7 @@ def often_interrupted() -> Iterator[None]:
 def test_frames_are_taken_while_others_are_read() -> None:
     """No frame is lost and none ends the run, one in three left out; oracle: the frames themselves."""
     frames = [_frame(index) for index in range(20_000)]
-    hand = FramesInHand(frames)
+    hand = PendingFrames(frames)
     with ThreadPoolExecutor(1) as reader:
         read = iter(hand)
         coming = [reader.submit(next, read) for _ in frames]
@@ -49,7 +49,7 @@ def test_frames_are_taken_while_others_are_read() -> None:
 def test_a_frame_left_out_is_forgotten() -> None:
     """Of two frames of one index, that of the record's time is given; then those after it."""
     frames = [_frame(0), _frame(1, 0.5), _frame(1, 1.5), _frame(2)]
-    hand = FramesInHand(frames)
+    hand = PendingFrames(frames)
     assert len(list(hand)) == len(frames)
     assert hand.take(_record(frames[2])) is frames[2]
     assert hand.take(_record(frames[3])) is frames[3]

@@ -13,14 +13,14 @@ import tiny_sequences
 from recorded_run import RecordedRun, recorded_run
 
 import vggtgeo as vg
-from vggtgeo.cli.run_sequence import _once_more
+from vggtgeo.cli.run_sequence import _reopen
 from vggtgeo.datasets import open_sequence
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.consistency import PosedDepth
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.frame_depth import rendered_depth
-from vggtgeo.results.every_depth import every_depth
+from vggtgeo.results.reread_frames import depth_of_frames
 from vggtgeo.slam.run import default_roles
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
@@ -68,7 +68,7 @@ def test_a_frame_without_depth_gets_that_of_the_keyframes(run: RecordedRun) -> N
     slam, row = run.slam, ordinary(run.slam)
     maps = dense_depths(slam.keyframes, slam.intrinsics)
     truth = run.sequence.true_depth(slam.frames[row].frame)
-    found = dict(every_depth(slam, maps))
+    found = dict(depth_of_frames(slam, maps))
     assert list(found) == [record.frame for record in slam.frames]
     own = found[slam.frames[row].frame]
     assert own is not None
@@ -79,7 +79,7 @@ def test_a_frame_without_depth_gets_that_of_the_keyframes(run: RecordedRun) -> N
     away = slam.frames[row].relative.copy()
     away[2, 3] += 0.5
     frames = [*slam.frames[:row], replace(slam.frames[row], relative=away), *slam.frames[row + 1 :]]
-    wrong = dict(every_depth(replace(slam, frames=tuple(frames)), maps))[slam.frames[row].frame]
+    wrong = dict(depth_of_frames(replace(slam, frames=tuple(frames)), maps))[slam.frames[row].frame]
     assert wrong is not None
     known &= np.isfinite(wrong.depth)
     assert np.median(np.abs(wrong.depth - truth)[known]) > 0.2
@@ -104,7 +104,7 @@ def test_the_sensor_s_own_depth_counts_and_holes_are_filled(run: RecordedRun) ->
                 depth[100:140, 100:140] = np.nan
                 yield replace(frame, depth=depth)
 
-    found = dict(every_depth(slam, maps, Halved()))
+    found = dict(depth_of_frames(slam, maps, Halved()))
     depth, given = found[slam.frames[row].frame].depth, run.frames[slam.frames[row].frame].depth
     known = np.isfinite(given) & (given > 0.5)
     known[100:140, 100:140] = False
@@ -130,8 +130,8 @@ def test_a_folder_has_the_depth_of_every_frame(run: RecordedRun, tmp_path: Path)
         one, other = ((place / name).read_bytes() for place in places)
         assert one == other
     assert cv2.imread(str(tmp_path / "every/depth" / min(names[1] - names[0])), cv2.IMREAD_UNCHANGED).any()
-    with pytest.raises(InputError, match="`frames` are of 160 x 120 pixels, those of the run of 320 x 240"):
-        list(every_depth(run.slam, [None] * len(run.slam.keyframes), vg.simulate("room", 9, size=(160, 120))))
+    with pytest.raises(InputError, match=r"`frames` .*160 x 120.*320 x 240"):
+        list(depth_of_frames(run.slam, [None] * len(run.slam.keyframes), vg.simulate("room", 9, size=(160, 120))))
 
 
 def test_a_lost_frame_has_its_own_depth_alone(run: RecordedRun) -> None:
@@ -140,13 +140,13 @@ def test_a_lost_frame_has_its_own_depth_alone(run: RecordedRun) -> None:
     lost = replace(run.slam.frames[row], tracked=False)
     slam = replace(run.slam, frames=(*run.slam.frames[:row], lost, *run.slam.frames[row + 1 :]))
     maps = dense_depths(slam.keyframes, slam.intrinsics)
-    assert dict(every_depth(slam, maps))[lost.frame] is None
+    assert dict(depth_of_frames(slam, maps))[lost.frame] is None
 
 
-def test_the_command_reads_every_frame_once_more(tmp_path: Path) -> None:
+def test_the_command_reads_every_frame_reopen(tmp_path: Path) -> None:
     # Proves that pictures of frames without depth are kept, too, and that depth which no role used is not read.
     images = tiny_layouts.quietly_opened(tiny_sequences.images(tmp_path / "images"))
     both = open_sequence(tiny_sequences.tum(tmp_path / "tum"))
-    assert len(list(_once_more(images, default_roles(False), SlamSettings()).frames())) == len(images)
-    assert _once_more(both, default_roles(True), SlamSettings()).has_depth
-    assert not _once_more(both, default_roles(False), SlamSettings()).has_depth
+    assert len(list(_reopen(images, default_roles(False), SlamSettings()).frames())) == len(images)
+    assert _reopen(both, default_roles(True), SlamSettings()).has_depth
+    assert not _reopen(both, default_roles(False), SlamSettings()).has_depth
