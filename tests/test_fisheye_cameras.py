@@ -101,7 +101,7 @@ def test_a_bag_of_a_fisheye(tmp_path: Path) -> None:
 
 
 def test_a_lens_of_three_numbers_is_told_with_its_file(tmp_path: Path) -> None:
-    # Proves that the sentence names the file; what else may be wrong in it are rows of docs/bad-inputs.md.
+    # Proves that the sentence names the file; what else may be wrong in it are rows of bad_inputs.csv.
     sensor = of_euroc(tmp_path / "scene") / "mav0/cam0/sensor.yaml"
     sensor.write_text(sensor.read_text().replace(", -0.0007", ""))
     with pytest.raises(InputError, match=r"sensor.yaml`: `distortion` has 3 coefficients"):
