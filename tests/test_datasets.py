@@ -8,6 +8,7 @@ import numpy as np
 import picture_bytes as bytes_of
 import pytest
 import tiny_sequences as tiny
+from PIL import Image
 from tiny_layouts import matroska
 
 from vggtgeo.cli.run import open_input
@@ -24,7 +25,7 @@ from vggtgeo.datasets import (
     with_rate,
     without_depth,
 )
-from vggtgeo.datasets.image_files import MILLIMETRES, read_depth, read_image_file
+from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth, read_image_file
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 
@@ -379,3 +380,15 @@ def test_a_camera_that_is_given_is_not_guessed(tmp_path: Path) -> None:
         assert not open_input(tmp_path, None, None, rgb_only=False).camera.known
     sequence = open_input(tmp_path, None, "50,50,31.5,23.5", rgb_only=False)  # a warning is an error here
     assert sequence.camera.intrinsics == (50.0, 50.0, 31.5, 23.5)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", ["uint8", "uint16"])
+def test_images_are_read_as_stored_whatever_their_orientation(tmp_path: Path, orientation: int, kind: str) -> None:
+    # Proves that no EXIF orientation of a TIFF is applied, though OpenCV does. Oracle: the pixels that Pillow wrote.
+    stored = np.random.default_rng(0).integers(0, 200, (12, 20)).astype(kind) * (1 if kind == "uint8" else 300)
+    Image.fromarray(stored).save(tmp_path / "a.tiff", tiffinfo={274: orientation})
+    assert np.array_equal(read_codes(tmp_path / "a.tiff"), stored)
+    read = read_image_file(tmp_path / "a.tiff")
+    assert read.orientation == orientation
+    assert np.array_equal(read.image[..., 0], stored if kind == "uint8" else stored >> 8)

@@ -7,7 +7,6 @@ answer, computed again. Each failed before.
 from __future__ import annotations
 
 import shutil
-import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,7 +21,6 @@ from conftest import ROOT
 from decoders import ANSWER, ANY
 
 from vggtgeo.datasets import open_sequence, video
-from vggtgeo.datasets.tiff_tags import tiff_tags
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 Change = Callable[[bytes], bytes]
@@ -153,13 +151,6 @@ def test_a_video_whose_reader_raises_ends_there(tmp_path: Path, monkeypatch: pyt
         InputWarning, match=r"`clip.mp4` ends after 2 frames; its header says 5: is the file cut off, or"
     ):
         assert [frame.index for frame in sequence.frames()] == [0, 1]
-
-
-def test_a_tag_that_a_tiff_has_twice() -> None:
-    """The first counts, as for libtiff, which decodes: a size or a turning that is declared again is none."""
-    twice = [struct.pack("<HHIHH", tag, 3, 1, value, 0) for tag, value in ((257, 48), (274, 6), (257, 10), (274, 1))]
-    found = tiff_tags(b"II*\0" + struct.pack("<IH", 8, len(twice)) + b"".join(twice))
-    assert {tag: entry.value for tag, entry in found.items()} == {257: 48, 274: 6}
 
 
 def test_a_video_goes_on_behind_damaged_data(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vggtgeo.datasets.image_defects import declared_size, defect
+from vggtgeo.datasets.image_checks import image_header
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import MASK, Scene
@@ -16,8 +16,7 @@ def picture_mask(scene: Scene, source: Path) -> bytes | None:
     if not file.is_file():
         return None
     content = file.read_bytes()
-    if declared_size(content) != scene.size:
-        raise InputError(f"`{file}` is no picture of {scene.size[0]} x {scene.size[1]} pixels; run again")
+    _check(content, file, scene, source)
     return content
 
 
@@ -29,13 +28,18 @@ def copy_pictures(scene: Scene, source: Path, target: Path) -> None:
         if not file.is_file():
             raise InputError(f"`{file}` is not there; run again, with `-o {source}`")
         content = file.read_bytes()
-        width, height = declared_size(content)
-        if content and (wrong := defect(content)):
-            raise InputError(f"`{file}` {wrong}; run again, with `-o {source}`")
-        if (width, height) != scene.size:
-            raise InputError(
-                f"`{file}` is no picture of {scene.size[0]} x {scene.size[1]} pixels (found {width} x {height}); run "
-                f"again, with `-o {source}`"
-            )
+        _check(content, file, scene, source)
         with atomic_open(target / "images" / file.name, "wb") as handle:
             handle.write(content)
+
+
+def _check(content: bytes, file: Path, scene: Scene, source: Path) -> None:
+    try:
+        header = image_header(content, file)
+    except InputError as error:
+        raise InputError(f"{error}; run again, with `-o {source}`") from None
+    if (header.width, header.height) != scene.size:
+        raise InputError(
+            f"`{file}` is {header.width} x {header.height} pixels; it must be {scene.size[0]} x {scene.size[1]}: run "
+            f"again, with `-o {source}`"
+        )
