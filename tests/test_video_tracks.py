@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import av
 import numpy as np
 import pytest
 
 from vggtgeo.datasets import open_sequence, with_rate, without_depth
 from vggtgeo.datasets.check import inspect
-from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.video_tracks import Track, choose_tracks
-from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.errors import InputError, NoteWarning
 
-av = pytest.importorskip("av", reason="av is not installed")
 COUNT, RATE = 6, 10
 SIZE = 64, 48
 
@@ -141,19 +139,6 @@ def test_grey_that_does_not_say_what_it_is_is_named(tmp_path: Path) -> None:
         open_sequence(path)
     with pytest.warns(NoteWarning):
         assert not open_sequence(path, depth=False).has_depth
-
-
-@pytest.mark.parametrize("name", ["a.mkv", "a.mp4"])
-def test_several_tracks_without_the_package(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that several tracks are told where the package that reads them is missing, with the extra; and that one
-    # track, or its absence, changes nothing for others. Oracle: the files.
-    film = Film("mpeg4", "yuv420p")
-    several, one = write(tmp_path / name, film, film), write(tmp_path / f"one-{name}", film)
-    assert isinstance(open_sequence(one), VideoFile)
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.warns(InputWarning, match=r"2 tracks of video.*`video`"):
-        assert len(list(open_sequence(several).frames())) == COUNT
-    assert open_sequence(one).tracks is None
 
 
 def test_tracks_in_colour_go_before_those_in_grey_and_covers() -> None:
