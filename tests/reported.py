@@ -11,8 +11,14 @@ from vggtgeo.io.errors import InputError, InputWarning
 
 
 def pattern(*named: object) -> str:
-    """A pattern of messages in which each of these occurs: the argument or file, and the offending value."""
-    return "(?s)" + "".join(f"(?=.*{re.escape(str(one))})" for one in named)
+    """Return a pattern of messages that name each of these: the argument or file, and the offending value.
+
+    A number is matched as a whole: `1` does not occur in `10`.
+    """
+    return "(?s)" + "".join(
+        rf"(?=.*(?<!\w){re.escape(one)}(?!\w))" if one[-1:].isdigit() else f"(?=.*{re.escape(one)})"
+        for one in map(str, named)
+    )
 
 
 def raises(*named: object, error: type[Exception] = InputError) -> Any:

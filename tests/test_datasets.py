@@ -9,6 +9,7 @@ import picture_bytes as bytes_of
 import pytest
 import tiny_sequences as tiny
 from PIL import Image
+from reported import raises, warns
 from tiny_layouts import matroska
 
 from vggtgeo.cli.run import open_input
@@ -74,7 +75,7 @@ def test_seven_scenes_finds_the_sequence_in_a_scene(tmp_path: Path) -> None:
     tiny.seven_scenes(tmp_path / "seq-02", (1,))
     assert open_sequence(tmp_path).name == "seq-02"
     tiny.seven_scenes(tmp_path / "seq-01", (0,))
-    with pytest.warns(InputWarning, match="2 sequences; reading `seq-01`"):
+    with warns("seq-01", "2"):
         assert open_sequence(tmp_path).name == "seq-01"
 
 
@@ -112,7 +113,7 @@ def test_tum_pairs_the_nearest_depth_once(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text(
         "10.000 rgb/10.000000.png\n10.010 rgb/10.100000.png\n10.100 rgb/10.200000.png\n10.200 rgb/10.300000.png\n"
     )
-    with pytest.warns(InputWarning, match="2 of 4 images have no depth"):
+    with warns("2", "4"):
         sequence = open_sequence(tmp_path)
     found = [None if np.isnan(f.depth).all() else round(float(f.depth[1, 0]) * 5000) for f in _with_depth(sequence)]
     assert found == [None, 1000, 1010, None]
@@ -275,7 +276,7 @@ def test_the_users_intrinsics_win(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["500,500,320", "500,500,320,240,1", "a,b,c,d", "-500,500,320,240", "nan,1,1,1", ""])
 def test_bad_intrinsics_of_the_user_are_refused(text: str) -> None:
     # Proves that what is no `fx,fy,cx,cy` is an error that names it.
-    with pytest.raises(InputError, match="`intrinsics`"):
+    with raises("intrinsics"):
         parse_intrinsics(text)
 
 
@@ -327,9 +328,9 @@ def test_a_given_rate_makes_the_times(tmp_path: Path) -> None:
     tiny.write_calibration(tmp_path, tiny.INTRINSICS)
     video = with_rate(open_sequence(_video(tmp_path / "clip.avi", [0, 80, 160])), 5.0)
     assert [frame.timestamp for frame in video.frames()] == [0.0, 0.2, 0.4]
-    with pytest.raises(InputError, match="has times of its own"):
+    with raises("tum"):
         with_rate(open_sequence(tiny.tum(tmp_path / "tum")), 5.0)
-    with pytest.raises(InputError, match="must be a positive number"):
+    with raises("rate"):
         with_rate(images, -1.0)
 
 

@@ -276,8 +276,11 @@ def _check_depth(path: Path, chosen: ChosenTracks, depth: Track, size: Size) -> 
 
 def _check_content(path: Path) -> None:
     """Raise InputError for an empty file or text: FFmpeg draws letters, and opens lists of addresses (`m3u8`)."""
-    with path.open("rb") as file:
-        head = file.read(_HEAD)
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    except OSError as error:  # a disk that fails
+        raise InputError(f"`{path}` cannot be read: {error.strerror}; give a copy on a disk that works") from None
     if not head:
         raise InputError(f"`{path}` is empty; copy or record it again")
     if not _NO_TEXT.search(head):

@@ -21,6 +21,8 @@ DELAY = 0.02
 """Seconds between an image and its depth at most."""
 _NO_TIMESTAMPS = 0x80
 """Flag of FFmpeg's formats that are streams without a container (AVFMT_NOTIMESTAMPS)."""
+_IMAGES = ("_pipe", "gif", "image2", "ico")
+"""Formats of FFmpeg that hold images: it takes one for a video of one frame."""
 _PREDICTED = (2, 3)
 """Types of frames that are made of others: P and B."""
 
@@ -146,6 +148,10 @@ def open_container(path: Path) -> Iterator[Any]:
             "AVI or WebM"
         ) from None
     with container:
+        if container.format.name.endswith(_IMAGES):
+            raise InputError(
+                f"`{path}` is an image ({container.format.name}); give the folder of the sequence, or a video file"
+            )
         if not any(stream.codec_context is not None for stream in container.streams.video):
             raise InputError(f"`{path}` has no stream of video that can be decoded")
         yield container
