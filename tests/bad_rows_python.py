@@ -1,4 +1,4 @@
-"""Rows of the table of bad inputs: what a script may give to the functions of the library, wrongly.
+"""Rows of the table of bad inputs: invalid calls of the library by a script.
 
 The tests check all annotations while they run, so that these calls would not get far there: called as a program, this
 file makes them as a script does, and prints how each of them ended.
@@ -339,23 +339,23 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
 PYTHON = [Row("Calls from Python", given, nothing, call=call, slack=3.0) for given, call in CALLS]
 
 
-def main() -> None:
-    """How each row ends, what is said, and seconds of the processor, as JSON."""
+def main(names: Sequence[str]) -> None:
+    """Print how each row of these names ends, its messages, and seconds of the processor, as JSON."""
     jax.config.update("jax_enable_x64", True)
-    told = {}
-    for row in PYTHON:
+    results = {}
+    for row in (row for row in PYTHON if row.given in names):
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            began, end, said = time.process_time(), "used", []
+            began, ended, messages = time.process_time(), "used", []
             try:
                 row.call(Path(folder))
             except ValueError as error:
-                end, said = "error", [str(error)]
+                ended, messages = "error", [str(error)]
             seconds = time.process_time() - began
-            said += [str(entry.message) for entry in caught if issubclass(entry.category, InputWarning)]
-        told[row.given] = (end, said, seconds)
-    sys.stdout.write(json.dumps(told))
+            messages += [str(entry.message) for entry in caught if issubclass(entry.category, InputWarning)]
+        results[row.given] = (ended, messages, seconds)
+    sys.stdout.write(json.dumps(results))
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

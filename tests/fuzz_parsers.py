@@ -8,7 +8,7 @@ next call goes on from there.
 
 Oracle: the file is read, or `InputError` says why not; nothing else comes out, and it takes no more than a second of
 the processor and 500 MB. What else happens is told once for each place in the code, and the file that shows it is kept
-in `.cache/fuzz/findings/`. Exit code 1 where there is one. A finding becomes a row of docs/bad-inputs.md or a test.
+in `.cache/fuzz/findings/`. Exit code 1 where there is one. A finding becomes a row of `bad_inputs.csv` or a test.
 """
 
 from __future__ import annotations

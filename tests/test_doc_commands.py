@@ -16,8 +16,7 @@ from conftest import ROOT
 from vggtgeo.benchmark.suite import limited, load_suite, shipped
 from vggtgeo.cli.main import make_app
 
-PAGES = sorted({ROOT / "README.md", *(ROOT / "docs").rglob("*.md")} - {ROOT / "docs" / "bad-inputs.md"})
-"""Without the page of wrong commands, which has a test of its own."""
+PAGES = sorted({ROOT / "README.md", *(ROOT / "docs").rglob("*.md")})
 OURS = re.compile(r"(?:\S+/)?(?:vggtgeo (?!as )(?=[a-z])|python (?:benchmarks|docs)/)")
 UNFINISHED = re.compile(r"\.\.\.|[\[\]|]|--\S+,|FILE\.toml|GROUP\.FIELD")
 """In prose: `vggtgeo run ...`, optional parts, a list of options, a word in the place of a file or a setting."""

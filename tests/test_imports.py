@@ -30,7 +30,7 @@ STAIR = (
 STEP = {package: step for step, packages in enumerate(STAIR) for package in packages}
 LATE = {"vggtgeo.cli"}
 """Packages whose functions import the project: a command's help must not load what the command needs."""
-NEVER_AT_MODULE_LEVEL = {"av", "evo", "onnx", "onnxscript", "pyarrow", "ray", "rerun", "rosbags", "torch"}
+NEVER_AT_MODULE_LEVEL = {"evo", "onnx", "onnxscript", "pyarrow", "ray", "rerun", "rosbags", "torch"}
 
 
 def _statements(body: ast.AST, in_functions: bool, for_types: bool = True) -> Iterator[ast.AST]:

@@ -1,7 +1,7 @@
 """Every parser on files that were damaged at random: it reads them, or says in a sentence why not; nothing else.
 
 `make fuzz COUNT=20000 ARGS=tests/test_mutated_files.py` runs so many of each kind; a finding becomes a row of
-docs/bad-inputs.md.
+`bad_inputs.csv`.
 """
 
 from __future__ import annotations

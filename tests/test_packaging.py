@@ -43,7 +43,7 @@ def test_every_hint_to_install_names_an_extra_that_is_there() -> None:
     sources = [file for folder in ("vggtgeo", "models", "solvers") for file in (ROOT / folder).rglob("*.py")]
     texts = {file.name: file.read_text(encoding="utf-8") for file in sources}
     asked = {extra for text in texts.values() for extra in re.findall(r"install_hint\([\"'](\w+)", text)}
-    assert asked == {"bags", "bench", "cluster", "export", "fetch", "gpu", "maps", "phones", "video"}
+    assert asked == {"bags", "bench", "cluster", "export", "fetch", "gpu", "maps", "phones"}
     known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     assert asked <= set(known)
     assert [name for name, text in texts.items() if "pip install" in text] == ["extras.py"]

@@ -17,10 +17,11 @@ import pytest
 import tiny_layouts as layouts
 import tiny_sequences as tiny
 from parsers import KINDS
+from reported import raises, warns
 
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.exr_files import exr_depth
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError
 
 Change = Callable[[bytes], bytes]
 BY_NAME = {kind.name: kind for kind in KINDS}
@@ -71,8 +72,8 @@ def long_chunk(whole: bytes) -> bytes:
 DEEP = b"[" * 20_000
 MANY = r"it declares 2000000\d\d elements, and has"
 REFUSED: tuple[tuple[str, Change, str], ...] = (
-    ("PNG", long_chunk, r"i.png` is damaged: a part of the PNG declares more bytes than the file has"),
-    ("depth", long_chunk, r"d.png` is damaged: a part of the PNG declares more bytes"),
+    ("PNG", long_chunk, "i.png`"),
+    ("depth", long_chunk, "d.png`"),
     ("problem", header("alpha", b"{'descr': (((\n"), r"p.npz` is damaged, or no file of a bundle-adjustment problem"),
     ("scene", header("poses", b"{'descr': (((\n"), r"scene.npz` is damaged, or no file of the scene of a run"),
     ("scene", array("poses", np.array(b"text")), r"its `poses` is \|S4 of shape \(\); expected numbers, \(2, 4, 4\)"),
@@ -166,14 +167,14 @@ def test_a_separator_behind_a_time_is_space(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:.*poses have a NaN")
 def test_a_pose_of_zeros_is_no_truth(tmp_path: Path) -> None:
     """ScanNet's lost frames hold infinities, other exporters write zeros; oracle: the warning."""
-    with pytest.warns(InputWarning, match="1 of 3 poses have no rotation"):
+    with warns("pose", "1", "3"):
         read("ScanNet pose", lambda _: b"0 " * 16, tmp_path)
 
 
 @pytest.mark.filterwarnings("ignore:.*no intrinsics found")
 def test_a_pose_with_another_last_row_is_no_truth(tmp_path: Path) -> None:
     """It is no rigid motion, and was taken for one; oracle: the warning."""
-    with pytest.warns(InputWarning, match="1 of 3 poses have no rotation"):
+    with warns("data_COLMAP_SfM.log", "1", "3"):
         read("Tanks poses", put(b" 1.000000000\n1 1 0", b" 7.000000000\n1 1 0"), tmp_path)
 
 
@@ -203,7 +204,7 @@ def test_a_recording_with_fewer_times_than_frames_says_so(tmp_path: Path) -> Non
     folder = layouts.stray(tmp_path / "scan")
     lines = (folder / "odometry.csv").read_text().splitlines(keepends=True)
     (folder / "odometry.csv").write_text("".join(lines[:-1]))
-    with pytest.warns(InputWarning, match=r"`rgb.mp4` has 3 frames, `odometry.csv` 2 times; frames behind 2"):
+    with warns("scan", "rgb.mp4", "odometry.csv"):
         assert len(open_sequence(folder)) == 2
 
 
@@ -211,7 +212,7 @@ def test_replica_without_its_camera_is_taken_for_none_other(tmp_path: Path) -> N
     """The published camera is that of images of 1200 x 680 pixels. Oracle: the sentence."""
     folder = layouts.replica(tmp_path / "room")
     (tmp_path / "cam_params.json").unlink()
-    with pytest.raises(InputError, match=r"has no `cam_params.json`, and its images are .* pixels; those of the publi"):
+    with raises("room", "cam_params.json"):
         open_sequence(folder)
 
 
@@ -227,16 +228,16 @@ def test_a_listed_name_that_no_file_system_takes_costs_its_frame(tmp_path: Path)
     lines[2] = lines[2].split()[0] + " rgb/" + LONG
     (folder / "rgb.txt").write_text("\n".join(lines))
     sequence = open_sequence(folder)
-    with pytest.warns(InputWarning, match="File name too long"):
+    with warns("xxx.png"):
         assert len(list(sequence.frames())) == 2
     scene = layouts.nerfstudio(tmp_path / "phone")
     content = json.loads((scene / "transforms.json").read_text())
     for frame in content["frames"]:
         frame["depth_file_path"] = LONG
     (scene / "transforms.json").write_text(json.dumps(content))
-    with pytest.warns(InputWarning, match="none of the 3 depth images is there"):
+    with warns("transforms.json", "3"):
         assert not open_sequence(scene).has_depth
-    with pytest.raises(InputError, match=r"\.exr` cannot be read: no such file"):
+    with raises("xxx.exr"):
         exr_depth(tmp_path / f"{LONG[:-4]}.exr")
 
 
@@ -244,5 +245,5 @@ def test_a_listed_name_that_no_file_system_takes_costs_its_frame(tmp_path: Path)
 def test_a_quaternion_of_length_zero_is_no_pose(tmp_path: Path) -> None:
     """It is left out of the truth, with a warning; oracle: the warning."""
     zero = put(b",0,0,0,1,0,0,0,", b",0,0,0,0,0,0,0,")
-    with pytest.warns(InputWarning, match="1 of 3 poses have no rotation"):
+    with warns("data.csv", "1", "3"):
         read("EuRoC truth", zero, tmp_path)

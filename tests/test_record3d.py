@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import tiny_layouts as tiny
 import tiny_sequences
+from reported import pattern, raises, warns
 
 from vggtgeo.datasets.check import inspect
 from vggtgeo.datasets.opening import open_sequence
 from vggtgeo.datasets.record3d import Record3d
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputWarning
 
 FORMS = [
     pytest.param(tiny.record3d, True, id="unpacked"),
@@ -73,17 +74,19 @@ def packed(content: bytes, times: int = 1) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "told"),
+    ("name", "content", "named"),
     [
-        ("1.depth", b"bvx2" + bytes(40), r"1.depth` cannot be unpacked \(LZFSE\)"),
-        ("1.depth", b"", r"1.depth` cannot be unpacked \(LZFSE\)"),
-        ("1.depth", packed(bytes(1100)), r"1.depth` unpacks to 1100 bytes; expected 1200, 20 x 15 pixels"),
-        ("1.depth", packed(bytes(10**6), 100), r"1.depth` unpacks to more than 4800 bytes"),
-        ("1.conf", packed(bytes(10)), r"1.conf` unpacks to 10 bytes; expected 300, 20 x 15 pixels"),
-        ("1.jpg", b"\xff\xd8\xff", r"1.jpg` is cut off.*; the frame is skipped"),
+        ("1.depth", b"bvx2" + bytes(40), ("1.depth",)),
+        ("1.depth", b"", ("1.depth",)),
+        ("1.depth", packed(bytes(1100)), ("1.depth", "1100")),
+        ("1.depth", packed(bytes(10**6), 100), ("1.depth", "4800")),
+        ("1.conf", packed(bytes(10)), ("1.conf", "10")),
+        ("1.jpg", b"\xff\xd8\xff", ("1.jpg",)),
     ],
 )
-def test_a_damaged_part_is_named_and_the_rest_read(tmp_path: Path, name: str, content: bytes, told: str) -> None:
+def test_a_damaged_part_is_named_and_the_rest_read(
+    tmp_path: Path, name: str, content: bytes, named: tuple[str, ...]
+) -> None:
     # Proves that one bad file costs its own depth, or its own frame; a bomb of 0.1 GB is not unpacked.
     folder = tiny.record3d(tmp_path / "room")
     (folder / "rgbd" / name).write_bytes(content)
@@ -91,7 +94,7 @@ def test_a_damaged_part_is_named_and_the_rest_read(tmp_path: Path, name: str, co
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         frames = list(sequence.frames())
-    assert re.search(told, str(caught[0].message))
+    assert re.search(pattern(*named), str(caught[0].message))
     assert [frame.index for frame in frames if np.isfinite(frame.depth).any()] == [0, 2]
 
 
@@ -105,30 +108,30 @@ def test_without_the_extra_the_images_are_read(
     # Proves that the sentence says what to install, and that nothing else is lost.
     place = write(tmp_path / "room.r3d")
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.warns(
-        InputWarning, match=rf"{part}.* needs the package {package}; .*`phones`.*; reading the images only"
-    ):
+    with warns("phones", part, package):
         sequence = open_sequence(place)
     assert not sequence.has_depth
     assert len(list(sequence.frames())) == tiny.COUNT
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "named"),
     [
-        ({"K": 3, "perFrameIntrinsicCoeffs": None}, r"metadata`: `K` must hold 9 numbers"),
-        ({"perFrameIntrinsicCoeffs": [[1, 2]]}, r"`perFrameIntrinsicCoeffs` 4 for each frame"),
-        ({"perFrameIntrinsicCoeffs": [[0, 0, 0, 0]]}, r"metadata`: .*focal lengths 0"),
-        (None, r"metadata` is no JSON"),
-        ([], r"metadata` holds no object of JSON"),
+        ({"K": 3, "perFrameIntrinsicCoeffs": None}, ("metadata", "K")),
+        ({"perFrameIntrinsicCoeffs": [[1, 2]]}, ("metadata", "perFrameIntrinsicCoeffs")),
+        ({"perFrameIntrinsicCoeffs": [[0, 0, 0, 0]]}, ("metadata", "0")),
+        (None, ("metadata",)),
+        ([], ("metadata",)),
     ],
 )
-def test_a_wrong_metadata_file_is_told(tmp_path: Path, change: dict[str, object] | list | None, told: str) -> None:
+def test_a_wrong_metadata_file_is_told(
+    tmp_path: Path, change: dict[str, object] | list | None, named: tuple[str, ...]
+) -> None:
     # Proves that the sentence names the part, what was found and what was expected.
     folder = tiny.record3d(tmp_path / "room")
     changed = {**tiny.RECORD3D, **change} if isinstance(change, dict) else change
     (folder / "metadata").write_text("{" if changed is None else json.dumps(changed))
-    with pytest.raises(InputError, match=told):
+    with raises(*named):
         open_sequence(folder)
 
 
@@ -136,7 +139,7 @@ def test_poses_that_are_none_are_told(tmp_path: Path) -> None:
     # Proves that six numbers are no pose, and none at all no truth.
     folder = tiny.record3d(tmp_path / "room")
     (folder / "metadata").write_text(json.dumps({**tiny.RECORD3D, "poses": [[0] * 6]}))
-    with pytest.raises(InputError, match=r"metadata`: a pose has not 7 numbers"):
+    with raises("metadata", "7"):
         open_sequence(folder).ground_truth()
 
 
@@ -156,7 +159,7 @@ def test_a_part_that_unpacks_to_too_much_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("metadata", bytes(65 * 2**20))
         archive.writestr("rgbd/0.jpg", b"")
-    with pytest.raises(InputError, match=r"bomb.r3d/metadata` has 68157440 bytes, more than 67108864: not unpacked"):
+    with raises("metadata", "bomb.r3d", "68157440"):
         open_sequence(bomb)
 
 
@@ -166,12 +169,10 @@ def test_an_archive_without_images_or_end(tmp_path: Path) -> None:
     with zipfile.ZipFile(empty, "w") as archive:
         archive.writestr("metadata", "{}")
         archive.writestr("rgbd/0.depth", "")
-    with pytest.raises(
-        InputError, match=r"empty.r3d` is no recording of Record3D: expected `metadata` and `rgbd/0.jpg`"
-    ):
+    with raises("empty.r3d", " is no recording of Record3D: expected ", " and "):
         open_sequence(empty)
     half = tiny.record3d_file(tmp_path / "room.r3d")
     half.write_bytes(half.read_bytes()[:-40])
     for kind in ("record3d", None):
-        with pytest.raises(InputError, match=r"room.r3d` is damaged or cut short, .* share it from the app again"):
+        with raises("room.r3d"):
             open_sequence(half, kind)

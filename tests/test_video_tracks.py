@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import sys
+import struct
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import av
+import bad_files as bad
 import numpy as np
 import pytest
 
 from vggtgeo.datasets import open_sequence, with_rate, without_depth
 from vggtgeo.datasets.check import inspect
-from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.video_tracks import Track, choose_tracks
-from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning
 
-av = pytest.importorskip("av", reason="av is not installed")
 COUNT, RATE = 6, 10
 SIZE = 64, 48
 
@@ -143,19 +143,6 @@ def test_grey_that_does_not_say_what_it_is_is_named(tmp_path: Path) -> None:
         assert not open_sequence(path, depth=False).has_depth
 
 
-@pytest.mark.parametrize("name", ["a.mkv", "a.mp4"])
-def test_several_tracks_without_the_package(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that several tracks are told where the package that reads them is missing, with the extra; and that one
-    # track, or its absence, changes nothing for others. Oracle: the files.
-    film = Film("mpeg4", "yuv420p")
-    several, one = write(tmp_path / name, film, film), write(tmp_path / f"one-{name}", film)
-    assert isinstance(open_sequence(one), VideoFile)
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.warns(InputWarning, match=r"2 tracks of video.*`video`"):
-        assert len(list(open_sequence(several).frames())) == COUNT
-    assert open_sequence(one).tracks is None
-
-
 def test_tracks_in_colour_go_before_those_in_grey_and_covers() -> None:
     # Proves the choice alone: a cover, infrared in 8 bits and depth in false colours are no images where others are.
     # Oracle: by hand.
@@ -169,3 +156,19 @@ def test_tracks_in_colour_go_before_those_in_grey_and_covers() -> None:
     )
     chosen = choose_tracks(tracks)
     assert (chosen.images.number, chosen.depth, len(chosen.others), chosen.maybe_depth) == (3, None, 4, ())
+
+
+@pytest.mark.parametrize(("turns", "matrix"), [(1, (0, -1, 1, 0)), (2, (-1, 0, 0, -1)), (3, (0, 1, -1, 0))])
+def test_videos_are_rotated_as_the_file_states(tmp_path: Path, turns: int, matrix: tuple[int, ...]) -> None:
+    # Proves the sense of the display matrix of an MP4. Oracle: the frames of the same file without it, rotated.
+    path = bad.video(tmp_path / "clip.mp4", 3)
+    content = bytearray(path.read_bytes())
+    a, b, c, d = (value << 16 for value in matrix)
+    place = content.index(b"tkhd") + 44
+    with pytest.warns(GuessedCameraWarning):
+        stored = [frame.image for frame in open_sequence(path).frames()]
+    content[place : place + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    with pytest.warns(GuessedCameraWarning):
+        shown = [frame.image for frame in open_sequence(path).frames()]
+    assert all(np.array_equal(one, np.rot90(other, turns)) for one, other in zip(shown, stored, strict=True))

@@ -78,12 +78,12 @@ def kind_of(message: Any) -> str:
     return str(getattr(message, "encoding", "") or getattr(message, "format", ""))[:60] or "of no stated kind"
 
 
-def image_of(message: Any, place: Path, least_bits: int = 8) -> ImageFile:
+def image_of(message: Any, place: Path, min_bits: int = 8) -> ImageFile:
     """The image in a message, see `read_image_file`; InputError where there is none. place: for that."""
     if isinstance(message, Unread):
         raise InputError(f"`{place}` is damaged: {message.reason}")
     if not hasattr(message, "encoding"):
-        return _compressed_image(message, place, least_bits)
+        return _compressed_image(message, place, min_bits)
     if message.encoding not in COLOUR:
         raise InputError(f"`{place}`: its encoding is {message.encoding}; known are {', '.join(COLOUR)}")
     coding = COLOUR[message.encoding]
@@ -95,18 +95,18 @@ def image_of(message: Any, place: Path, least_bits: int = 8) -> ImageFile:
     rows = message.height * 3 // 2 if message.encoding in _OF_SQUARES else message.height
     kind = np.dtype(np.uint8 if coding.bits == 8 else np.uint16)
     image = _pixels(message, place, kind.newbyteorder(">" if message.is_bigendian else "<"), coding.channels, rows)
-    return _in_colour(image, coding, least_bits)
+    return _in_colour(image, coding, min_bits)
 
 
-def _in_colour(codes: np.ndarray, coding: Coding, least_bits: int) -> ImageFile:
-    image, bits = eight_bits(codes, least_bits)
+def _in_colour(codes: np.ndarray, coding: Coding, min_bits: int) -> ImageFile:
+    image, bits = eight_bits(codes, min_bits)
     return ImageFile(image if coding.change is None else np.asarray(cv2.cvtColor(image, coding.change)), bits, 1)
 
 
-def _compressed_image(message: Any, place: Path, least_bits: int) -> ImageFile:
+def _compressed_image(message: Any, place: Path, min_bits: int) -> ImageFile:
     kind = encoding_of(message)
     try:
-        read = image_in(np.asarray(message.data, np.uint8).tobytes(), place, least_bits)
+        read = image_in(np.asarray(message.data, np.uint8).tobytes(), place, min_bits)
     except InputError as error:
         raise InputError(f"{error} (its format: {kind_of(message)}; expected JPEG or PNG)") from None
     if kind.startswith("bayer_") and kind in COLOUR and not np.ptp(read.image, axis=2).any():  # the mosaic itself

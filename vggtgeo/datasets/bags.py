@@ -22,7 +22,6 @@ from vggtgeo.datasets.bag_images import Unread, image_of, metres_of
 from vggtgeo.datasets.bag_topics import IMAGES, Chosen, chosen_topics, told, truth_topic
 from vggtgeo.datasets.bag_transforms import TRANSFORMS, frame_name
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_orientation import not_turned
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
@@ -166,7 +165,7 @@ class RosBag:
                     _warn(text, LeftOutWarning)
                     continue
                 if read.orientation != 1 and not turned:
-                    _warn(not_turned(place, read.orientation))
+                    _warn(orientation_message(place, read.orientation))
                 bits, turned = max(bits, read.bits), turned or read.orientation != 1
                 depth = None
                 if self.has_depth:

@@ -18,11 +18,11 @@ from vggtgeo.datasets.image_files import (
     ImageFile,
     floats_out_of_range,
     is_there,
+    orientation_message,
     read_depth,
     read_image,
     read_image_file,
 )
-from vggtgeo.datasets.image_orientation import not_turned
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning, UnusableDepthWarning
@@ -96,9 +96,9 @@ class FolderSequence:
         """Whether a file of `files` is there."""
         return is_there(path)
 
-    def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
+    def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
         """The image in a file, see `read_image_file`; a layout whose images do not fit its depth changes them here."""
-        return read_image_file(path, least_bits)
+        return read_image_file(path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
@@ -143,7 +143,7 @@ class FolderSequence:
             bits = max(bits, read.bits)
             if read.orientation != 1 and not turned:
                 turned = True
-                _warn(not_turned(file.image, read.orientation))
+                _warn(orientation_message(file.image, read.orientation))
             image = read.image
             depth = self._read_depth(file) if self.has_depth else None
             if file.depth is not None and depth is not None and not np.isfinite(depth).any():

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, tell_of_no_depth
 from vggtgeo.datasets.icl import MIRROR, icl_camera, icl_truth
-from vggtgeo.datasets.image_files import FARTHEST
+from vggtgeo.datasets.image_files import MAX_DEPTH
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.pose_files import numbers_of, read_text, trajectory_of
 from vggtgeo.geometry.trajectory import Trajectory
@@ -70,7 +70,7 @@ class IclNuimRaw(FolderSequence):
         fx, fy, cx, cy = self.camera.intrinsics
         across, down = (np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy
         depth = distances.reshape(height, width) / np.sqrt(1.0 + across**2 + down[:, None] ** 2)
-        known = np.isfinite(depth) & (depth > 0) & (depth <= FARTHEST)
+        known = np.isfinite(depth) & (depth > 0) & (depth <= MAX_DEPTH)
         return np.where(known, depth, np.nan).astype(np.float32)
 
     def ground_truth(self) -> Trajectory | None:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_depth, check_selection, described
-from vggtgeo.datasets.image_defects import MOST_PIXELS
-from vggtgeo.datasets.image_files import FARTHEST, NEAREST
+from vggtgeo.datasets.image_checks import MAX_PIXELS
+from vggtgeo.datasets.image_files import MAX_DEPTH, MIN_DEPTH
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_whole
@@ -90,11 +90,11 @@ def _tell_of_depth(frame: Frame) -> bool:
     depth = frame.depth
     if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or np.isnan(depth).all():
         return False
-    if ((depth >= NEAREST) & (depth <= FARTHEST)).any():
+    if ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
         return False
     warnings.warn(
         f"the depth of `{frame.name}` goes from {np.nanmin(depth):g} to {np.nanmax(depth):g}, and none of it is from "
-        f"{NEAREST:g} to {FARTHEST:g} m: are these metres (millimetres: divide by 1000.0)? It is not used",
+        f"{MIN_DEPTH:g} to {MAX_DEPTH:g} m: are these metres (millimetres: divide by 1000.0)? It is not used",
         InputWarning,
         stacklevel=3,
     )
@@ -128,8 +128,8 @@ def _own(name: str, given: Any) -> Any:
     if not isinstance(given, np.ndarray) or given.ndim < 2:
         return given
     height, width = given.shape[:2]
-    if width * height > MOST_PIXELS:
+    if width * height > MAX_PIXELS:
         raise InputError(
-            f"`{name}` is {width} x {height} pixels, more than {MOST_PIXELS // 10**6} million; reduce the images"
+            f"`{name}` is {width} x {height} pixels, more than {MAX_PIXELS // 10**6} million; reduce the images"
         )
     return given.copy()

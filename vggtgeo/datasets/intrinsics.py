@@ -26,7 +26,7 @@ MOST_ASPECT = 4.0
 _OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
 _FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
 """What ROS, Kalibr, EuRoC and RealSense call the two lenses that are read."""
-MOST_BYTES = 100_000
+MAX_BYTES = 100_000
 """Of a file with a few numbers and comments."""
 CALIBRATION = "calibration.txt"
 FISHEYE = "fisheye"
@@ -151,7 +151,7 @@ def _camera_of_another_name(folder: Path, width: int, height: int) -> Camera | N
 
 
 def _bare_pinhole(file: Path, width: int, height: int) -> Camera | None:
-    if file.stat().st_size > MOST_BYTES:
+    if file.stat().st_size > MAX_BYTES:
         return None
     try:
         numbers = [float(word) for word in _without_comments(file).replace(",", " ").split()]
@@ -315,7 +315,7 @@ def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
 
 
 def _without_comments(file: Path) -> str:
-    if file.stat().st_size > MOST_BYTES:
+    if file.stat().st_size > MAX_BYTES:
         raise InputError(f"`{file}` has {file.stat().st_size} bytes; expected a few numbers")
     lines = whole_text(file).splitlines()
     return " ".join(line.split("#", 1)[0] for line in lines)

@@ -1,4 +1,4 @@
-"""Which reader a path needs, by looking at it."""
+"""Choice of the reader of a path."""
 
 import math
 import os
@@ -43,11 +43,11 @@ class FolderReader(Protocol):
     """A reader of one layout."""
 
     def matches(self, folder: Path) -> bool:
-        """Whether `folder` looks like it."""
+        """Return whether `folder` has this layout."""
         ...
 
     def open(self, folder: Path) -> Sequence:
-        """The sequence in `folder`; InputError where something is wrong."""
+        """Open the sequence in `folder`; raise InputError if it is invalid."""
         ...
 
 
@@ -77,17 +77,19 @@ KINDS = (*FOLDER_KINDS, "video", "bag", "camera")
 def open_sequence(
     path: str | os.PathLike[str], kind: str | None = None, rate: float | None = None, depth: bool = True
 ) -> Sequence:
-    """Opens a folder of a benchmark or of images, a video file, a ROS bag, a webcam (`webcam:0`) or a stream (`rtsp://`).
+    """Open a folder of a benchmark or of images, a video file, a ROS bag, a webcam (`webcam:0`) or a stream (`rtsp://`).
 
     Args:
         path: the folder or file, or the name of a camera.
-        kind: one of `KINDS` to name the reader; None to find it by looking.
+        kind: one of `KINDS` to name the reader; None to choose it by the content.
         rate: frames a second of a plain folder of images, whose files have no times (by default 30), or of a video.
         depth: False to leave the depth of a bag or a video alone, which may not be that of its images' camera.
 
-    The camera comes from `calibration.txt` or `camera-intrinsics.txt` in the folder, else from published
-    values where the name tells the camera, else it is a guess (`camera.known` is False), with an
-    InputWarning. InputError where the path is missing or empty, or holds nothing that can be read.
+    The camera comes from `calibration.txt` or `camera-intrinsics.txt` in the folder, else from published values of the
+    benchmark, else it is a guess (`camera.known` is False), with an InputWarning.
+
+    Raises:
+        InputError: the path is missing or empty, or has nothing that can be read.
 
     Example:
         >>> import vggtgeo as vg
@@ -111,7 +113,7 @@ def open_sequence(
 
 
 def _check_pace(sequence: FolderSequence) -> None:
-    """An InputWarning for more frames a second than cameras take: microseconds where nanoseconds are expected, say."""
+    """Warn of more frames a second than cameras take, such as microseconds in place of nanoseconds."""
     times = [file.timestamp for file in sequence.files]
     apart = statistics.median(after - before for before, after in pairwise(times)) if len(times) > 1 else math.inf
     if 0 < apart < 1 / FASTEST:
@@ -120,7 +122,7 @@ def _check_pace(sequence: FolderSequence) -> None:
 
 
 def is_readable(place: Path) -> bool:
-    """Whether a folder looks like a recording, or the path is a file; nothing is opened."""
+    """Return whether a path is a file, or a folder of a known layout; nothing is opened."""
     try:
         return place.is_file() or any(reader.matches(place) for reader in FOLDER_KINDS.values())
     except OSError:  # a folder that may not be looked into
@@ -128,7 +130,7 @@ def is_readable(place: Path) -> bool:
 
 
 def check_there(path: str | os.PathLike[str]) -> None:
-    """InputError where nothing lies that could be opened, or what may not be read: what is asked first, and quickly."""
+    """Raise InputError if the path does not exist or may not be read, before anything is opened."""
     place = path_of("path", path)
     if not is_live(os.fspath(path)):
         _check_place(place)
@@ -180,18 +182,18 @@ def _open_folder(place: Path, kind: str | None) -> Sequence:
 
 
 def _dead_links(folder: Path) -> str:
-    """What links in a folder, and in those in it, lead nowhere, as a sentence: a disk that is not mounted, or contents
-    that a tool for large files has not fetched, would be missed without a word.
+    """Broken links in a folder and in those in it, as a message: of a disk that is not mounted, or of files that a tool
+    for large files has not fetched.
     """
     dead = []
-    for place in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())[:_MOST_LOOKED_AT]):
+    for place in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())[:_MAX_FOLDERS]):
         with suppress(OSError), os.scandir(place) as entries:
             links = (Path(entry.path) for entry in entries if entry.is_symlink() and entry.name[0] != ".")
             dead += [path for path in links if not is_there(path)]
     if not dead:
         return ""
     return (
-        f"links that lead nowhere are not read: {len(dead)}, `{min(dead).relative_to(folder)}` first; is a disk "
+        f"{len(dead)} broken links are not read, `{min(dead).relative_to(folder)}` first; is a disk "
         "missing, or was the content not fetched (git annex, DVC)?"
     )
 
@@ -201,38 +203,25 @@ def _open_video(file: Path, depth: bool) -> Sequence:
         raise InputError(f"`{file}` is a folder; the reader 'video' needs a file")
     if not file.is_file():
         raise InputError(f"`{file}` is no regular file; give a folder of images or a video file")
-    try:
-        with file.open("rb") as opened:
-            head = opened.read(len(_PNG))
-    except OSError as error:  # a disk that fails, or what only looks like a file
-        raise InputError(f"`{file}` cannot be read: {error.strerror}; give a copy on a disk that works") from None
-    # FFmpeg goes by the content, and takes a picture for a video of one frame; a stream of Motion JPEG begins as one.
-    if file.suffix.lower() == ".gif" or head.startswith(b"GIF8"):
-        raise InputError(f"`{file}` is a GIF, whose colours and times are not those of a camera; give the video itself")
-    a_jpeg = head.startswith(b"\xff\xd8") and file.suffix.lower() not in _MOTION_JPEG
-    if file.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES or a_jpeg or head == _PNG:
+    if file.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
     if reason := reason_not_read(file):
         raise InputError(reason)
     return VideoFile.open(file, depth)
 
 
-_PNG = b"\x89PNG\r\n\x1a\n"
-_MOTION_JPEG = (".mjpg", ".mjpeg")
-
-
 def _hint(folder: Path) -> str:
-    """What in a folder can be read in its place, as the end of a sentence."""
+    """Recordings in a folder, as the end of a message."""
     found = [f"`{path}`" for path in islice(_readable_below(folder), 4)]
     if not found:
         return ""
-    return f"; in it can be read: {', '.join(found[:3])}" + (", ..." if len(found) > 3 else "")
+    return f"; it holds {', '.join(found[:3])}" + (", ..." if len(found) > 3 else "")
 
 
 def _readable_below(folder: Path) -> Iterator[Path]:
     """Recordings in a folder and those below it, the nearest first."""
     waiting = deque([(folder, 0)])
-    for _ in range(_MOST_LOOKED_AT):
+    for _ in range(_MAX_FOLDERS):
         if not waiting:
             return
         place, depth = waiting.popleft()
@@ -242,15 +231,15 @@ def _readable_below(folder: Path) -> Iterator[Path]:
             for path in (path for path in inside if path.is_dir()):
                 if is_readable(path):
                     yield path
-                elif depth < _DEEPEST:
+                elif depth < _MAX_DEPTH:
                     waiting.append((path, depth + 1))
         except OSError:  # a folder that may not be looked into
             continue
 
 
 _FILES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".bag", ".mcap", ".r3d"})
-_MOST_LOOKED_AT, _DEEPEST = 100, 2
-"""Folders, and levels below the one that was given: a whole disk is not searched for a hint."""
+_MAX_FOLDERS, _MAX_DEPTH = 100, 2
+"""Folders and levels that are searched for a hint."""
 
 
 def _names(folder: Path, most: int = 4) -> str:

@@ -27,8 +27,8 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
 from vggtgeo.datasets.image_files import (
+    MAX_BYTES,
     MILLIMETRES,
-    MOST_BYTES,
     ImageFile,
     file_content,
     image_in,
@@ -43,7 +43,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.text_files import MOST_BYTES as MOST_TEXT
+from vggtgeo.io.text_files import MAX_BYTES as MOST_TEXT
 from vggtgeo.models.extras import install_hint
 
 SUFFIX = ".r3d"
@@ -125,9 +125,9 @@ class Record3d(FolderSequence):
             return path.is_file()
         return path.relative_to(self.folder).as_posix() in self._archive.NameToInfo
 
-    def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
+    def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
         """The image in a part of the archive."""
-        return image_in(self._content(path), path, least_bits)
+        return image_in(self._content(path), path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth in a part of the archive, enlarged to the images; what is not trusted is none."""
@@ -156,7 +156,7 @@ class Record3d(FolderSequence):
         found = poses_of(rows[:, 4:], rows[:, :4])[[numbers[row] for row in there]] @ FROM_OPENGL
         return trajectory_of([self.files[row].timestamp for row in there], found, where)
 
-    def _content(self, path: Path, most: int = MOST_BYTES) -> bytes:
+    def _content(self, path: Path, most: int = MAX_BYTES) -> bytes:
         """All bytes of a part, by its path in the folder or, as if it were one, in the archive; no more than `most`."""
         if self.folder.is_dir():
             return file_content(path, most)

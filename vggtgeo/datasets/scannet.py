@@ -75,9 +75,9 @@ class ScanNet(FolderSequence):
         motion = _extrinsics(folder, "color") @ np.linalg.inv(_extrinsics(folder, "depth"))
         return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour, motion)
 
-    def load_image(self, path: Path, least_bits: int = 8) -> ImageFile:
+    def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
         """The image as the depth camera would see it: an affine change of pixels, reduced with an average."""
-        read = read_image_file(path, least_bits)
+        read = read_image_file(path, min_bits)
         image = read.image
         fx, fy, cx, cy = self.camera.intrinsics
         gx, gy, dx, dy = self.colour

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.datasets.image_defects import declared_size, defect
+from vggtgeo.datasets.image_checks import image_header
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
@@ -70,8 +70,7 @@ def picture_mask(scene: Scene, source: Path) -> bytes | None:
     if not file.is_file():
         return None
     content = file.read_bytes()
-    if declared_size(content) != scene.size:
-        raise InputError(f"`{file}` must be an image of {scene.size[0]} x {scene.size[1]} pixels; run again")
+    _check_image(content, file, scene, source)
     return content
 
 
@@ -83,13 +82,18 @@ def copy_pictures(scene: Scene, source: Path, target: Path) -> None:
         if not file.is_file():
             raise InputError(f"`{file}` does not exist; run again, with `-o {source}`")
         content = file.read_bytes()
-        width, height = declared_size(content)
-        if content and (wrong := defect(content)):
-            raise InputError(f"`{file}` {wrong}; run again, with `-o {source}`")
-        if (width, height) != scene.size:
-            raise InputError(
-                f"`{file}` must be an image of {scene.size[0]} x {scene.size[1]} pixels, got {width} x {height}; run "
-                f"again, with `-o {source}`"
-            )
+        _check_image(content, file, scene, source)
         with atomic_open(target / "images" / file.name, "wb") as handle:
             handle.write(content)
+
+
+def _check_image(content: bytes, file: Path, scene: Scene, source: Path) -> None:
+    try:
+        header = image_header(content, file)
+    except InputError as error:
+        raise InputError(f"{error}; run again, with `-o {source}`") from None
+    if (header.width, header.height) != scene.size:
+        raise InputError(
+            f"`{file}` must be an image of {scene.size[0]} x {scene.size[1]} pixels, got {header.width} x "
+            f"{header.height}; run again, with `-o {source}`"
+        )

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from vggtgeo.io.errors import InputError
 
-MOST_BYTES = 64 * 2**20
+MAX_BYTES = 64 * 2**20
 """Of a text: 600,000 poses, five hours of frames. As words and numbers it takes ten times as much memory; what is
 larger is something else, a sparse file of any size, say."""
 
 
 def whole_text(file: Path, errors: str = "replace") -> str:
-    """The text of a file of at most `MOST_BYTES` bytes: UTF-8, without the mark that editors of Windows begin it with,
+    """The text of a file of at most `MAX_BYTES` bytes: UTF-8, without the mark that editors of Windows begin it with,
     or UTF-16 with the one that spreadsheets and PowerShell write.
 
     Raises:
@@ -26,8 +26,8 @@ def whole_text(file: Path, errors: str = "replace") -> str:
     if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):  # a pipe has no end
         raise InputError(f"`{file}` is no regular file; give a text that lies on the disk")
     size = status.st_size
-    if size > MOST_BYTES:
-        raise InputError(f"`{file}` has {size} bytes; expected a text of at most {MOST_BYTES}")
+    if size > MAX_BYTES:
+        raise InputError(f"`{file}` has {size} bytes; expected a text of at most {MAX_BYTES}")
     try:
         content = file.read_bytes()
     except PermissionError as error:
