@@ -12,7 +12,7 @@ With `--slide` the loss is the pose error at the end of so many slid windows (`v
 without their depth, in the unit of the first two keyframes' distance: depth tells which matches are right, and where
 the inverse depths start.
 
-Writes `learned-confidence.png` and `.json` into `--out` (`slid-confidence`, `slid-confidence-clips`) and prints the table.
+Writes `NAME.png` and `NAME.json` into `--out` (`learned-confidence`, `slid-confidence`) and prints the table.
 """
 
 from __future__ import annotations
