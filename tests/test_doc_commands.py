@@ -13,7 +13,7 @@ import pytest
 import typer
 from conftest import ROOT
 
-from vggtgeo.benchmark.suite import limited, load_suite, shipped
+from vggtgeo.benchmark.suite import load_suite, restrict, shipped
 from vggtgeo.cli.main import make_app
 
 PAGES = sorted({ROOT / "README.md", *(ROOT / "docs").rglob("*.md")})
@@ -55,7 +55,7 @@ def _parse(command: Any, name: str, words: list[str]) -> None:
         elif name == "bench" and context.params["suite"] in shipped():
             given = (context.params[key] for key in ("sequences", "settings"))
             chosen = [None if one is None else tuple(one.split(",")) for one in given]
-            limited(load_suite(Path(context.params["suite"])), *chosen, None, None, None)
+            restrict(load_suite(Path(context.params["suite"])), *chosen, None, None, None)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: " ".join(words)[:80])

@@ -25,7 +25,7 @@ from vggtgeo.learning import (
     stack_sequences,
     tracked_windows,
 )
-from vggtgeo.learning.network import LEAST
+from vggtgeo.learning.network import MIN_CONFIDENCE
 from vggtgeo.learning.recorded_windows import RecordedTruth
 from vggtgeo.learning.tracked_windows import FEATURES, INLIER
 
@@ -103,7 +103,7 @@ def test_windows_of_a_recording_are_right_where_the_truth_is_exact() -> None:
     assert np.mean(window.right) > 0.5, window.error
     batch = stack([window])
     chosen = batch.select(0)
-    error, _ = error_and_gradient(chosen, jnp.where(chosen.right, 1.0, LEAST))
+    error, _ = error_and_gradient(chosen, jnp.where(chosen.right, 1.0, MIN_CONFIDENCE))
     start = np.linalg.norm(window.start[1:, 4:] - window.poses[1:, 4:], axis=1)
     assert float(error) < 0.5 * start.max(), (float(error), start)
 
@@ -143,7 +143,7 @@ def test_the_gradient_through_slid_windows_is_that_of_the_error(depth: bool) -> 
     windows = stack_sequences([long], 3, depth=depth).select(0)
     assert windows.truth.shape == (3, 3, 3)
     rng = np.random.default_rng(0)
-    right = jnp.where(windows.right, 1.0, LEAST)
+    right = jnp.where(windows.right, 1.0, MIN_CONFIDENCE)
     confidence = right * jnp.asarray(rng.uniform(0.3, 1.0, right.shape))
     _, gradient = slid_error_and_gradient(windows, confidence)
     for row in range(3):
@@ -167,7 +167,7 @@ def test_a_failed_solve_is_no_small_error(batch: Batch) -> None:
 @pytest.mark.long
 def test_methods_are_told_apart(batch: Batch) -> None:
     """`compare` with a network that says what the oracle knows gives the oracle's errors."""
-    knows = jax.tree_util.Partial(lambda _: jnp.where(batch.right, jnp.ones_like(batch.saliency), LEAST))
+    knows = jax.tree_util.Partial(lambda _: jnp.where(batch.right, jnp.ones_like(batch.saliency), MIN_CONFIDENCE))
     found = compare(batch, knows)
     np.testing.assert_array_equal(found.learned, found.oracle)
     assert not np.allclose(found.uniform, found.saliency)
@@ -182,7 +182,7 @@ def test_the_network_starts_near_trust_and_stays_in_range(batch: Batch) -> None:
     start = np.asarray(network(features))
     assert abs(start.mean() - 0.73) < 0.05
     wild = np.asarray(network(1e3 * features))
-    assert (wild >= LEAST).all()
+    assert (wild >= MIN_CONFIDENCE).all()
     assert (wild <= 1).all()
 
 

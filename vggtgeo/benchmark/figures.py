@@ -28,11 +28,11 @@ _ROW, _LINE, _MARGIN = 0.3, 0.15, 0.9
 """Inches."""
 _LABEL, _TITLE, _ENTRY = 30, 60, 44
 """Letters of a line of a label beside an axis, of a title, of an entry of a legend: with longer ones axes collapse."""
-_LEAST_SPAN = 2.5
+_MIN_SPAN = 2.5
 """Factor between the ends of an axis of errors: a difference of a thousandth is not drawn as others are, and one of the
 ticks at 1, 2 and 5 lies within."""
-_MOST_LINES = 8
-LEAST_POSES = 3
+_MAX_LINES = 8
+MIN_POSES = 3
 """Of a path that is drawn: fewer cannot be aligned."""
 
 
@@ -100,7 +100,7 @@ def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Seq
             axes.axvline(summary.mean, color=_FULL, lw=0.8, ls=":")
     axes.set_xscale("log")
     low, high = axes.get_xlim()
-    wider = max(np.sqrt(_LEAST_SPAN * low / high), 1.0)
+    wider = max(np.sqrt(_MIN_SPAN * low / high), 1.0)
     axes.set_xlim(low / wider, high * wider)
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -130,7 +130,7 @@ def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> lis
     for setting in cells.settings_of(suite, rows):
         drawn = (_path(suite, row, folder) for row in select(rows, sequence, setting))
         found += [one for one in [next((one for one in drawn if one is not None), None)] if one is not None]
-    return found[:_MOST_LINES]
+    return found[:_MAX_LINES]
 
 
 def _path(suite: Suite, row: Row, folder: Path) -> Path3 | None:
@@ -144,7 +144,7 @@ def _path(suite: Suite, row: Row, folder: Path) -> Path3 | None:
         one = Path3(title, estimate, truth, row.get("metric") is False)
     except InputError:
         return None
-    return one if len(one.errors) >= LEAST_POSES else None
+    return one if len(one.errors) >= MIN_POSES else None
 
 
 def _truth_file(place: Path, folder: Path, sequence: str, seed: object) -> Path:

@@ -1,4 +1,4 @@
-"""A small network from what is seen of a match to how far it is trusted."""
+"""A small network from the features of a match to its confidence."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-LEAST = 1e-3
-"""Confidence of a match that is not trusted at all: the optimum stays defined."""
+MIN_CONFIDENCE = 1e-3
+"""Lower bound of the confidence, so that the optimum stays defined."""
 
 
 class ConfidenceNetwork(eqx.Module):
@@ -19,7 +19,7 @@ class ConfidenceNetwork(eqx.Module):
     layers: eqx.nn.MLP
 
     def __init__(self, features: Float[Array, "a f"], key: PRNGKeyArray, width: int = 16):
-        """`features` of the training matches give the standardisation; the network starts at about 0.7 for all."""
+        """Standardise by the `features` of the training matches; the initial confidence is about 0.7 for all."""
         self.mean = jnp.mean(features, 0)
         self.scale = jnp.std(features, 0) + 1e-6
         layers = eqx.nn.MLP(
@@ -29,8 +29,8 @@ class ConfidenceNetwork(eqx.Module):
         self.layers = eqx.tree_at(lambda m: (m.layers[-1].weight, m.layers[-1].bias), layers, start(layers.layers[-1]))
 
     def __call__(self, features: Float[Array, "*b f"]) -> Float[Array, "*b"]:
-        """Confidence of each match."""
+        """Return the confidence of each match."""
         inputs = (features - jax.lax.stop_gradient(self.mean)) / jax.lax.stop_gradient(self.scale)
         flat = inputs.reshape(-1, inputs.shape[-1])
         confidence = jax.nn.sigmoid(jax.vmap(self.layers)(flat)).reshape(inputs.shape[:-1])
-        return LEAST + (1 - LEAST) * confidence
+        return MIN_CONFIDENCE + (1 - MIN_CONFIDENCE) * confidence

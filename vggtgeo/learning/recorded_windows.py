@@ -1,8 +1,7 @@
-"""Windows of a recorded clip with depth and truth: what a tracker finds in real images, for learning on real clips.
+"""Windows of a recording with depth and ground truth, with matches of a tracker, for learning on real images.
 
-As `tracked_windows`, but for where the truth comes from: a match is right where the depth camera and the true poses
-carry the corner to it. Both have errors of their own, which no confidence can mend: errors of poses fall less than in
-simulation.
+As `tracked_windows`, but a match is correct if depth camera and true poses project the corner to it. Both have errors,
+which confidences cannot reduce: pose errors fall less than in simulation.
 """
 
 from __future__ import annotations
@@ -19,20 +18,20 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.learning.tracked_windows import TrackedWindow, track_window
 
 SAME_SURFACE = 0.05
-"""Relative difference of depths up to which two frames see one surface."""
+"""Relative difference of depth up to which two frames see the same surface."""
 DEPTH_SIGMA = 0.02
-"""Relative standard deviation of the depth prior: what depth cameras of rooms reach at some metres."""
+"""Relative standard deviation of the depth prior: that of indoor depth cameras at some metres."""
 SAME_TIME = 0.02
-"""Seconds between a frame and its true pose."""
-LEAST_MATCHES = 12
-"""Of each keyframe of a window, in and out: fewer hardly place it."""
+"""Largest time between a frame and its true pose, seconds."""
+MIN_MATCHES = 12
+"""Of each keyframe of a window, in and out: fewer hardly determine its pose."""
 _TRIES = 20
-"""Places that are tried for each window: at some nothing is followed, or the depth is missing."""
+"""Random positions per window: at some, tracking fails or depth is missing."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedTruth:
-    """What is known of some frames of a clip, by their place in `frames`: undistorted, each with depth and true pose.
+    """Ground truth of some undistorted frames with depth, by index in `frames`.
 
     poses: world -> camera, float64 [n, 4, 4]. intrinsics: fx, fy, cx, cy, pixels.
     """
@@ -56,8 +55,8 @@ class RecordedTruth:
         return np.asarray(self.poses[index])
 
     def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where `pixels` [n, 2] of frame i are in frame j, float64 [n, 2], NaN without depth, and whether nothing that
-        was measured there hides them, bool [n].
+        """Project `pixels` [n, 2] of frame i into frame j: float64 [n, 2], NaN without depth; and whether they are not
+        occluded there, bool [n].
         """
         inverse = 1 / _nearest(self.depth(index_i), pixels)
         known = np.isfinite(inverse)
@@ -73,15 +72,15 @@ class RecordedTruth:
 def recorded_windows(
     sequence: Sequence, count: int, *, keyframes: int = 4, points: int = 24, spacing: int = 3, seed: int = 0
 ) -> Iterator[TrackedWindow]:
-    """`count` windows at random places of a recording with depth and truth, see `vggtgeo.open_sequence`.
+    """Yield `count` windows at random positions of a recording with depth and ground truth.
 
     Args:
-        sequence: the recording.
-        count: how many; fewer come where too few places have depth, truth, and corners that can be followed.
-        keyframes: a window.
+        sequence: the recording, for example of `vggtgeo.open_sequence`.
+        count: number of windows; fewer if too few positions have depth, ground truth and corners that can be tracked.
+        keyframes: per window.
         points: hosted in each keyframe.
         spacing: frames from keyframe to keyframe.
-        seed: of places, corners and noise.
+        seed: of positions, corners and noise.
 
     Raises:
         InputError: the recording has no depth or no truth, or is shorter than a window.
@@ -97,7 +96,7 @@ def recorded_windows(
     truth = sequence.ground_truth()
     if truth is None or not sequence.has_depth:
         missing = "true poses" if truth is None else "depth"
-        raise InputError(f"`sequence` ({sequence.name}) has no {missing}; windows to learn from need depth and truth")
+        raise InputError(f"`sequence` ({sequence.name}) has no {missing}; learning needs depth and ground truth")
     span = spacing * (keyframes - 1) + 1
     if len(sequence) < span:
         raise InputError(f"`sequence` ({sequence.name}) has {len(sequence)} frames; a window spans {span}")
@@ -129,7 +128,7 @@ def recorded_windows(
 def _determined(window: TrackedWindow) -> bool:
     seen = window.observations
     ends = seen.edges[seen.point_edge].ravel()
-    return bool((np.bincount(ends, minlength=len(window.images)) >= LEAST_MATCHES).all())
+    return bool((np.bincount(ends, minlength=len(window.images)) >= MIN_MATCHES).all())
 
 
 def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:

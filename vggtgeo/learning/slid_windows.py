@@ -1,4 +1,4 @@
-"""Learning through a sliding window: one loss behind several windows, each solved under the prior of those before.
+"""Learning through a sliding window: a loss after several windows, each solved with the prior of those before.
 
 A long window of tracked keyframes is cut into short ones that overlap. They are solved, marginalised and slid in one
 `lax.scan` (`vggtgeo.slide`); the loss is the pose error of the last, and its gradient reaches the matches of all.
@@ -26,12 +26,12 @@ from vggtgeo.learning.tracked_windows import TrackedWindow
 from vggtgeo.learning.training import GAIN, Batch, log_error, stack
 
 _BASELINE_SIGMA = 1e-3
-"""Relative, of the distance that is the unit where no depth is known."""
+"""Relative standard deviation of the baseline that fixes the scale without depth."""
 Window = tuple[Problem, State]
 
 
 def cut(long: TrackedWindow, keyframes: int) -> list[TrackedWindow]:
-    """The windows of `keyframes` keyframes from each keyframe of a longer one on, the oldest first."""
+    """Return all windows of `keyframes` successive keyframes of a longer one, the oldest first."""
     count = len(long.poses)
     return [_part(long, np.arange(first, first + keyframes)) for first in range(count - keyframes + 1)]
 
@@ -55,7 +55,7 @@ def _part(long: TrackedWindow, places: np.ndarray) -> TrackedWindow:
 def stack_sequences(sequences: Sequence[TrackedWindow], keyframes: int, *, depth: bool = True) -> Batch:
     """Cut each of `sequences` into windows of `keyframes`, and pack all to one shape: every array `[b, w, ...]`.
 
-    depth: False leaves the depth prior out; the unit is then the true distance of the first two keyframes.
+    depth: False removes the depth prior; the true distance of the first two keyframes then fixes the scale.
     """
     windows = [window for long in sequences for window in cut(long, keyframes)]
     terms = None
@@ -81,8 +81,8 @@ def _unit(window: TrackedWindow) -> BaselinePrior:
 def slid_error_and_gradient(
     windows: Batch, confidence: Float[Array, "w e p"]
 ) -> tuple[Float[Array, ""], Float[Array, "w e p"]]:
-    """RMS error of the camera centres of the last of `w` slid windows under the weights `GAIN * confidence`, metres,
-    and the gradient of its logarithm with respect to each match's confidence; NaN where a solve failed.
+    """Return the RMS error of the camera centres of the last of `w` slid windows with weights `GAIN * confidence`,
+    metres, and the gradient of its logarithm with respect to each confidence; NaN if a solve failed.
 
     Args:
         windows: one sequence of a batch, `batch.select(i)`.
@@ -95,7 +95,7 @@ def slid_error_and_gradient(
         solutions = _slid(_with_priors(windows, weight), windows.initial)
         last = jax.tree.map(lambda leaf: leaf[-1], solutions.state)
         usable = jnp.isfinite(solutions.energy).all() & jnp.isfinite(weight).all()
-        # The last window holds no pose: each of its keyframes counts.
+        # No pose of the last window is fixed: all its keyframes count.
         return jnp.where(usable, log_error(last.poses.inverse().translation(), windows.truth[-1]), jnp.nan)
 
     error, gradient = jax.value_and_grad(loss)(confidence)
@@ -103,7 +103,7 @@ def slid_error_and_gradient(
 
 
 def _with_priors(windows: Batch, weight: Array) -> Problem:
-    """The stacked problems under these weights, with room for a prior each; the unit only in the first."""
+    """The stacked problems with these weights and an empty prior each; the baseline only in the first."""
     count, keyframes = windows.truth.shape[:2]
     empty = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), no_prior(keyframes, weight.dtype))
     problem = windows.problem.with_term(windows.problem.points.reweighted(weight)).with_term(empty)
@@ -122,7 +122,7 @@ def _slid(problems: Problem, initials: State) -> Solution:
         return slide(problem, solution.state, *coming), solution
 
     pick: Any = lambda row: jax.tree.map(lambda leaf: leaf[row], (problems, initials))
-    # What follows the last window is not solved.
+    # The window after the last one is not solved.
     coming = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, 0), (problems, initials))
     solutions: Solution = jax.lax.scan(step, pick(0), coming)[1]
     return solutions

@@ -1,8 +1,8 @@
-"""Simulated windows whose matches are found by a real tracker, so that they fail where trackers fail.
+"""Simulated windows with matches of a real tracker, which has realistic failures.
 
-Corners of each rendered keyframe are followed into the others by Lucas and Kanade (Bouguet's pyramid, OpenCV), started
-some pixels off. What goes wrong does so by the images: repeated bricks, edges without corners, occlusion, blur. The
-renderer then tells how far each match is off.
+Corners of each rendered keyframe are tracked into the others by pyramidal Lucas-Kanade (OpenCV) from a perturbed start.
+Failures have their natural causes: repeated texture, edges, occlusion, blur. The renderer gives the error of each
+match.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ FEATURES = (
     "log change of brightness",
     "log motion against its neighbours",
 )
-"""What the network sees of a match; no truth is among it."""
+"""Inputs of the network for a match, without ground truth."""
 INLIER = 3.0
-"""Pixels of true error below which a match counts as right."""
+"""True error below which a match is correct, pixels."""
 _SEARCH = 6.0
-"""Pixels, standard deviation: how far off the tracker starts."""
+"""Standard deviation of the tracker's start, pixels."""
 _LK = {"winSize": (13, 13), "maxLevel": 2, "minEigThreshold": 1e-5}
 _PATCH = 9
 _DEPTH_NOISE = 0.05
 _START = 0.03
-"""Metres, standard deviation: how far off the poses start."""
+"""Standard deviation of the initial positions, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedWindow:
-    """Keyframes with matches, what can be seen of each match, and the truth.
+    """Keyframes with matches, features of each match, and the ground truth.
 
     images: uint8 [n, H, W, 3]. observations: all directed pairs as edges, landmarks hosted in every keyframe, a depth
     prior of 5 % noise; the point weights are one. poses: true, world -> camera, [n, 7]. start: poses to start from.
@@ -65,12 +65,12 @@ class TrackedWindow:
 
     @property
     def right(self) -> np.ndarray:
-        """Matches that are right, bool [A]: what an oracle knows."""
+        """Correct matches, bool [A], by the ground truth."""
         return self.error < INLIER
 
     @property
     def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Edge and slot of each match, int [A] each: where a batch keeps it (`batch.saliency[i][window.places]`)."""
+        """Edge and slot of each match, int [A] each: its index in a batch (`batch.saliency[i][window.places]`)."""
         seen = self.observations
         first = np.searchsorted(seen.host, seen.host)  # hosts are in order
         return seen.point_edge, (np.arange(len(seen.host)) - first)[seen.point_landmark]
@@ -79,15 +79,15 @@ class TrackedWindow:
 def tracked_windows(
     sequence: SyntheticSequence, count: int, *, keyframes: int = 4, points: int = 24, spacing: int = 5, seed: int = 0
 ) -> Iterator[TrackedWindow]:
-    """`count` windows at random places of a simulated sequence.
+    """Yield `count` windows at random positions of a simulated sequence.
 
     Args:
         sequence: of `vggtgeo.simulate`.
-        count: how many.
-        keyframes: a window.
+        count: number of windows.
+        keyframes: per window.
         points: hosted in each keyframe.
         spacing: frames from keyframe to keyframe.
-        seed: of places, corners and noise.
+        seed: of positions, corners and noise.
 
     Example:
         >>> import vggtgeo as vg
@@ -109,7 +109,7 @@ def tracked_windows(
 
 @runtime_checkable
 class KnownFrames(Protocol):
-    """Frames of which the truth is known, by number. intrinsics: fx, fy, cx, cy, pixels."""
+    """Frames with ground truth, by number. intrinsics: fx, fy, cx, cy, pixels."""
 
     @property
     def intrinsics(self) -> np.ndarray: ...
@@ -154,8 +154,8 @@ def track_window(
     rng: np.random.Generator,
     depth_noise: tuple[float, float],
 ) -> TrackedWindow:
-    """A window of the frames with these numbers. depth_noise: relative standard deviation of what is added to the
-    depth, and of what the prior says of it.
+    """Return a window of the frames `numbers`. depth_noise: relative standard deviations of the noise added to the
+    depth, and of the depth prior.
     """
     frames = list(numbers)
     images = np.stack([oracle.image(k) for k in frames])
@@ -212,7 +212,7 @@ class _Followed:
 
 def _follow(first: np.ndarray, second: np.ndarray, pixels: np.ndarray, guess: np.ndarray) -> _Followed:
     """Track from `first` to `second` and back."""
-    if not len(pixels):  # which OpenCV refuses
+    if not len(pixels):  # OpenCV rejects empty arrays
         return _Followed(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, bool))
     here, there = pixels.astype(np.float32)[:, None], guess.astype(np.float32)[:, None]
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW

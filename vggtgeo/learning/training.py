@@ -20,7 +20,7 @@ from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
-from vggtgeo.learning.network import LEAST, ConfidenceNetwork
+from vggtgeo.learning.network import MIN_CONFIDENCE, ConfidenceNetwork
 from vggtgeo.learning.tracked_windows import TrackedWindow
 
 GAIN = 16.0
@@ -175,7 +175,7 @@ def compare(batch: Batch, network: Callable[[Array], Array], judge: Judge = erro
     `train`.
     """
     ones = jnp.ones_like(batch.saliency)
-    oracle = jnp.where(batch.right, ones, LEAST)
+    oracle = jnp.where(batch.right, ones, MIN_CONFIDENCE)
     methods = (ones, batch.saliency, _apply(network, batch.features), oracle)
     windows = [batch.select(row) for row in range(len(batch.truth))]
     errors = [
