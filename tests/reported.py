@@ -15,10 +15,12 @@ def pattern(*named: object) -> str:
 
     A number is matched as a whole: `1` does not occur in `10`.
     """
-    return "(?s)" + "".join(
-        rf"(?=.*(?<!\w){re.escape(one)}(?!\w))" if one[-1:].isdigit() else f"(?=.*{re.escape(one)})"
-        for one in map(str, named)
-    )
+    return "(?s)" + "".join(_part(str(one)) for one in named)
+
+
+def _part(named: str) -> str:
+    edges = (r"(?<!\w)", r"(?!\w)") if named[-1:].isdigit() and named.lstrip("-")[:1].isdigit() else ("", "")
+    return f"(?=.*{edges[0]}{re.escape(named)}{edges[1]})"
 
 
 def raises(*named: object, error: type[Exception] = InputError) -> Any:

@@ -22,6 +22,7 @@ from vggtgeo.datasets.bag_images import Unread, image_of, metres_of
 from vggtgeo.datasets.bag_topics import IMAGES, Chosen, chosen_topics, told, truth_topic
 from vggtgeo.datasets.bag_transforms import TRANSFORMS, frame_name
 from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.image_files import orientation_message
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration

@@ -1,4 +1,4 @@
-"""What is wrong with a recording, in sentences, before an hour is spent on it."""
+"""Checks of a recording before a run: times, images, depth and ground truth of a sample of its frames."""
 
 import itertools
 import os
@@ -20,28 +20,28 @@ from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 SAMPLES = 20
 """Frames that are decoded."""
 PLAUSIBLE = (0.5, 6.5)
-"""Metres, of a room's median depth, for the verdict of a run, too; millimetres taken for fifths mostly have less."""
-_LEAST_DEPTH = 0.2
+"""Metres, of the median depth of a room, used by the verdict, too: a wrong unit is mostly outside."""
+_MIN_DEPTH_SHARE = 0.2
 """Share of pixels; depth cameras give 0.5 to 0.9 indoors."""
 _DARK = 8.0
-_LEAST_STEPS, _USUAL = 10, 0.75
-"""Of the steps between the numbers of images, and the share that is one: else they were chosen by hand."""
+_MIN_STEPS, _USUAL = 10, 0.75
+"""Steps between image numbers, and the share that is the usual one: otherwise the images were selected by hand."""
 _GAP = 5.0
 """Times the median step between two frames."""
 _FAST, _FAST_CAR = 5.0, 60.0
-"""Metres a second: more than a hand or a small drone, or a car, does between two poses of the truth."""
+"""Metres a second between two poses of the ground truth: above those of a hand or small drone, and of a car."""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """facts: what was found, in words. problems: what is wrong or doubtful, a sentence each; empty for nothing."""
+    """Fields: facts, what the recording has. problems, what is wrong or doubtful; empty for none."""
 
     facts: tuple[str, ...]
     problems: tuple[str, ...]
 
 
 def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection:
-    """Opens a recording and looks at a sample of its frames, times, depth and truth; what it finds is no exception."""
+    """Inspect a recording by a sample of its frames; problems are returned, not raised."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         try:
@@ -67,7 +67,7 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
 
 
 def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
-    """How many of the files that are listed are not there, and the sequence of those that are."""
+    """Messages about listed files that are missing, and the sequence without them."""
     if not isinstance(sequence, FolderSequence):
         return [], sequence
     images = [file.image for file in sequence.files if not sequence.holds(file.image)]
@@ -78,13 +78,13 @@ def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
         for file in sequence.files
         if file.image not in gone
     )
-    told = [*_told(images, len(sequence), "images"), *_told(depths, len(sequence), "depth images")]
-    return told, replace(sequence, files=files)
+    messages = [*_missing(images, len(sequence), "images"), *_missing(depths, len(sequence), "depth images")]
+    return messages, replace(sequence, files=files)
 
 
-def _told(gone: list[Path], count: int, what: str) -> list[str]:
+def _missing(gone: list[Path], count: int, what: str) -> list[str]:
     names = f"`{gone[0]}`{', ...' if len(gone) > 1 else ''}" if gone else ""
-    return [f"{len(gone)} of {count} {what} that are listed are not there: {names}"] if gone else []
+    return [f"{len(gone)} of {count} {what} that are listed are missing: {names}"] if gone else []
 
 
 def _sample(sequence: Sequence) -> list[Frame]:
@@ -93,9 +93,9 @@ def _sample(sequence: Sequence) -> list[Frame]:
 
 
 def _texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:
-    """Of what may be wrong: a note says what was done as it should be."""
-    told = (one for one in caught if issubclass(one.category, InputWarning))
-    return [str(one.message) for one in told if not issubclass(one.category, NoteWarning)]
+    """Warnings without notes, which report what was done as intended."""
+    problems = (one for one in caught if issubclass(one.category, InputWarning))
+    return [str(one.message) for one in problems if not issubclass(one.category, NoteWarning)]
 
 
 def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) -> tuple[str, ...]:
@@ -128,10 +128,10 @@ def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) ->
 
 
 def _of_numbers(sequence: Sequence) -> list[str]:
-    """Images that are not there, by the numbers of those that are: nearly all steps are one, and a few are larger."""
+    """Images missing by the numbers of the others: nearly all steps are the usual one, and a few are larger."""
     images = [file.image for file in sequence.files] if isinstance(sequence, FolderSequence) else []
     steps = np.diff(rows_of(images, None))
-    if len(steps) < _LEAST_STEPS:
+    if len(steps) < _MIN_STEPS:
         return []
     sizes, counts = np.unique(steps, return_counts=True)
     usual = sizes[np.argmax(counts)]
@@ -187,7 +187,7 @@ def _of_depth(sequence: Sequence, frames: list[Frame]) -> list[str]:
         return ["none of the depth images looked at has a valid pixel"]
     problems = []
     share = float(np.mean([np.isfinite(depth).mean() for depth in depths]))
-    if share < _LEAST_DEPTH:
+    if share < _MIN_DEPTH_SHARE:
         problems.append(f"only {100 * share:.0f} % of the pixels have depth")
     middle = float(np.median(np.concatenate([depth[np.isfinite(depth)][::7] for depth in depths])))
     if not PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:

@@ -1,4 +1,4 @@
-"""What all sequences of image files share: a list of files, read one by one, with a word for bad ones."""
+"""Base of all sequences of image files: a list of files, read one by one, with warnings about invalid ones."""
 
 import math
 import warnings
@@ -28,14 +28,14 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning, UnusableDepthWarning
 
 LATEST = 1e11
-"""Seconds of a time stamp, 3,000 years: nanoseconds since 1970 are 1e18."""
+"""Seconds of a time stamp at most, 3,000 years: Unix times in nanoseconds are 1e18."""
 _SAMPLES = 3
 _NAMED_EMPTY_DEPTHS = 3
 
 
 @dataclass(frozen=True)
 class FrameFile:
-    """Where one frame lies. Fields: index, position in the sequence; timestamp, seconds; image; depth, if any."""
+    """The files of one frame. Fields: index, position in the sequence; timestamp, seconds; image; depth, if any."""
 
     index: int
     timestamp: float
@@ -59,7 +59,7 @@ class FolderSequence:
     has_depth: bool = False
 
     depth_of_fewer_pixels: ClassVar[bool] = False
-    """Whether depth of fewer pixels than the images and the same shape is enlarged to them."""
+    """Whether depth of fewer pixels and the same aspect as the images is enlarged to them."""
 
     def __post_init__(self) -> None:
         for file in self.files:
@@ -79,29 +79,29 @@ class FolderSequence:
         return len(self.files)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`. Images of another size than the camera's are skipped with a warning, too."""
+        """See `Sequence.frames`. Images of another size than the camera are skipped with a warning."""
         check_selection(self.name, len(self), start, end, stride)
         return self._read_all(self.files[start:end:stride])
 
     def ground_truth(self) -> Trajectory | None:
-        """No truth, unless the layout knows one."""
+        """Return None; layouts with ground truth override it."""
         return None
 
     @property
     def truth_in_metres(self) -> bool:
-        """Whether lengths of `ground_truth` are metres, as those of the benchmarks are."""
+        """Whether lengths of `ground_truth` are metres."""
         return True
 
     def holds(self, path: Path) -> bool:
-        """Whether a file of `files` is there."""
+        """Return whether a file of `files` exists."""
         return is_there(path)
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """The image in a file, see `read_image_file`; a layout whose images do not fit its depth changes them here."""
+        """Return the image in a file, see `read_image_file`; layouts whose images must be changed override it."""
         return read_image_file(path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """The depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
+        """Return the depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
         depth = read_depth(path, self.depth_format)
         size = self.camera.width, self.camera.height
         return (
@@ -109,7 +109,7 @@ class FolderSequence:
         )
 
     def depth_can_be_read(self) -> bool:
-        """Whether depth of the first, the middle or the last image that has some can be read; else an InputWarning."""
+        """Return whether depth of the first, middle or last image with depth can be read; else warn."""
         depths = [file.depth for file in self.files if file.depth is not None]
         reason = ""
         for depth in (depths[0], depths[len(depths) // 2], depths[-1]):
@@ -173,7 +173,7 @@ class FolderSequence:
         return read
 
     def _read_depth(self, file: FrameFile) -> np.ndarray | None:
-        """None where there is no depth, or none that can be used, which is told."""
+        """None if there is no depth, or, with a warning, if it cannot be used."""
         if file.depth is None:
             return None
         try:
@@ -190,7 +190,7 @@ class FolderSequence:
 def common_size(
     name: str, files: Sequence[FrameFile], read: Callable[[Path], np.ndarray] = read_image
 ) -> tuple[int, int]:
-    """Width and height of most of a few readable images: first, middle, last. InputError where none can be read."""
+    """Return width and height of most of a few readable images; raise InputError if none can be read."""
     sizes: list[tuple[int, int]] = []
     reason = ""
     for file in _spread(files):
@@ -207,11 +207,11 @@ def common_size(
     return Counter(sizes).most_common(1)[0][0]
 
 
-NEAREST = 0.01
-"""Metres: no camera of depth measures what is nearer."""
+MIN_MEDIAN_DEPTH = 0.01
+"""Metres: below the range of all depth cameras."""
 _SAME_SHAPE = 0.01
-MOST_ENLARGED = 32
-"""Pixels of an image to one of its depth, along a side; phones have 8."""
+MAX_ENLARGEMENT = 32
+"""Pixels of an image to one of its depth, along a side at most; phones have 8."""
 
 
 def depth_is_usable(
@@ -241,7 +241,7 @@ def depth_is_usable(
                 "with --rgb-only"
             )
         if np.isfinite(depth).any():
-            if (middle := float(np.nanmedian(depth))) < NEAREST:
+            if (middle := float(np.nanmedian(depth))) < MIN_MEDIAN_DEPTH:
                 _warn(
                     f"`{file.depth}`: half of its depths are below {middle:.2g} m: is its unit another? "
                     "`--depth-scale` says how many there are in a metre: 1000 are millimetres"
@@ -261,8 +261,8 @@ def depth_is_usable(
     return False
 
 
-def tell_of_no_depth(folder: Path, files: Sequence[FrameFile]) -> None:
-    """How many images have no depth where others have one, in an InputWarning: a copy that stopped half-way, say."""
+def warn_of_no_depth(folder: Path, files: Sequence[FrameFile]) -> None:
+    """Warn of images without depth where others have one, as after an incomplete copy."""
     alone = sum(file.depth is None for file in files)
     if 0 < alone < len(files):
         _warn(f"`{folder}`: {alone} of {len(files)} images have no depth")
@@ -278,7 +278,7 @@ def enlarged(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray
     (rows, columns), (width, height) = depth.shape, size
     if (rows, columns) == (height, width):
         return depth
-    if not _has_the_shape(depth, width, height) or columns > width * MOST_ENLARGED:
+    if not _has_the_shape(depth, width, height) or columns > width * MAX_ENLARGEMENT:
         raise InputError(
             _other_size(path, depth, width, height) + ": no such size of the same view; register the depth to the "
             "images, or leave it out with --rgb-only"
@@ -295,7 +295,7 @@ def _has_the_shape(depth: np.ndarray, width: int, height: int) -> bool:
     """Whether depth [h, w] has the shape of images of this size, to a row or a hundredth, and not hardly any pixels."""
     rows, columns = depth.shape
     alike = abs(columns * height / width - rows) < max(1.0, _SAME_SHAPE * rows)
-    return alike and columns * MOST_ENLARGED >= width
+    return alike and columns * MAX_ENLARGEMENT >= width
 
 
 def _spread(files: Sequence[FrameFile]) -> list[FrameFile]:

@@ -17,7 +17,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, warn_of_no_depth
 from vggtgeo.datasets.icl import MIRROR, icl_camera, icl_truth
 from vggtgeo.datasets.image_files import MAX_DEPTH
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
@@ -54,7 +54,7 @@ class IclNuimRaw(FolderSequence):
             FrameFile(index, number / FRAMES_PER_SECOND, image, depth if depth.is_file() else None)
             for index, (number, image, depth) in enumerate(zip(numbers, images, depths, strict=True))
         )
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         camera = icl_camera(folder, *common_size(str(folder), files))
         return cls(folder, folder.resolve().name, camera, files, has_depth=any(file.depth for file in files))
 

@@ -21,17 +21,17 @@ FRAMES_PER_SECOND = 30.0
 _SECONDS = re.compile(r"-?\d+\.\d+")
 _NANOSECONDS = re.compile(r"\d{18,19}")
 _MICROSECONDS, _MILLISECONDS = re.compile(r"1\d{15}"), re.compile(r"1\d{12}")
-"""Since 1970, from 2001 to 2033."""
+"""Unix times of 2001 to 2033."""
 _PREFERRED = (".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp", ".jpg", ".jpeg")
-"""Of two formats of the same pictures: what loses nothing first."""
+"""Order of preference among two formats of the same images: lossless first."""
 _DIGITS = re.compile(r"[0-9]+")
 _SMALL = (64, 64)
 _ALIKE = 0.95
-"""Correlation of two files of one picture; a colour image and its depth or mask have less."""
+"""Correlation of two files of one image; a colour image and its depth or mask are below it."""
 _NO_IMAGES = re.compile(r"depth|conf", re.IGNORECASE)
 _NUMBERS = re.compile(r"((?:^-)?\d+)")
 _CAMERAS = re.compile(r"(.*(?:cam|camera|view|sensor|lens|eye)[ ._-]*\d+)(?!\d)(.*)", re.IGNORECASE)
-"""Names that say which camera a picture is of, `cam0_17`."""
+"""Names with the number of a camera, `cam0_17`."""
 _UNITS = ((_SECONDS, 1.0), (_NANOSECONDS, 1e-9), (_MICROSECONDS, 1e-6), (_MILLISECONDS, 1e-3))
 _COUNTED = re.compile(r"-?\d+\.\d+0")
 _NUMBERED = re.compile(r"[^0-9]*([0-9]{1,15})")
@@ -47,19 +47,19 @@ class ImageFolder(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has an image."""
+        """Return whether `folder` has an image."""
         return bool(image_files(folder))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images; InputError where there is none."""
+        """List the images; raise InputError if there is none."""
         images = image_files(folder)
         if not images:
             raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
         images = _without_doubles(folder, images)
-        tell_of_unread(folder, images)
-        _tell_of_series(folder, images)
-        _tell_of_more(folder, len(images))
+        warn_of_unread(folder, images)
+        _warn_of_series(folder, images)
+        _warn_of_more(folder, len(images))
         times = times_by_name(images)
         files = tuple(
             FrameFile(index, time, image) for index, (time, image) in enumerate(sorted(zip(times, images, strict=True)))
@@ -69,11 +69,11 @@ class ImageFolder(FolderSequence):
         return cls(folder, folder.resolve().name, camera, files)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `FolderSequence.frames`; behind the last image, how many came in since the folder was opened is told."""
+        """See `FolderSequence.frames`; warns at the end of images that were added since the folder was opened."""
         read = super().frames(start, end, stride)
-        return read if end is not None and end < len(self) else self._then_tell_of_new(read)
+        return read if end is not None and end < len(self) else self._then_warn_of_new(read)
 
-    def _then_tell_of_new(self, read: Iterator[Frame]) -> Iterator[Frame]:
+    def _then_warn_of_new(self, read: Iterator[Frame]) -> Iterator[Frame]:
         yield from read
         listed = {file.image for file in self.files}
         kinds = {image.suffix.lower() for image in listed}
@@ -87,14 +87,15 @@ class ImageFolder(FolderSequence):
             warnings.warn(LeftOutWarning(text, len(new)), stacklevel=3)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses, if the folder has them."""
+        """Return the ground truth, if the folder has it."""
         file = self.folder / "groundtruth.txt"
         return Trajectory.load_tum(file) if file.exists() else None
 
 
 def _without_doubles(folder: Path, images: list[Path]) -> list[Path]:
-    """One file of each picture, where every picture lies there in the same two formats, as a converter or a camera
-    leaves it (`1.jpg`, `1.png`); told in a note. Pairs of different pictures, colour and a mask, say, stay.
+    """Keep one file of each image if all are there in the same two formats (`1.jpg`, `1.png`), with a NoteWarning.
+
+    Pairs of different images, such as colour and a mask, are kept.
     """
     formats = sorted({image.suffix.lower() for image in images}, key=_PREFERRED.index)
     if len(formats) != 2:
@@ -106,7 +107,7 @@ def _without_doubles(folder: Path, images: list[Path]) -> list[Path]:
     if not all(_show_the_same(first[row], second[row]) for row in ends):
         return images
     warnings.warn(
-        f"`{folder}`: each of {len(first)} pictures lies there twice, as `{formats[0]}` and as `{formats[1]}`: the "
+        f"`{folder}`: each of {len(first)} images is there twice, as `{formats[0]}` and as `{formats[1]}`: the "
         f"`{formats[0]}` are read",
         NoteWarning,
         stacklevel=4,
@@ -115,7 +116,7 @@ def _without_doubles(folder: Path, images: list[Path]) -> list[Path]:
 
 
 def _show_the_same(one: Path, other: Path) -> bool:
-    """Whether two files are of one picture, whatever their size, tone and compression."""
+    """Whether two files are of one image, whatever their size, tone and compression."""
     try:
         small = [cv2.resize(read_image(path), _SMALL, interpolation=cv2.INTER_AREA) for path in (one, other)]
     except InputError:
@@ -124,9 +125,9 @@ def _show_the_same(one: Path, other: Path) -> bool:
     return bool(first @ second >= _ALIKE * np.sqrt((first @ first) * (second @ second)))
 
 
-def tell_of_unread(folder: Path, images: list[Path]) -> None:
-    """How many pictures lie among `images` in a kind that is not read, or are not whole: in an InputWarning. One that
-    is there in another kind, too, is none of them (HEIC of a phone beside JPEG, raw of a camera).
+def warn_of_unread(folder: Path, images: list[Path]) -> None:
+    """Warn of images that are not read, or not complete, among `images`; not of those that are there in a format that
+    is read, too (HEIC of a phone beside JPEG, raw of a camera).
     """
     read = {image.stem for image in images}
     files = [path for path in folder.iterdir() if path.is_file()]
@@ -140,18 +141,18 @@ def tell_of_unread(folder: Path, images: list[Path]) -> None:
         and Path(path.stem.lstrip(".")).stem not in read
     ]
     for found, what in (
-        (other, "of a kind that is not read: convert to PNG or JPEG"),
-        (partial, "not here, or not whole: wait for the copy"),
+        (other, "of a format that is not read: convert to PNG or JPEG"),
+        (partial, "not complete: wait for the copy"),
     ):
         if found:
             first = min(path.name for path in found)
-            count = f"{len(found)} pictures" if len(found) > 1 else "a picture"
+            count = f"{len(found)} images" if len(found) > 1 else "an image"
             text = f"`{folder}` holds {count} {what} (`{first}`); left out"
             warnings.warn(LeftOutWarning(text, len(found)), stacklevel=4)
 
 
-def _tell_of_series(folder: Path, images: list[Path]) -> None:
-    """Names that differ in words and share their numbers are of two cameras, or of two recordings."""
+def _warn_of_series(folder: Path, images: list[Path]) -> None:
+    """Warn of names that differ in words and share their numbers: two cameras, or two recordings."""
     series: dict[str, set[str]] = {}
     for image in images:
         camera = _CAMERAS.fullmatch(image.stem)
@@ -169,8 +170,8 @@ def _tell_of_series(folder: Path, images: list[Path]) -> None:
         )
 
 
-def _tell_of_more(folder: Path, count: int) -> None:
-    """The recording may be in a folder below, and what lies here a few pictures of it."""
+def _warn_of_more(folder: Path, count: int) -> None:
+    """Warn of a folder below with more images: it may be the recording, and these a few images of it."""
     below = _folders_in(folder)
     below += [inner for place in below for inner in _folders_in(place)]
     more = {path.relative_to(folder).as_posix(): len(image_files(path)) for path in below}
@@ -190,7 +191,7 @@ def _folders_in(folder: Path) -> list[Path]:
 
 
 def files_like(folder: Path, pattern: str) -> list[Path]:
-    """The files in `folder` whose names match, in natural order, without hidden ones.
+    """Return the files in `folder` whose names match, in natural order, without hidden ones.
 
     macOS puts a hidden one beside each file that it copies to another disk (`._0.txt` beside `0.txt`).
     """
@@ -199,18 +200,18 @@ def files_like(folder: Path, pattern: str) -> list[Path]:
 
 
 def natural_key(name: str) -> list[int | str]:
-    """Sorts digits in `name` as numbers: `a2` before `a10`, and `-2` before `-1`; a minus behind a word is a dash."""
+    """Return a key that sorts digits as numbers: `a2` before `a10`, and `-2` before `-1`; `a-2` has a dash."""
     # The groups of the pattern are every second part; `isdigit` also holds of signs that are no numbers, as in `m²`.
     return [int(part) if row % 2 else part.lower() for row, part in enumerate(_NUMBERS.split(name))]
 
 
 def image_files(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[Path]:
-    """The images in `folder`, as `files_like` has them; suffixes: of what counts as one."""
+    """Return the images in `folder`, as `files_like`; suffixes: of images."""
     return [path for path in files_like(folder, "*") if path.suffix.lower() in suffixes]
 
 
 def times_by_name(images: list[Path]) -> list[float]:
-    """Seconds by the names where all are times, else position / 30 s."""
+    """Return seconds by the names if all are times, else position / 30 s."""
     stems = [image.stem for image in images]
     for pattern, unit in _UNITS:
         if all(pattern.fullmatch(stem) for stem in stems) and not (unit == 1.0 and _are_counted(stems)):

@@ -22,7 +22,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, warn_of_no_depth
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, is_there, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
@@ -71,7 +71,7 @@ class Nerfstudio(FolderSequence):
             FrameFile(index, index / FRAMES_PER_SECOND, image, _depth(folder, file, images[image]))
             for index, image in enumerate(order)
         )
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         camera = _camera(file, content, list(images.values()), width, height)
         listed = [one.depth for one in files if one.depth is not None]
@@ -176,7 +176,7 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
     fy = focal if fy is None else fy
     cx, cy = _number(file, content, frames, "cx"), _number(file, content, frames, "cy")
     centre = (0.5 * across if cx is None else cx) - 0.5, (0.5 * down if cy is None else cy) - 0.5
-    _tell_of_unread(file, content, frames, fisheye)
+    _warn_of_unread(file, content, frames, fisheye)
     lens = tuple(_number(file, content, frames, key) or 0.0 for key in (_OF_FISHEYE if fisheye else _DISTORTION))
     try:
         distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
@@ -191,7 +191,7 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
     return camera.resized(width, height)
 
 
-def _tell_of_unread(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], fisheye: bool) -> None:
+def _warn_of_unread(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], fisheye: bool) -> None:
     """Coefficients of the lens beyond those that are read."""
     unread = [key for key in ("k4", "k5", "k6") if not (fisheye and key == "k4")]
     if unread := [key for key in unread if _number(file, content, frames, key)]:

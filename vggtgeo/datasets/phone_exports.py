@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, warn_of_no_depth
 from vggtgeo.datasets.image_files import MILLIMETRES, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of
@@ -95,7 +95,7 @@ class PhoneExport(FolderSequence):
             FrameFile(index, time, part.image, part.depth if part.depth.is_file() else None)
             for index, (time, (part, _)) in enumerate(zip(times, known, strict=True))
         )
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         camera = _camera(folder, [stated for _, stated in known], *common_size(str(folder), files))
         trusted = {part.depth: part.confidence for part, _ in known if part.confidence.is_file()}
         has_depth = any(file.depth is not None for file in files)

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, warn_of_no_depth
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.images import files_like
@@ -160,7 +160,7 @@ class ArkitScenes(FolderSequence):
         files = tuple(
             FrameFile(index, time, image, _nearest(time, depths)) for index, (time, image) in enumerate(images)
         )
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         has_depth = any(file.depth is not None for file in files)
         whole = cls(folder, folder.resolve().name, _pincam(folder, width, height), files, MILLIMETRES, has_depth)

@@ -25,7 +25,7 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, warn_of_no_depth
 from vggtgeo.datasets.image_files import (
     MAX_BYTES,
     MILLIMETRES,
@@ -100,7 +100,7 @@ class Record3d(FolderSequence):
         unread = cls(folder, folder.resolve().name, Camera.guess(1, 1), ())
         metadata = unread.metadata()
         files = tuple(map(FrameFile, range(len(numbers)), _times(metadata, numbers), images, there))
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         width, height = common_size(str(folder), files, lambda path: unread.load_image(path).image)
         camera = _camera(unread.file, metadata, width, height) or guess_with_warning(str(folder), width, height)
         whole = cls(folder, unread.name, camera, files, MILLIMETRES, any(there), _depth_size(metadata))

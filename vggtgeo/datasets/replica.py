@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, warn_of_no_depth
 from vggtgeo.datasets.image_files import DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
@@ -46,7 +46,7 @@ class Replica(FolderSequence):
             FrameFile(index, (row - rows[0]) / FRAMES_PER_SECOND, image, _depth(image))
             for index, (row, image) in enumerate(zip(rows, images, strict=True))
         )
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         camera, units = _camera(folder, width, height)
         coding = DepthFormat(units)

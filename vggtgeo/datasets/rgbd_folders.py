@@ -14,9 +14,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Self
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, warn_of_no_depth
 from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MILLIMETRES
-from vggtgeo.datasets.images import image_files, tell_of_unread, times_by_name
+from vggtgeo.datasets.images import image_files, times_by_name, warn_of_unread
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, list_of, lists_no_times, partners_in_time
 from vggtgeo.geometry.trajectory import Trajectory
@@ -78,13 +78,13 @@ class RgbdFolders(FolderSequence):
         if loose:
             beside = f" beside `{colour.name}`" if colour != folder else ""
             _warn(f"`{folder}`: {len(loose)} images{beside} ({loose[0].name}, ...) are left out")
-        tell_of_unread(colour, images)
+        warn_of_unread(colour, images)
         _tell_of_others(folder, colour)
         times = times_by_name(images)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
         rows = sorted(zip(times, images, partners, strict=True), key=lambda row: row[0])
         files = tuple(FrameFile(index, time, image, partner) for index, (time, image, partner) in enumerate(rows))
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         _tell_of_no_image(folder, depths, partners)
         width, height = common_size(str(folder), files)
         camera = (

@@ -23,7 +23,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, warn_of_no_depth
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_of_other_size
@@ -63,7 +63,7 @@ class ScanNet(FolderSequence):
             FrameFile(index, _number(image, index) / FRAMES_PER_SECOND, image, _depth(folder, image))
             for index, image in enumerate(images)
         )
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         colour, depth = _intrinsics(folder, "color"), _intrinsics(folder, "depth")
         width, height = _size(folder, files)
         # An absurd ratio of the two cameras would make a filter of any width.

@@ -18,7 +18,7 @@ from typing import Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, tell_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, warn_of_no_depth
 from vggtgeo.datasets.image_files import MILLIMETRES
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.pose_files import trajectory_of
@@ -68,7 +68,7 @@ class SevenScenes(FolderSequence):
             FrameFile(index, number / FRAMES_PER_SECOND, image, _beside(image, "depth.png"))
             for index, (number, image) in enumerate(sorted(numbered.items()))
         )
-        tell_of_no_depth(folder, files)
+        warn_of_no_depth(folder, files)
         width, height = common_size(str(folder), files)
         own = camera_from_folder(folder, width, height)
         if own is not None and own.intrinsics == _KINECT_DEPTH:  # of what is not registered to the colour camera

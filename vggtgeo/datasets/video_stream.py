@@ -94,7 +94,7 @@ class VideoStream:
         width, height = size[::-1] if turns % 2 else size
         # Of 10 bits FFmpeg's RGB differs from its BGR by up to 5: BGR is that of OpenCV. A frame's own `to_ndarray`
         # sets the conversion up anew each time, which takes as long as the conversion.
-        image = self._conversion.reformat(frame, width, height, "bgr24", interpolation="BICUBIC").to_ndarray()
+        image: Any = self._conversion.reformat(frame, width, height, "bgr24", interpolation="BICUBIC").to_ndarray()
         image = np.ascontiguousarray(np.rot90(image, turns))
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
