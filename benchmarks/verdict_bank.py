@@ -290,6 +290,8 @@ def judged(options: argparse.Namespace) -> list[Judged]:
         case, outcome = (json.loads((folder / name).read_text()) for name in ("case.json", "outcome.json"))
         if outcome["outcome"] == "error" or (options.half and case["half"] != options.half):
             continue
+        # A run that never had a map is wrong, but cannot be taken for a right one: it counts for no recall.
+        word = outcome["outcome"] if np.isfinite(outcome["ate"]) else NO_MAP
         level, reasons = outcome["level"], outcome["reasons"]
         if not options.saved:
             slam, evidence, of_input = (
@@ -300,11 +302,11 @@ def judged(options: argparse.Namespace) -> list[Judged]:
                 verdict = judge(slam, evidence, of_input)
             level, reasons = verdict.level, verdict.reasons
         one = Judged(
-            *(case["half"], case["degradation"], case["rgb_only"], outcome["outcome"], level, tuple(reasons)),
+            *(case["half"], case["degradation"], case["rgb_only"], word, level, tuple(reasons)),
             folder.name,
         )
         found.append(one)
-        if options.verbose and (one.level == "good") == (one.outcome == "wrong"):
+        if options.verbose and (one.level == "good") == (one.outcome in ("wrong", NO_MAP)):
             print(f"{one.name}: {one.outcome}, {one.level}: {'; '.join(one.reasons)[:300]}", flush=True)
     return found
 
@@ -312,8 +314,8 @@ def judged(options: argparse.Namespace) -> list[Judged]:
 def table(runs: list[Judged]) -> str:
     """Recall of wrong results, alarms on right ones, and how many mild ones are reported, with intervals."""
     lines = [
-        "| half | degradation | runs | wrong, reported | right, doubted | mild, reported |",
-        "|---|---|---|---|---|---|",
+        "| half | degradation | runs | wrong, reported | right, doubted | mild, reported | without a map, reported |",
+        "|---|---|---|---|---|---|---|",
     ]
     for half in HALVES:
         own = [one for one in runs if one.half == half]
@@ -334,7 +336,8 @@ def table(runs: list[Judged]) -> str:
     return "\n".join(lines)
 
 
-OUTCOMES = ("wrong", "good", "mild")
+NO_MAP = "no map"
+OUTCOMES = ("wrong", "good", "mild", NO_MAP)
 
 
 def share(hits: list[bool]) -> str:
