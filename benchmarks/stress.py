@@ -173,7 +173,7 @@ def _measured(case: Case, folder: Path, truth: Path, run: Path, code: int | None
     if code in (0, 3) and (run / "summary.json").is_file():
         summary = json.loads((run / "summary.json").read_text())
         estimate, true = Trajectory.load_tum(run / "trajectory.txt"), Trajectory.load_tum(truth)
-        facts |= _errors(estimate, true)
+        facts |= trajectory_errors(estimate, true)
         facts |= {
             "level": summary["verdict"]["level"],
             "reasons": tuple(summary["verdict"]["reasons"]),
@@ -184,8 +184,8 @@ def _measured(case: Case, folder: Path, truth: Path, run: Path, code: int | None
     return Outcome(case.source, case.name, code, **facts)
 
 
-def _errors(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
-    """None where too few frames have a pose to be compared, as where a run never began."""
+def trajectory_errors(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
+    """ATE after SE(3) and Sim(3), metres, and turn; empty where too few frames have a pose to be compared."""
     try:
         report = evaluate_trajectory(estimate, true)
     except InputError:

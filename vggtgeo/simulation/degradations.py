@@ -118,18 +118,18 @@ def centimetres(recording: Recording, rng: np.random.Generator) -> Recording:
     return with_depths(recording, lambda depth, row: 0.1 * depth)
 
 
-def growing_depth(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A depth camera that warms up: its scale grows by 40 % over the recording."""
+def growing_depth(recording: Recording, rng: np.random.Generator, share: float = 0.4) -> Recording:
+    """A depth camera that warms up: its scale grows by 40 % over the recording, or another share."""
     del rng
     count = len(recording.frames)
-    return with_depths(recording, lambda depth, row: depth * (1 + 0.4 * row / count))
+    return with_depths(recording, lambda depth, row: depth * (1 + share * row / count))
 
 
-def jumping_depth(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A depth camera that starts again in another mode: from the middle on its depth is a fifth longer."""
+def jumping_depth(recording: Recording, rng: np.random.Generator, factor: float = 1.2) -> Recording:
+    """A depth camera that starts again in another mode: from the middle on its depth is `factor` times as long."""
     del rng
     middle = len(recording.frames) // 2
-    return with_depths(recording, lambda depth, row: depth * (1.2 if row >= middle else 1.0))
+    return with_depths(recording, lambda depth, row: depth * (factor if row >= middle else 1.0))
 
 
 def other_depth(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -148,31 +148,31 @@ def shuffled(recording: Recording, rng: np.random.Generator) -> Recording:
     return replace(recording, frames=moved, truth=Trajectory(times, poses[order]))
 
 
-def barrel(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A wide lens, k1 = -0.3, that nobody told of."""
+def barrel(recording: Recording, rng: np.random.Generator, k1: float = -0.3) -> Recording:
+    """A wide lens, k1 = -0.3 or another value, that the calibration does not state."""
     del rng
     camera = recording.camera
     y, x = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     grid = np.stack([x, y], -1).reshape(-1, 1, 2)
-    source = cv2.undistortPoints(grid, camera.matrix, np.array([-0.3, 0, 0, 0.0]), P=camera.matrix)
+    source = cv2.undistortPoints(grid, camera.matrix, np.array([k1, 0, 0, 0.0]), P=camera.matrix)
     u, v = np.asarray(source, np.float32).reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
     bent = with_images(recording, lambda image, row: cv2.remap(image, u, v, cv2.INTER_LINEAR))
     nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
     return with_depths(bent, lambda depth, row: cv2.remap(depth, u, v, cv2.INTER_NEAREST, **nothing))
 
 
-def zooming(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A lens that zooms while it films: the picture grows steadily, by 1.3 in the end."""
+def zooming(recording: Recording, rng: np.random.Generator, share: float = 0.3) -> Recording:
+    """A lens that zooms while it films: the picture grows steadily, by 1.3 in the end, or 1 + share."""
     del rng
     last = max(len(recording.frames) - 1, 1)
-    return _through_lens(recording, lambda row: 1.0 + 0.3 * row / last)
+    return _through_lens(recording, lambda row: 1.0 + share * row / last)
 
 
-def changed_lens(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A phone that changes its lens in the middle, for one of 1.7 times the focal length."""
+def changed_lens(recording: Recording, rng: np.random.Generator, factor: float = 1.7) -> Recording:
+    """A phone that changes its lens in the middle, for one of `factor` times the focal length."""
     del rng
     middle = len(recording.frames) // 2
-    return _through_lens(recording, lambda row: 1.7 if row >= middle else 1.0)
+    return _through_lens(recording, lambda row: factor if row >= middle else 1.0)
 
 
 def rolling_shutter(recording: Recording, rng: np.random.Generator, seconds: float = 0.02) -> Recording:
@@ -184,11 +184,17 @@ def rolling_shutter(recording: Recording, rng: np.random.Generator, seconds: flo
     return replace(recording, frames=drawn)
 
 
-def wrong_focal(recording: Recording, rng: np.random.Generator) -> Recording:
-    """The calibration of a lens with 15 % more focal length."""
+def wrong_focal(
+    recording: Recording,
+    rng: np.random.Generator,
+    factor: float = 1.15,
+    aside: tuple[float, float] = (0.0, 0.0),
+) -> Recording:
+    """The calibration of a lens with 15 % more focal length, or `factor` times; its centre is `aside`, in pixels."""
     del rng
     fx, fy, cx, cy = recording.camera.intrinsics
-    return replace(recording, camera=replace(recording.camera, intrinsics=(1.15 * fx, 1.15 * fy, cx, cy)))
+    given = (factor * fx, factor * fy, cx + aside[0], cy + aside[1])
+    return replace(recording, camera=replace(recording.camera, intrinsics=given))
 
 
 def covered(recording: Recording, rng: np.random.Generator) -> Recording:

@@ -1,0 +1,369 @@
+"""The bank of simulated runs that the verdict's levels are set on, and validated on.
+
+    .venv/bin/python benchmarks/verdict_bank.py make [--out runs/verdict-bank] [--count 420] [--jobs 1]
+    .venv/bin/python benchmarks/verdict_bank.py judge [--out runs/verdict-bank] [--saved] [--judge MODULE]
+
+`make` runs SLAM and keeps what a verdict is computed from; what is there already is not run again. `judge` computes the
+verdict of each run again, in a second or so, and prints how many wrong results it reports (recall) and how many right
+ones it doubts (alarms), each with its Wilson interval of 95 %.
+
+Half of the runs are healthy: they have the errors of real cameras and calibrations (`CameraErrors`) and nothing else.
+The others have one fault besides, of a random severity (`FAULTS`). The outcome is that of `benchmarks/stress.py`, by
+truth: good, mild or wrong, whatever was done. The halves "set" and "validate" share no seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import multiprocessing
+import os
+import pickle
+import shutil
+import warnings
+import zlib
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+from unittest import mock
+
+import numpy as np
+from scipy.stats import binomtest
+from stress import Outcome, trajectory_errors
+from stress import judge as outcome_of
+from verdict_faults import FAULTS, HEALTHY, OF_DEPTH, WITHOUT_DEPTH, CameraErrors, Given, Walk, rendered
+
+import vggtgeo as vg
+from vggtgeo.benchmark.inputs import DegradedWalk
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.evaluation.alignment import umeyama
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.process_settings import program_settings
+from vggtgeo.results import reconstruction
+from vggtgeo.simulation import WORLDS
+from vggtgeo.simulation.degradations import Recording, without_depth
+from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.run import frame_trajectory
+from vggtgeo.slam.state import Slam
+
+HALVES: dict[str, int] = {"set": 1000, "validate": 5000}
+"""First seed of each half; both have fewer than 1000 walks."""
+WALKS = 42
+"""Of a half: seven in each of the six worlds. Runs of one walk show the same, with other errors and faults."""
+BASE = 0.01
+"""Metres: the ATE that excuses nothing (`stress.excused`)."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run of the bank, which all follows from `half` and `number`."""
+
+    half: Literal["set", "validate"]
+    number: int
+    degradation: str
+    severity: float
+    rgb_only: bool
+    walk: Walk
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return f"{self.half}-{self.number:03d}-{self.degradation}{'-rgb' if self.rgb_only else ''}"
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """All that is drawn for this run alone."""
+        return np.random.default_rng([HALVES[self.half], self.number, 43])
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `case.json`."""
+        walk = asdict(self.walk)
+        kept = {key: walk.pop(key) for key in ("world", "seed", "frames", "size")}
+        own = {key: value for key, value in asdict(self).items() if key != "walk"}
+        return {**own, **kept, "walk": walk, "camera_errors": asdict(CameraErrors.drawn(self.rng))}
+
+
+def main() -> None:
+    """Make the bank, or judge it."""
+    options = _options()
+    if options.command == "make":
+        make(options)
+    else:
+        text = table(judged(options))
+        print(text)
+        if options.page:
+            options.page.write_text(text + "\n")
+
+
+# ---------------------------------------------------------------------------------------------------------- the cases
+def cases(count: int) -> list[Case]:
+    """So many runs, halves by turns, so that any first part holds a bit of everything."""
+    halves = [_cases_of(half) for half in HALVES]
+    return [next(halves[number % 2]) for number in range(count)]
+
+
+def _cases_of(half: str) -> Iterator[Case]:
+    worlds = list(WORLDS)
+    walks = [Walk.drawn(worlds[k % len(worlds)], HALVES[half] + k) for k in range(WALKS)]
+    rng = np.random.default_rng([HALVES[half], 47])
+    faults = np.random.default_rng(47).permutation([name for name in FAULTS if name != HEALTHY])
+    # The halves begin at opposite ends of the list, so that the first runs of both together have all faults.
+    offset = list(HALVES).index(half) * len(faults) // 2
+    number = 0
+    while True:
+        for place in rng.permutation(WALKS):
+            severity, images_alone = float(rng.uniform()), bool(rng.random() < 0.5)
+            degradation = HEALTHY
+            if number % 2:
+                degradation = str(faults[(number // 2 + offset) % len(faults)])
+            rgb_only = degradation in WITHOUT_DEPTH or (degradation not in OF_DEPTH and images_alone)
+            yield Case(half, number, degradation, severity, rgb_only, walks[place])
+            number += 1
+
+
+def record(case: Case, render: Callable[[Walk], Recording]) -> Recording:
+    """What the run of a case reads, with its truth."""
+    rng = case.rng
+    errors = CameraErrors.drawn(rng)
+    perfect = render(case.walk)
+    if case.degradation in WITHOUT_DEPTH:
+        moved = errors.of_motion(FAULTS[case.degradation](Given(perfect, case.walk, case.severity, rng, render)))
+    else:
+        seen = lambda walk: errors.of_motion(render(walk))
+        moved = FAULTS[case.degradation](Given(seen(case.walk), case.walk, case.severity, rng, seen))
+    recording = errors.of_sensors(moved, rng)
+    return without_depth(recording, rng) if case.rgb_only else recording
+
+
+@dataclass(frozen=True)
+class RenderedWalks:
+    """Walks that are rendered once and kept in a folder."""
+
+    folder: Path
+
+    def __call__(self, walk: Walk) -> Recording:
+        values = json.dumps(asdict(walk), sort_keys=True)
+        path = self.folder / f"{walk.world}-{walk.seed}-{zlib.crc32(values.encode()):08x}.pkl"
+        if path.is_file():
+            return pickle.loads(path.read_bytes())
+        recording = rendered(walk)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}")
+        part.write_bytes(pickle.dumps(recording))
+        part.replace(path)
+        return recording
+
+
+# ------------------------------------------------------------------------------------------------------------ the runs
+def make(options: argparse.Namespace) -> None:
+    """Run what is not there."""
+    todo = [case for case in cases(options.count) if not (options.out / case.name / "outcome.json").is_file()]
+    print(f"{options.count - len(todo)} of {options.count} runs are there", flush=True)
+    if options.jobs == 1:
+        _run_all(todo, options.out)
+        return
+    # JAX's threads do not survive a fork.
+    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
+        parts = [pool.submit(_run_all, todo[job :: options.jobs], options.out) for job in range(options.jobs)]
+        for part in parts:
+            part.result()
+
+
+def _run_all(todo: list[Case], out: Path) -> None:
+    walks = RenderedWalks(out.with_name(out.name + "-walks"))
+    for case in todo:
+        print(run(case, walks, out), flush=True)
+
+
+def run(case: Case, render: Callable[[Walk], Recording], out: Path) -> str:
+    """Run a case, and keep what its verdict is computed from; its folder appears when all is in it. Returns a line."""
+    recording = record(case, render)
+    part = out / f".{case.name}.{os.getpid()}"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    sequence = SequenceView(DegradedWalk(case.name, recording), recording.camera, not case.rgb_only)
+    judged_by: list[tuple[Any, ...]] = []
+    judge = reconstruction.judged_or_told
+
+    def noting(*arguments: Any) -> vg.Verdict:
+        judged_by.append(arguments)
+        return judge(*arguments)
+
+    facts: dict[str, Any] = {}
+    with warnings.catch_warnings(), mock.patch.object(reconstruction, "judged_or_told", noting):
+        warnings.simplefilter("ignore")
+        try:
+            result = vg.reconstruct(sequence, dense="none")
+            slam, evidence, of_input = judged_by[0]
+            for name, value in (("slam", slam), ("evidence", list(evidence)), ("input", of_input)):
+                (part / f"{name}.pkl").write_bytes(pickle.dumps(value))
+            facts = _facts(result, slam, recording)
+        except InputError as error:
+            facts = {"outcome": "error", "reasons": [str(error)]}
+    errors = facts.pop("errors", np.full(len(recording.frames), np.nan))
+    truth = recording.truth
+    np.savez(
+        part / "truth.npz",
+        poses=truth.poses,
+        frames=np.array([frame.index for frame in recording.frames]),
+        timestamps=truth.timestamps,
+        errors=errors,
+        intrinsics=render(case.walk).camera.intrinsics,
+    )
+    given = {"healthy": case.degradation == HEALTHY, "given_frames": len(recording.frames)}
+    (part / "case.json").write_text(json.dumps({**case.as_dict(), **given, **facts}, indent=1))
+    (part / "outcome.json").write_text(json.dumps(facts, indent=1))
+    shutil.rmtree(out / case.name, ignore_errors=True)
+    part.replace(out / case.name)
+    ate = facts.get("ate", float("nan"))
+    return f"{case.name}: {facts['outcome']}, {100 * ate:.1f} cm, {facts.get('level')}: {facts.get('reasons')}"
+
+
+def _facts(result: vg.Result, slam: Slam, recording: Recording) -> dict[str, Any]:
+    estimate = frame_trajectory(slam) if slam.keyframes else Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    outcome = Outcome(
+        "bank",
+        "run",
+        0,
+        level="good",  # so that the outcome is that by truth, whatever the verdict says
+        scale=result.summary["scale"],
+        given=len(recording.frames),
+        written=result.summary["frames"],
+        tracked=len(estimate),
+        **trajectory_errors(estimate, recording.truth),
+    )
+    word = outcome_of(outcome, BASE)
+    return {
+        "outcome": "wrong" if word == "SILENT" else word,
+        "ate": outcome.ate,
+        "ate_se3": outcome.ate_se3,
+        "ate_sim3": outcome.ate_sim3,
+        "turn": outcome.turn,
+        "scale": outcome.scale,
+        "written": outcome.written,
+        "tracked": outcome.tracked,
+        "level": result.verdict.level,
+        "reasons": list(result.verdict.reasons),
+        "path": float(np.linalg.norm(np.diff(recording.truth.poses[:, :3, 3], axis=0), axis=1).sum()),
+        "errors": _frame_errors(slam, estimate, recording, outcome.scale.startswith("free")),
+    }
+
+
+def _frame_errors(slam: Slam, estimate: Trajectory, recording: Recording, with_scale: bool) -> np.ndarray:
+    """Position error of each frame after the alignment of all, metres; NaN without a pose."""
+    rows = {round(frame.timestamp, 6): row for row, frame in enumerate(recording.frames)}
+    own = np.array([rows[round(float(time), 6)] for time in estimate.timestamps], int)
+    errors = np.full(len(recording.frames), np.nan)
+    if len(own) > 2:
+        there, true = estimate.poses[:, :3, 3], recording.truth.poses[own, :3, 3]
+        found = umeyama(there, true, with_scale)
+        moved = found.scale * there @ found.rotation.T + found.translation
+        errors[own] = np.linalg.norm(moved - true, axis=1)
+    return errors
+
+
+# --------------------------------------------------------------------------------------------------------- the verdicts
+@dataclass(frozen=True)
+class Judged:
+    """A run and its verdict. outcome: by truth."""
+
+    half: str
+    degradation: str
+    rgb_only: bool
+    outcome: str
+    level: str
+    reasons: tuple[str, ...]
+    name: str
+
+
+def judged(options: argparse.Namespace) -> list[Judged]:
+    """Every run that is there, with the verdict computed again, or, with `--saved`, as the run gave it."""
+    module = importlib.import_module(options.judge)
+    judge = in_double_precision(module.judge)
+    found = []
+    for folder in sorted(path.parent for path in options.out.glob("[!.]*/outcome.json")):
+        case, outcome = (json.loads((folder / name).read_text()) for name in ("case.json", "outcome.json"))
+        if outcome["outcome"] == "error" or (options.half and case["half"] != options.half):
+            continue
+        # A run that never had a map is wrong, but cannot be taken for a right one: it counts for no recall.
+        word = outcome["outcome"] if np.isfinite(outcome["ate"]) else NO_MAP
+        level, reasons = outcome["level"], outcome["reasons"]
+        if not options.saved:
+            slam, evidence, of_input = (
+                pickle.loads((folder / f"{name}.pkl").read_bytes()) for name in ("slam", "evidence", "input")
+            )
+            with warnings.catch_warnings(), program_settings():
+                warnings.simplefilter("ignore")
+                verdict = judge(slam, evidence, of_input)
+            level, reasons = verdict.level, verdict.reasons
+        one = Judged(
+            *(case["half"], case["degradation"], case["rgb_only"], word, level, tuple(reasons)),
+            folder.name,
+        )
+        found.append(one)
+        if options.verbose and (one.level == "good") == (one.outcome in ("wrong", NO_MAP)):
+            print(f"{one.name}: {one.outcome}, {one.level}: {'; '.join(one.reasons)[:300]}", flush=True)
+    return found
+
+
+def table(runs: list[Judged]) -> str:
+    """Recall of wrong results, alarms on right ones, and how many mild ones are reported, with intervals."""
+    lines = [
+        "| half | degradation | runs | wrong, reported | right, doubted | mild, reported | without a map, reported |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for half in HALVES:
+        own = [one for one in runs if one.half == half]
+        groups: dict[str, list[Judged]] = {
+            "all": own,
+            "with depth": [one for one in own if not one.rgb_only],
+            "without depth": [one for one in own if one.rgb_only],
+        }
+        by_degradation = defaultdict(list)
+        for one in own:
+            by_degradation[one.degradation].append(one)
+        for name, group in {
+            **groups,
+            **{name: by_degradation[name] for name in FAULTS if name in by_degradation},
+        }.items():
+            cells = (share([one.level != "good" for one in group if one.outcome == word]) for word in OUTCOMES)
+            lines.append(f"| {half} | {name} | {len(group)} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+NO_MAP = "no map"
+OUTCOMES = ("wrong", "good", "mild", NO_MAP)
+
+
+def share(hits: list[bool]) -> str:
+    """Hits of all, with the Wilson interval of 95 %."""
+    if not hits:
+        return "-"
+    interval = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
+    mean = 100 * sum(hits) / len(hits)
+    return f"{sum(hits)} of {len(hits)}: {mean:.1f} % ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    making, judging = commands.add_parser("make", help="run SLAM"), commands.add_parser("judge", help="print the table")
+    for command in (making, judging):
+        command.add_argument("--out", type=Path, default=Path("runs/verdict-bank"))
+    making.add_argument("--count", type=int, default=420, help="runs in both halves together")
+    making.add_argument("--jobs", type=int, default=1, help="processes; each runs many cases")
+    judging.add_argument("--saved", action="store_true", help="take the verdicts that the runs gave")
+    judging.add_argument("--judge", default="vggtgeo.slam.trust.judge", help="module with the function `judge`")
+    judging.add_argument("--half", choices=HALVES, help="this half alone")
+    judging.add_argument("--verbose", action="store_true", help="print each run whose verdict is not right")
+    judging.add_argument("--page", type=Path, help="file that gets the table, too")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

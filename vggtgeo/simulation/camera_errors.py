@@ -1,0 +1,141 @@
+"""Errors that the cameras of real recordings have, done to simulated ones whose depth and poses are exact.
+
+A pixel moves with the motion field of the frame (Longuet-Higgins and Prazdny, 1980). With the camera's velocity `v` and
+angular velocity `w` a point `p` of the camera's frame moves by `p' = w x p + v`, and its pixel by the derivative of the
+projection. Over an exposure this is nearly constant, so blur and rolling shutter cost a few resamplings, no rendering.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.simulation.degradations import Recording, with_images
+from vggtgeo.simulation.rolling_rows import camera_velocities
+
+INSTANTS = 5
+"""Of an exposure: an image is the mean of what is seen at so many."""
+ROUNDS = 2
+"""Until a pixel and its motion belong together: the field is read where the pixel came from."""
+
+
+def motion_field(
+    depth: np.ndarray, velocity: np.ndarray, intrinsics: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How pixels and their depth change with time.
+
+    depth: float [H, W], metres; pixels without depth take the median. velocity: float64 [6], of world -> camera,
+    translation first, metres and radians a second (`camera_velocities`). intrinsics: fx, fy, cx, cy, pixels.
+    Returns the motion of the pixels, float32 [H, W, 2], pixels a second, and that of their depth, float32 [H, W],
+    metres a second.
+    """
+    fx, fy, cx, cy = intrinsics
+    known = np.isfinite(depth) & (depth > 0)
+    usual = float(np.median(depth[known])) if known.any() else 1.0
+    z = np.where(known, depth, usual)
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]].astype(np.float64)
+    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], -1)
+    moved = np.cross(velocity[3:], points) + velocity[:3]
+    x, y = points[..., 0] / z, points[..., 1] / z
+    field = np.stack([fx * (moved[..., 0] - x * moved[..., 2]) / z, fy * (moved[..., 1] - y * moved[..., 2]) / z], -1)
+    return field.astype(np.float32), moved[..., 2].astype(np.float32)
+
+
+def exposed(recording: Recording, readout: float = 0.0, exposure: float = 0.0) -> Recording:
+    """Images whose rows are read one after another, and whose shutter is open for a while.
+
+    readout: seconds from the first row to the last; timestamps name the middle one. exposure: seconds the shutter is
+    open. Depth stays that of the frame's instant: depth cameras have a shutter of their own.
+    Raises InputError where frames have no depth: the motion of the pixels is computed from it.
+    """
+    instants = exposure * ((np.arange(INSTANTS) + 0.5) / INSTANTS - 0.5) if exposure else np.zeros(1)
+
+    def seen(frame: Frame, velocity: np.ndarray) -> np.ndarray:
+        field, _ = motion_field(_depth(frame), velocity, recording.camera.intrinsics)
+        rows = readout * ((np.arange(len(field))[:, None] + 0.5) / len(field) - 0.5)
+        images = [
+            cv2.remap(frame.image, *_source(field, rows + late), cv2.INTER_LINEAR, **_BORDER) for late in instants
+        ]
+        return np.rint(np.mean(images, axis=0)).astype(np.uint8)
+
+    return _each(recording, lambda frame, velocity: replace(frame, image=seen(frame, velocity)))
+
+
+def late_depth(recording: Recording, seconds: float) -> Recording:
+    """Depth that was taken so many seconds before its image; negative: after.
+
+    Raises InputError where frames have no depth.
+    """
+
+    def before(frame: Frame, velocity: np.ndarray) -> np.ndarray:
+        depth = _depth(frame)
+        field, nearing = motion_field(depth, velocity, recording.camera.intrinsics)
+        at = _source(field, np.full((len(field), 1), -seconds))
+        there = cv2.remap(depth - seconds * nearing, *at, cv2.INTER_NEAREST, **_BORDER)
+        return np.asarray(there, np.float32)
+
+    return _each(recording, lambda frame, velocity: replace(frame, depth=before(frame, velocity)))
+
+
+def late_truth(recording: Recording, seconds: float) -> Recording:
+    """Truth whose clock is so many seconds ahead: a pose carries the time of a later moment."""
+    truth = recording.truth
+    return replace(recording, truth=Trajectory(truth.timestamps + seconds, truth.poses))
+
+
+def vignetted(recording: Recording, share: float) -> Recording:
+    """Corners that are darker by `share`, growing with the square of the distance from the middle."""
+    height, width = recording.frames[0].image.shape[:2]
+    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    factor = (1 - share * (x**2 + y**2) / 2)[..., None]
+    return with_images(recording, lambda image, row: _as_bytes(image * factor))
+
+
+def auto_exposed(recording: Recording, strength: float, frames: float) -> Recording:
+    """Images of a camera that adapts its exposure to what it sees.
+
+    strength: share of the difference to the mean brightness of the recording that is taken away, 0 to 1.
+    frames: frames that the control lags behind.
+    """
+    means = np.array([frame.image.mean() for frame in recording.frames])
+    wanted = (means.mean() / np.maximum(means, 1.0)) ** strength
+    gains, gain = np.empty_like(wanted), wanted[0]
+    for row, value in enumerate(wanted):
+        gain += (value - gain) / max(frames, 1.0)
+        gains[row] = gain
+    return with_images(recording, lambda image, row: _as_bytes(image * gains[row]))
+
+
+_BORDER = {"borderMode": cv2.BORDER_REPLICATE}
+
+
+def _as_bytes(image: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _depth(frame: Frame) -> np.ndarray:
+    if frame.depth is None:
+        raise InputError(f"frame {frame.index} has no depth; the motion of its pixels follows from it: give depth")
+    return frame.depth
+
+
+def _each(recording: Recording, change: Callable[[Frame, np.ndarray], Frame]) -> Recording:
+    frames = recording.frames
+    velocities = camera_velocities(np.array([frame.timestamp for frame in frames]), recording.truth)
+    return replace(recording, frames=[change(frame, own) for frame, own in zip(frames, velocities, strict=True)])
+
+
+def _source(field: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where in the frame is what each pixel shows so many seconds later, float [H, 1]: p + seconds field(p) = pixel."""
+    rows, columns = np.mgrid[: field.shape[0], : field.shape[1]].astype(np.float32)
+    late, at = seconds.astype(np.float32), field
+    for _ in range(ROUNDS):
+        x, y = columns - late * at[..., 0], rows - late * at[..., 1]
+        at = cv2.remap(field, x, y, cv2.INTER_LINEAR, **_BORDER)
+    return columns - late * at[..., 0], rows - late * at[..., 1]
