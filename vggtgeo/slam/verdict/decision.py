@@ -1,0 +1,178 @@
+"""What is reported: an explanation that is significant and matters.
+
+An explanation of a window (`alternatives.py`) is reported where
+
+- it explains the corners better than the run's claim does, beyond chance: the decrease of minus twice the log
+  likelihood, divided by the number of observations that count as one, exceeds the chi-square quantile of `LEVEL`; and
+- it has a consequence: places differ from those of the run by more than `PLACES` (without depth `SHARE` of the path's
+  extent) beyond the explanation's own noise, or turns from frame to frame by more than `TURN`.
+
+The cause is named by what was added first: a second motion, a calibration, or poses alone. Reasons are exclusive: one a
+cause, at most `MAX_REASONS`, the largest consequence first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.trust.finding import Finding
+from vggtgeo.slam.verdict.alternatives import LEVEL, Consequence, Explanation, consequence
+
+PLACES = 0.035
+"""Metres, RMS over a window."""
+SHARE = 0.02
+"""Of the path's extent where lengths have no unit."""
+TURN = np.deg2rad(0.45)
+"""Radians from frame to frame of a window, RMS."""
+RIVAL = 0.2
+"""Share of the explained corners that follow a second motion, beyond which it is not sure which one is the camera's."""
+DEPTH_NOISE = 0.06
+"""Relative noise of depth beyond which it says nothing of the scene: sensors reach 4 % at the end of their range."""
+MAX_REASONS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Contradiction:
+    """An explanation with its consequence. cause: its name in `SENTENCES`. places: metres, or share of the extent."""
+
+    explanation: Explanation
+    consequence: Consequence
+    cause: str
+    size: float
+
+
+def extent(poses: np.ndarray) -> float:
+    """RMS distance of the places from their mean, of poses world -> camera."""
+    places = rigid.invert(poses)[:, :3, 3]
+    return float(np.sqrt(np.mean(np.sum((places - places.mean(0)) ** 2, 1))))
+
+
+def contradiction(explanation: Explanation, metric: bool) -> Contradiction | None:
+    """What the explanation of a window contradicts; None where it does not matter."""
+    tracks, best = explanation.tracks, explanation.best
+    found = consequence(tracks, best, not metric, explanation.as_one)
+    gain = (explanation.claim.energy - explanation.free.energy) / explanation.as_one
+    significant = bool(explanation.added) or gain > float(chi2.isf(LEVEL, 6 * (len(tracks.rows) - 1)))
+    limit = PLACES if metric else SHARE * extent(tracks.poses)
+    size = max(found.sure / max(limit, 1e-12), found.turn / TURN)
+    if explanation.rival > RIVAL * (explanation.rival + explanation.share):
+        return Contradiction(explanation, found, "second motion", max(size, 1.0))
+    if not significant or size < 1.0:
+        return None
+    if metric and explanation.noise.depth > DEPTH_NOISE:
+        return Contradiction(explanation, found, "depth", size)
+    if explanation.added:
+        return Contradiction(explanation, found, explanation.added[0].name, size)
+    return Contradiction(explanation, found, "poses", size)
+
+
+def findings(estimate: Estimate, explanations: Sequence[Explanation]) -> list[Finding]:
+    """One finding a cause, the largest consequence first."""
+    found = [one for explanation in explanations if (one := contradiction(explanation, estimate.metric))]
+    causes = {one.cause: [other for other in found if other.cause == one.cause] for one in found}
+    ordered = sorted(causes.values(), key=lambda ones: -sum(one.size for one in ones))
+    return [_finding(estimate, ones) for ones in ordered[:MAX_REASONS]]
+
+
+def _finding(estimate: Estimate, ones: list[Contradiction]) -> Finding:
+    rows = np.concatenate([one.explanation.tracks.rows for one in ones])
+    start, end = int(estimate.frames[rows.min()]), int(estimate.frames[rows.max()])
+    worst = max(ones, key=lambda one: one.size)
+    what, advice, scale = SENTENCES[worst.cause]
+    text = f"frames {start} to {end}: {what(ones)}; {_consequence(estimate, worst)}; {advice}"
+    return Finding(worst.cause, "degraded", text, start, end, scale=scale and estimate.metric)
+
+
+def _consequence(estimate: Estimate, worst: Contradiction) -> str:
+    found = worst.consequence
+    turned = f", turns from frame to frame by {np.degrees(found.turn):.1f} degrees"
+    if estimate.metric:
+        return f"poses that allow for it differ by {100 * found.places:.0f} +- {100 * found.noise:.0f} cm{turned}"
+    share = 100 * found.places / max(extent(worst.explanation.tracks.poses), 1e-12)
+    return f"poses that allow for it differ by {share:.0f} % of the path's extent{turned}"
+
+
+def _pooled(ones: list[Contradiction]) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate and standard deviation of the first alternative, by inverse variance over windows."""
+    added = [one.explanation.added[0] for one in ones]
+    weights = [np.linalg.pinv(what.covariance, hermitian=True) for what in added]
+    covariance = np.linalg.pinv(sum(weights), hermitian=True)
+    value = covariance @ sum(weight @ what.estimate for weight, what in zip(weights, added, strict=True))
+    return value, np.sqrt(np.diag(covariance))
+
+
+def _focal(ones: list[Contradiction]) -> str:
+    (value,), (sigma,) = _pooled(ones)
+    focal = ones[0].explanation.tracks.intrinsics[0]
+    return f"the images fit a focal length of {focal * np.exp(value):.0f} +- {focal * sigma:.0f} px; the run has {focal:.0f}"
+
+
+def _zoom(ones: list[Contradiction]) -> str:
+    change = max(float(np.ptp(one.explanation.added[0].estimate)) for one in ones)
+    sigma = max(float(np.sqrt(np.diag(one.explanation.added[0].covariance)).mean()) for one in ones)
+    return f"the focal length changes by {100 * change:.0f} +- {100 * sigma:.0f} % while filming; the run has one"
+
+
+def _centre(ones: list[Contradiction]) -> str:
+    value, sigma = _pooled(ones)
+    focal = ones[0].explanation.tracks.intrinsics[:2]
+    off, by = focal * value, focal * sigma
+    return f"the principal point is off by ({off[0]:.0f} +- {by[0]:.0f}, {off[1]:.0f} +- {by[1]:.0f}) px"
+
+
+def _radial(ones: list[Contradiction]) -> str:
+    (value,), (sigma,) = _pooled(ones)
+    return f"the images have a radial distortion of k1 = {value:.2f} +- {sigma:.2f} that the camera lacks"
+
+
+def _shutter(ones: list[Contradiction]) -> str:
+    (value,), (sigma,) = _pooled(ones)
+    return f"the image is read out row by row in {1000 * abs(value):.0f} +- {1000 * sigma:.0f} ms (rolling shutter)"
+
+
+def _factor(ones: list[Contradiction]) -> str:
+    change = max(float(np.ptp([0.0, *one.explanation.added[0].estimate])) for one in ones)
+    sigma = max(float(np.sqrt(np.diag(one.explanation.added[0].covariance)).mean()) for one in ones)
+    return f"the factor of the depth changes by {100 * change:.0f} +- {100 * sigma:.0f} %"
+
+
+def _offset(ones: list[Contradiction]) -> str:
+    (value,), (sigma,) = _pooled(ones)
+    return f"the measured depth is off by {100 * value:.0f} +- {100 * sigma:.0f} cm everywhere"
+
+
+def _depth(ones: list[Contradiction]) -> str:
+    noise = max(one.explanation.noise.depth for one in ones)
+    return f"the depth contradicts the motion in the images (it scatters by {100 * noise:.0f} %)"
+
+
+def _second(ones: list[Contradiction]) -> str:
+    worst = max(ones, key=lambda one: one.explanation.rival)
+    share = worst.explanation.rival / (worst.explanation.rival + worst.explanation.share)
+    return f"{100 * share:.0f} % of the corners follow a second motion: an overlay, or something large that moves"
+
+
+def _poses(ones: list[Contradiction]) -> str:
+    del ones
+    return "the followed corners contradict the poses"
+
+
+CALIBRATE = "calibrate the camera, or leave it to the run (`--intrinsics` off)"
+SENTENCES: dict[str, tuple[Callable[[list[Contradiction]], str], str, bool]] = {
+    "poses": (_poses, "do not use these frames, or film them again, slower", False),
+    "second motion": (_second, "mask it, or film without it", False),
+    "focal length": (_focal, CALIBRATE, True),
+    "zoom": (_zoom, "film with a fixed lens and focus", True),
+    "principal point": (_centre, CALIBRATE, False),
+    "distortion": (_radial, CALIBRATE, False),
+    "rolling shutter": (_shutter, "move slower, or use a shorter readout", False),
+    "depth factor": (_factor, "check the depth camera, or leave its depth out (`--rgb-only`)", True),
+    "depth offset": (_offset, "check the depth camera, or leave its depth out (`--rgb-only`)", True),
+    "depth": (_depth, "check that depth and images belong together, or leave it out (`--rgb-only`)", True),
+}
