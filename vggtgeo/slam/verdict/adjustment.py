@@ -24,8 +24,10 @@ KERNEL = 2.0
 """Width of Cauchy's kernel, in standard deviations of the noise."""
 TETHER = 1e-4
 """Information on each unknown of a pose: holds the scale of a map without depth, and a frame without corners."""
-ITERATIONS, CONVERGED = 12, 1e-4
+ITERATIONS, CONVERGED = 12, 5e-4
 """At most; and the relative decrease of the energy below which the iteration ends."""
+FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e3
+"""Of Levenberg and Marquardt, as a share of the diagonal."""
 KNOTS = 4
 """Of a quantity that changes with time: linear between so many moments, evenly spread over the window."""
 FOCAL = slice(0, KNOTS)
@@ -263,30 +265,40 @@ def solve(
     """Minimise over points, poses where `poses_free`, and the calibration's `columns` (float64 [SIZE, k])."""
     columns = np.zeros((SIZE, 0)) if columns is None else columns
     some = columns.shape[1] > 0
-    unknowns, damping = start, 1e-4
+    unknowns, damping = start, FIRST_DAMPING
     linear = linearise(tracks, unknowns, noise, some)
-    frames = len(tracks.poses)
+    width = 6 * len(tracks.poses) * poses_free
+    free = slice(6 * poses_free, None)  # the first pose fixes the gauge
     for _ in range(iterations):
         reduced = reduce(tracks, linear, columns, poses_free, damping)
         step = np.zeros(len(reduced.side))
-        free = slice(6 if poses_free else 0, None)  # the first pose fixes the gauge
         if len(step[free]):
             step[free] = np.linalg.solve(reduced.matrix[free, free], reduced.side[free])
+        poses = rigid.moved(unknowns.poses, step[:width].reshape(-1, 6)) if poses_free else unknowns.poses
         points = unknowns.points + np.clip(reduced.points(step), -1.0, 1.0)
-        poses = rigid.moved(unknowns.poses, step[: 6 * frames].reshape(-1, 6)) if poses_free else unknowns.poses
-        theta = unknowns.theta + columns @ step[6 * frames * poses_free :]
-        tried = Unknowns(poses, points, theta)
+        tried = Unknowns(poses, points, unknowns.theta + columns @ step[width:])
+        if len(step):
+            tried = _with_own_points(tracks, tried, noise)
         there = linearise(tracks, tried, noise, some)
         if not there.energy < linear.energy:
             damping *= 10.0
-            if damping > 1e4:
+            if damping > LAST_DAMPING:
                 break
             continue
         ended = linear.energy - there.energy < CONVERGED * linear.energy
-        unknowns, linear, damping = tried, there, max(damping / 10.0, 1e-8)
+        unknowns, linear, damping = tried, there, max(damping / 10.0, 1e-10)
         if ended:
             break
     return Fit(unknowns, linear, columns, poses_free)
+
+
+def _with_own_points(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Unknowns:
+    """After a step of the points alone: points follow a long step of poses and focal length on a curve, and without
+    this the iteration creeps along it (embedded point iterations, Jeong et al. 2012).
+    """
+    linear = linearise(tracks, unknowns, noise, theta_too=False)
+    reduced = reduce(tracks, linear, np.zeros((SIZE, 0)), False, FIRST_DAMPING)
+    return replace(unknowns, points=unknowns.points + np.clip(reduced.points(np.zeros(0)), -1.0, 1.0))
 
 
 def start_of(tracks: Tracks) -> Unknowns:
@@ -308,8 +320,3 @@ def start_of(tracks: Tracks) -> Unknowns:
     inverse = np.where(np.isfinite(measured), measured, np.where(known, value, middle))
     inverse = np.clip(inverse, 0.02 * middle, 20.0 * middle)
     return Unknowns(tracks.poses, np.column_stack([own[:, :2], np.log(inverse)]), np.zeros(SIZE))
-
-
-def with_theta(unknowns: Unknowns, theta: np.ndarray) -> Unknowns:
-    """The same with another calibration."""
-    return replace(unknowns, theta=theta)
