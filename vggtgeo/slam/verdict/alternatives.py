@@ -36,12 +36,16 @@ from vggtgeo.slam.verdict.noise import Scores, estimated, scores
 
 LEVEL = 1e-6
 """Significance of an alternative. Seven are tried in each window."""
+SIGMAS = 3.0
+"""Standard deviations of a consequence below which it may be chance."""
 MAX_ADDED = 3
 """Alternatives in one explanation."""
 MAX_TRIED = 3
 """Alternatives that are solved in each round: those of the largest predicted gain."""
-MIN_SHARE = 0.1
+MIN_SHARE = 0.15
 """Of the observations that must contradict the first motion before a second one is looked for."""
+WIDE = 20.0
+"""Times the noise in the first steps towards a second motion, which begin far from it."""
 START = Noise(0.6, 0.03)
 """Pixels of an image of 320, relative: until residuals say more."""
 
@@ -87,14 +91,13 @@ class Added:
 class Explanation:
     """What the corners of a window prefer.
 
-    tracks, noise: that the rest refers to, without the corners of the second motion. claim: fit with the poses of the
-    run. free: with free poses. best: with all that was added. added: in the order in which they were. share, rival: of
+    tracks, noise: that the rest refers to, without the corners of the second motion. free: fit with free
+    poses. best: with all that was added. added: in the order in which they were. share, rival: of
     the observations, explained by the first motion and by the second. second: that motion, None where there is none.
     """
 
     tracks: Tracks
     noise: Noise
-    claim: Fit
     free: Fit
     best: Fit
     added: tuple[Added, ...]
@@ -123,9 +126,8 @@ def explain(tracks: Tracks) -> Explanation:
             noise = estimated(tracks, fit, noise)
             fit = solve(tracks, fit.unknowns, noise)
             chosen = _selected(tracks, noise, fit)
-    claim = solve(tracks, start_of(tracks), noise, poses_free=False)
     share = float(np.mean(fit.linear.weight[:, 0] > 0.5)) * (1.0 - rival)
-    return Explanation(tracks, noise, claim, fit, chosen.fit, chosen.added, chosen.as_one, share, rival, second)
+    return Explanation(tracks, noise, fit, chosen.fit, chosen.added, chosen.as_one, share, rival, second)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +226,8 @@ def second_motion(
     for seen in (own, without) if np.isfinite(own.depth).any() else (without,):
         for poses in (still, tracks.poses):
             points = _in_chart(seen, start_of(replace(seen, poses=poses)), poses)
-            fits.append(solve(seen, Unknowns(poses, points, np.zeros(SIZE)), noise))
+            wide = solve(seen, Unknowns(poses, points, np.zeros(SIZE)), Noise(WIDE * noise.pixel, WIDE * noise.depth))
+            fits.append(solve(seen, wide.unknowns, noise))
     other = max(fits, key=lambda one: float(one.linear.weight[:, 0].sum()))
     explained = ~_outliers(own, other)
     theirs = np.zeros(len(tracks.first), bool)
@@ -248,18 +251,29 @@ def _in_chart(tracks: Tracks, start: Unknowns, poses: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Consequence:
-    """How far a motion is from the claim: RMS of the places after alignment, in the unit of the map; what of that its
-    own noise explains; RMS of the turns from frame to frame, rad; scale of the claim over that of the motion.
+    """How far a motion is from the claim, RMS over frames, with the standard deviations of the same.
+
+    places: after alignment, in the unit of the map. turn: from frame to frame, rad.
     """
 
     places: float
-    noise: float
+    places_sigma: float
     turn: float
+    turn_sigma: float
 
     @property
-    def sure(self) -> float:
-        """Of the places, beyond the noise."""
-        return float(np.sqrt(max(self.places**2 - self.noise**2, 0.0)))
+    def sure_places(self) -> float:
+        """Beyond the noise; zero where that may be all."""
+        return _beyond(self.places, self.places_sigma)
+
+    @property
+    def sure_turn(self) -> float:
+        """Beyond the noise; zero where that may be all."""
+        return _beyond(self.turn, self.turn_sigma)
+
+
+def _beyond(value: float, sigma: float) -> float:
+    return float(np.sqrt(value**2 - sigma**2)) if value > SIGMAS * sigma else 0.0
 
 
 def consequence(tracks: Tracks, fit: Fit, free_scale: bool, as_one: float) -> Consequence:
@@ -268,10 +282,9 @@ def consequence(tracks: Tracks, fit: Fit, free_scale: bool, as_one: float) -> Co
     fitted = umeyama(places, claimed, free_scale)
     off = fitted.scale * places @ fitted.rotation.T + fitted.translation - claimed
     turns = _step_turns(fit.unknowns.poses, tracks.poses)
+    sigmas = np.sqrt(as_one) * np.array(_noise_of_motion(tracks, fit, free_scale))
     return Consequence(
-        float(np.sqrt(np.mean(np.sum(off**2, 1)))),
-        float(np.sqrt(as_one)) * _place_noise(tracks, fit, free_scale),
-        float(np.sqrt(np.mean(turns**2))) if len(turns) else 0.0,
+        float(np.sqrt(np.mean(np.sum(off**2, 1)))), float(sigmas[0]), float(np.sqrt(np.mean(turns**2))), float(sigmas[1])
     )
 
 
@@ -282,25 +295,30 @@ def _step_turns(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.asarray(np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1) / 2, -1, 1)))
 
 
-def _place_noise(tracks: Tracks, fit: Fit, free_scale: bool) -> float:
-    """Standard deviation of the places after alignment, RMS over frames, for independent observations."""
+def _noise_of_motion(tracks: Tracks, fit: Fit, free_scale: bool) -> tuple[float, float]:
+    """Standard deviations of the places after alignment, and of the turns from frame to frame, RMS over frames, for
+    independent observations.
+    """
     frames = len(tracks.rows)
     reduced = reduce(tracks, fit.linear, fit.columns, True, 0.0)
-    keep = np.arange(6, len(reduced.side))
+    inverse = np.linalg.pinv(reduced.matrix[6:, 6:], hermitian=True)
     covariance = np.zeros((6 * frames, 6 * frames))
-    inverse = np.linalg.pinv(reduced.matrix[np.ix_(keep, keep)], hermitian=True)
     covariance[6:, 6:] = inverse[: 6 * frames - 6, : 6 * frames - 6]
-    turns = fit.unknowns.poses[:, :3, :3]
-    blocks = covariance.reshape(frames, 6, frames, 6)[:, :3, :, :3]
-    places = np.einsum("fki,fkgl,glj->figj", turns, blocks, turns, optimize=True).reshape(3 * frames, 3 * frames)
+    blocks = covariance.reshape(frames, 6, frames, 6)
+    back = np.swapaxes(fit.unknowns.poses[:, :3, :3], 1, 2)  # a tangent moves the centre by -R' tau, and turns by R' omega
+    carried = lambda part: np.einsum("fik,fkgl,gjl->figj", back, part, back, optimize=True)
+    places = carried(blocks[:, :3, :, :3]).reshape(3 * frames, 3 * frames)
     centred = rigid.invert(fit.unknowns.poses)[:, :3, 3]
     centred = centred - centred.mean(0)
-    modes = [np.tile(np.eye(3), (frames, 1))]
-    modes.append(np.stack([np.cross(axis, centred) for axis in np.eye(3)], 2).reshape(3 * frames, 3))
+    modes = [np.tile(np.eye(3), (frames, 1)), np.stack([np.cross(a, centred) for a in np.eye(3)], 2).reshape(-1, 3)]
     if free_scale:
         modes.append(centred.reshape(-1, 1))
-    basis = np.hstack(modes)
-    left, values, _ = np.linalg.svd(basis, full_matrices=False)
-    left = left[:, values > 1e-9 * max(values[0], 1e-12)]
-    within = np.trace(places) - np.trace(left.T @ places @ left)
-    return float(np.sqrt(max(within, 0.0) / frames))
+    left, values, _ = np.linalg.svd(np.hstack(modes), full_matrices=False)
+    left = left[:, values > 1e-9 * max(float(values[0]), 1e-12)]
+    moved = max(float(np.trace(places) - np.trace(left.T @ places @ left)), 0.0) / frames
+    turns = carried(blocks[:, 3:, :, 3:])
+    rows = np.arange(frames - 1)
+    own = np.einsum("fifi->f", turns)
+    both = np.einsum("fifi->f", turns[1:, :, :-1])
+    turned = max(float(np.mean(own[rows] + own[rows + 1] - 2 * both)), 0.0)
+    return float(np.sqrt(moved)), float(np.sqrt(turned))

@@ -17,12 +17,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.finding import Finding
-from vggtgeo.slam.verdict.alternatives import LEVEL, Consequence, Explanation, consequence
+from vggtgeo.slam.verdict.alternatives import Consequence, Explanation, consequence
 
 PLACES = 0.035
 """Metres, RMS over a window."""
@@ -57,13 +56,11 @@ def contradiction(explanation: Explanation, metric: bool) -> Contradiction | Non
     """What the explanation of a window contradicts; None where it does not matter."""
     tracks, best = explanation.tracks, explanation.best
     found = consequence(tracks, best, not metric, explanation.as_one)
-    gain = (explanation.claim.energy - explanation.free.energy) / explanation.as_one
-    significant = bool(explanation.added) or gain > float(chi2.isf(LEVEL, 6 * (len(tracks.rows) - 1)))
     limit = PLACES if metric else SHARE * extent(tracks.poses)
-    size = max(found.sure / max(limit, 1e-12), found.turn / TURN)
+    size = max(found.sure_places / max(limit, 1e-12), found.sure_turn / TURN)
     if explanation.rival > RIVAL * (explanation.rival + explanation.share):
         return Contradiction(explanation, found, "second motion", max(size, 1.0))
-    if not significant or size < 1.0:
+    if size < 1.0:
         return None
     if metric and explanation.noise.depth > DEPTH_NOISE:
         return Contradiction(explanation, found, "depth", size)
@@ -93,7 +90,7 @@ def _consequence(estimate: Estimate, worst: Contradiction) -> str:
     found = worst.consequence
     turned = f", turns from frame to frame by {np.degrees(found.turn):.1f} degrees"
     if estimate.metric:
-        return f"poses that allow for it differ by {100 * found.places:.0f} +- {100 * found.noise:.0f} cm{turned}"
+        return f"poses that allow for it differ by {100 * found.places:.0f} +- {100 * found.places_sigma:.0f} cm{turned}"
     share = 100 * found.places / max(extent(worst.explanation.tracks.poses), 1e-12)
     return f"poses that allow for it differ by {share:.0f} % of the path's extent{turned}"
 
