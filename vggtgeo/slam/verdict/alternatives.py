@@ -127,16 +127,17 @@ def explain(tracks: Tracks) -> Explanation:
             fit = solve(tracks, fit.unknowns, noise)
             chosen = _selected(tracks, noise, fit)
     share = float(np.mean(fit.linear.weight[:, 0] > 0.5)) * (1.0 - rival)
-    return Explanation(tracks, noise, fit, chosen.fit, chosen.added, chosen.as_one, share, rival, second)
+    return Explanation(tracks, chosen.noise, fit, chosen.fit, chosen.added, chosen.as_one, share, rival, second)
 
 
 @dataclass(frozen=True, eq=False)
 class _Selected:
-    """The fit with all that is significant, what that is, and how many observations count as one."""
+    """The fit with all that is significant, what that is, how many observations count as one, and the noise."""
 
     fit: Fit
     added: tuple[Added, ...]
     as_one: float
+    noise: Noise
 
 
 def _selected(tracks: Tracks, noise: Noise, fit: Fit) -> _Selected:
@@ -156,7 +157,7 @@ def _selected(tracks: Tracks, noise: Noise, fit: Fit) -> _Selected:
                 beyond = gain / around.as_one - float(chi2.isf(LEVEL, len(estimate)))
                 found.append((beyond, one, union, tried, Added(one.name, estimate, covariance, gain, as_one)))
         if not found:
-            return _Selected(fit, tuple(added), around.as_one)
+            return _Selected(fit, tuple(added), around.as_one, noise)
         _, one, columns, fit, what = max(found, key=lambda each: each[0])
         left.remove(one)
         added.append(what)

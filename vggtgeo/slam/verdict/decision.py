@@ -23,15 +23,15 @@ from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.verdict.alternatives import Consequence, Explanation, consequence
 
-PLACES = 0.035
+PLACES = 0.04
 """Metres, RMS over a window."""
-SHARE = 0.02
+SHARE = 0.03
 """Of the path's extent where lengths have no unit."""
 TURN = np.deg2rad(0.45)
 """Radians from frame to frame of a window, RMS."""
 RIVAL = 0.2
 """Share of the explained corners that follow a second motion, beyond which it is not sure which one is the camera's."""
-DEPTH_NOISE = 0.06
+DEPTH_NOISE = 0.08
 """Relative noise of depth beyond which it says nothing of the scene: sensors reach 4 % at the end of their range."""
 MAX_REASONS = 3
 
@@ -54,19 +54,21 @@ def extent(poses: np.ndarray) -> float:
 
 def contradiction(explanation: Explanation, metric: bool) -> Contradiction | None:
     """What the explanation of a window contradicts; None where it does not matter."""
-    tracks, best = explanation.tracks, explanation.best
-    found = consequence(tracks, best, not metric, explanation.as_one)
+    tracks = explanation.tracks
+    with_depth = bool(np.isfinite(tracks.depth).any())
+    found = consequence(tracks, explanation.best, not with_depth, explanation.as_one)
     limit = PLACES if metric else SHARE * extent(tracks.poses)
     size = max(found.sure_places / max(limit, 1e-12), found.sure_turn / TURN)
     if explanation.rival > RIVAL * (explanation.rival + explanation.share):
         return Contradiction(explanation, found, "second motion", max(size, 1.0))
-    if size < 1.0:
-        return None
-    if metric and explanation.noise.depth > DEPTH_NOISE:
-        return Contradiction(explanation, found, "depth", size)
-    if explanation.added:
-        return Contradiction(explanation, found, explanation.added[0].name, size)
-    return Contradiction(explanation, found, "poses", size)
+    if with_depth and explanation.noise.depth > DEPTH_NOISE:
+        return Contradiction(explanation, found, "depth", max(size, 1.0))
+    if size >= 1.0:
+        cause = explanation.added[0].name if explanation.added else "poses"
+        return Contradiction(explanation, found, cause, size)
+    if metric and not with_depth:
+        return Contradiction(explanation, found, "no depth", 1.0)
+    return None
 
 
 def findings(estimate: Estimate, explanations: Sequence[Explanation]) -> list[Finding]:
@@ -155,6 +157,11 @@ def _second(ones: list[Contradiction]) -> str:
     return f"{100 * share:.0f} % of the corners follow a second motion: an overlay, or something large that moves"
 
 
+def _no_depth(ones: list[Contradiction]) -> str:
+    del ones
+    return "there is no depth of these moments, or one image of it is repeated"
+
+
 def _poses(ones: list[Contradiction]) -> str:
     del ones
     return "the followed corners contradict the poses"
@@ -171,5 +178,6 @@ SENTENCES: dict[str, tuple[Callable[[list[Contradiction]], str], str, bool]] = {
     "rolling shutter": (_shutter, "move slower, or use a shorter readout", False),
     "depth factor": (_factor, "check the depth camera, or leave its depth out (`--rgb-only`)", True),
     "depth offset": (_offset, "check the depth camera, or leave its depth out (`--rgb-only`)", True),
+    "no depth": (_no_depth, "the unit of length rests on other frames; check the depth camera", True),
     "depth": (_depth, "check that depth and images belong together, or leave it out (`--rgb-only`)", True),
 }
