@@ -26,7 +26,7 @@ from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.window.pending_window import settled
 from vggtgeo.slam.window.sliding_window import _camera_sigma
 
@@ -76,7 +76,7 @@ def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
         numbers = frozenset(range(count))
         pairs = tuple(pair for pair in wide.pairs if numbers.issuperset(pair.key))
         frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
-        assert Estimate.of(replace(slam, pairs=pairs, frames=frames, factors=(), origins=(0,))).guessed == held
+        assert Claim.of(replace(slam, pairs=pairs, frames=frames, factors=(), origins=(0,))).guessed == held
 
 
 def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:

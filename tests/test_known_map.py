@@ -31,8 +31,8 @@ from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.sparse_map.known_map import as_map, entered, save_map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
-from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.judge import judge
 from vggtgeo.slam.window.pending_window import settled
 
 FRAMES, HALF = 18, 9
@@ -190,8 +190,8 @@ def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     slam = run(0, 6, seed=3, settings=FIXED, known_map=known)
     assert not any(record.tracked for record in slam.frames)
     assert len(slam.waiting) == 6
-    assert "none of the 6 frames was found in the known map" in judge(slam).reasons[0]
-    assert not Estimate.of(first_half()).in_known_map
+    assert "0 of 6 frames were found in the known map" in judge(slam).reasons[0]
+    assert not Claim.of(first_half()).in_known_map
 
 
 def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:

@@ -28,9 +28,9 @@ from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, larges
 from vggtgeo.slam.global_map.global_adjustment import _taken_lens
 from vggtgeo.slam.sparse_map.known_map import as_map, entered
 from vggtgeo.slam.state import SeenPoints, Slam
-from vggtgeo.slam.trust import judge as judging
-from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.evidence import FrameEvidence
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.judge import aligned
+from vggtgeo.slam.verdict.witness import FrameEvidence
 from vggtgeo.slam.window.pending_window import settled
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
@@ -129,7 +129,7 @@ def test_a_lens_that_is_not_taken_leaves_its_focal_length() -> None:
     adjustment, state = slam.solved
     left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
     kept = _taken_lens(slam, adjustment, left_out)
-    assert kept.focal_with_lens == LENS.intrinsics[0] == Estimate.of(kept).focal_with_lens
+    assert kept.focal_with_lens == LENS.intrinsics[0]
     assert list(differences(replace(kept, focal_with_lens=None), slam)) == []
     for found in (None, replace(left_out, warp=float("inf"))):
         assert _taken_lens(kept, adjustment, found).focal_with_lens is None
@@ -200,15 +200,14 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
     np.testing.assert_allclose(redrawn(last.pixels), kept.pixels, atol=1e-3)
 
 
-def test_corners_of_the_verdict_go_through_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_corners_of_the_verdict_go_through_the_lens() -> None:
     # Proves that the witness sees the same camera as the map. Oracle: what it is given, back through the lens.
     slam = undistorted(run_of_room(), LENS)
     seen = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]], np.float32)
     nothing = np.zeros(3, np.float32)
-    noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing, 1.0, 0.5, 30.0) for r in slam.frames]
-    given: list[FrameEvidence] = []
-    monkeypatch.setattr(judging, "_images", lambda slam, estimate, evidence, size: given.extend(evidence) or [])
-    judging.judge(slam, noted)
+    noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing) for r in slam.frames]
+    given = aligned(slam, Claim.of(slam), noted)
+    assert given is not None
     assert len(given) == len(slam.frames) > 1
     np.testing.assert_allclose(redrawn(given[0].pixels), seen, atol=1e-3)
 

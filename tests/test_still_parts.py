@@ -22,8 +22,8 @@ from vggtgeo.slam.camera.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.trust.evidence import EvidenceRecorder
-from vggtgeo.slam.trust.input import check_still_parts
+from vggtgeo.slam.verdict.input import check_still_parts
+from vggtgeo.slam.verdict.witness import EvidenceRecorder
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = vg.Camera((300.0, 300.0, 159.5, 119.5), WIDTH, HEIGHT)

@@ -107,8 +107,8 @@ if TYPE_CHECKING:
     from vggtgeo.slam.settings.slam_settings import Roles as Roles
     from vggtgeo.slam.settings.slam_settings import SlamSettings as SlamSettings
     from vggtgeo.slam.sparse_map.known_map import load_map as load_map
-    from vggtgeo.slam.trust.evidence import EvidenceRecorder as EvidenceRecorder
-    from vggtgeo.slam.trust.finding import Verdict as Verdict
+    from vggtgeo.slam.verdict.finding import Verdict as Verdict
+    from vggtgeo.slam.verdict.witness import EvidenceRecorder as EvidenceRecorder
     from vggtgeo.solvers.adjoint import ArrowAdjoint as ArrowAdjoint
     from vggtgeo.solvers.kernels import AbstractKernel as AbstractKernel
     from vggtgeo.solvers.kernels import Barron as Barron
@@ -178,8 +178,8 @@ _HOME = {
         "WindowSettings",
     ),
     "slam.settings.slam_settings": ("Roles", "SlamSettings"),
-    "slam.trust.evidence": ("EvidenceRecorder",),
-    "slam.trust.finding": ("Verdict",),
+    "slam.verdict.witness": ("EvidenceRecorder",),
+    "slam.verdict.finding": ("Verdict",),
     "bundle.sliding": ("slide",),
     "bundle.solution": ("Solution", "solve"),
     "bundle.solver_choice": ("choose_reduced_solver",),

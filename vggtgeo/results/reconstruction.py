@@ -40,10 +40,10 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.sparse_map.known_map import entered
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.evidence import EvidenceRecorder
-from vggtgeo.slam.trust.finding import Verdict
-from vggtgeo.slam.trust.input import check_input, check_refusals
-from vggtgeo.slam.trust.judge import judged_or_told
+from vggtgeo.slam.verdict.finding import Verdict
+from vggtgeo.slam.verdict.input import check_input, check_refusals
+from vggtgeo.slam.verdict.judge import judge_or_report
+from vggtgeo.slam.verdict.witness import EvidenceRecorder
 from vggtgeo.slam.window.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
@@ -234,7 +234,7 @@ def _concluded(
     def judged() -> Verdict:
         with clock.measure("verdict (own thread)"):
             of_input = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals) + still.findings()
-            return judged_or_told(slam, evidence.frames, of_input)
+            return judge_or_report(slam, evidence.frames, of_input)
 
     hooks.each("on_stage", "dense map and verdict")
     with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:

@@ -8,8 +8,8 @@ the noise:
 - `f(theta) d(n; theta) + c(theta) + readout shift - u`, `n` the normalised image point, 2 rows a corner;
 - `log z + drift(theta) - log z_measured`, 1 row where depth was measured.
 
-Cauchy's kernel, as for Student's t likelihood with few degrees of freedom. Points are eliminated (3 x 3 blocks), and the
-reduced system of poses and calibration is dense: at most `6 * 48 + 14` unknowns.
+Cauchy's kernel, as for Student's t likelihood with few degrees of freedom. Points are eliminated (3 x 3 blocks), and
+the reduced system of poses and calibration is dense: at most `6 * 24 + 13` unknowns.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ class Tracks:
 
     rows: int [f], of the run. times: float64 [f], s. poses: float64 [f, 4, 4], world -> camera. intrinsics: fx, fy, cx,
     cy. size: width, height, pixels. frame, track: int [m], of each observation, sorted by track. pixels: float64
-    [m, 2]. depth: float64 [m], metres, NaN where it was not measured or the map is not metric. velocity: float64
-    [m, 2], of the corner in the image, pixels a second. first: int [t], first observation of each track.
+    [m, 2]. depth: float64 [m], metres, NaN where it was not measured or the map is not metric. readout: float64
+    [m, 2], pixels by which a rolling shutter of one second moves the corner. first: int [t], first observation of each
+    track.
     """
 
     rows: np.ndarray
@@ -61,7 +62,7 @@ class Tracks:
     track: np.ndarray
     pixels: np.ndarray
     depth: np.ndarray
-    velocity: np.ndarray
+    readout: np.ndarray
     first: np.ndarray
 
     @property
@@ -130,8 +131,7 @@ def predict(tracks: Tracks, numerator: np.ndarray, log_inverse: np.ndarray, thet
     weights = tracks.knots()
     focal = np.exp(weights @ theta[FOCAL])
     pixels = tracks.intrinsics[:2] * focal[:, None] * bent + tracks.intrinsics[2:]
-    row = tracks.pixels[:, 1] / tracks.size[1] - 0.5
-    pixels = pixels + theta[READOUT] * row[:, None] * tracks.velocity
+    pixels = pixels + theta[READOUT] * tracks.readout
     depth = np.maximum(z * np.exp(-log_inverse) + theta[OFFSET], 1e-3)
     return np.column_stack([pixels, np.log(depth) + weights @ theta[DRIFT]])
 
@@ -153,9 +153,8 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, theta_too: bool 
     known = np.isfinite(measured) & ~behind[:, None]
     residual = np.where(known, (value - np.where(known, measured, 0.0)) * scale, 0.0)
     step = DIFFERENCE * np.abs(numerator[:, 2])
-    by_numerator = np.stack(
-        [(at(numerator + step[:, None] * axis, log_inverse, unknowns.theta) - value) / step[:, None] for axis in np.eye(3)], 2
-    )
+    along = lambda axis: (at(numerator + step[:, None] * axis, log_inverse, unknowns.theta) - value) / step[:, None]
+    by_numerator = np.stack([along(axis) for axis in np.eye(3)], 2)
     by_log = (at(numerator, log_inverse + DIFFERENCE, unknowns.theta) - value) / DIFFERENCE
     mask = (known * scale)[:, :, None]
     none = np.zeros(len(a))

@@ -19,7 +19,6 @@ from vggtgeo.slam.verdict.adjustment import (
     CENTRE,
     DRIFT,
     FOCAL,
-    KNOTS,
     OFFSET,
     RADIAL,
     READOUT,
@@ -210,13 +209,11 @@ def subset(tracks: Tracks, kept: np.ndarray) -> tuple[Tracks, np.ndarray]:
     numbers = np.flatnonzero(kept)
     track = (np.cumsum(kept) - 1)[tracks.track[rows]]
     first = np.flatnonzero(np.r_[True, track[1:] != track[:-1]])
-    parts = {name: getattr(tracks, name)[rows] for name in ("frame", "pixels", "depth", "velocity")}
+    parts = {name: getattr(tracks, name)[rows] for name in ("frame", "pixels", "depth", "readout")}
     return replace(tracks, **parts, track=track, first=first), numbers
 
 
-def second_motion(
-    tracks: Tracks, noise: Noise, outliers: np.ndarray
-) -> tuple[float, np.ndarray | None, np.ndarray]:
+def second_motion(tracks: Tracks, noise: Noise, outliers: np.ndarray) -> tuple[float, np.ndarray | None, np.ndarray]:
     """Whether one other motion explains the corners that contradict the first: its share of all observations, its
     poses (None where there is none), and its tracks, bool [t].
     """
@@ -284,9 +281,8 @@ def consequence(tracks: Tracks, fit: Fit, free_scale: bool, as_one: float) -> Co
     off = fitted.scale * places @ fitted.rotation.T + fitted.translation - claimed
     turns = _step_turns(fit.unknowns.poses, tracks.poses)
     sigmas = np.sqrt(as_one) * np.array(_noise_of_motion(tracks, fit, free_scale))
-    return Consequence(
-        float(np.sqrt(np.mean(np.sum(off**2, 1)))), float(sigmas[0]), float(np.sqrt(np.mean(turns**2))), float(sigmas[1])
-    )
+    rms = np.sqrt([np.mean(np.sum(off**2, 1)), np.mean(turns**2)])
+    return Consequence(float(rms[0]), float(sigmas[0]), float(rms[1]), float(sigmas[1]))
 
 
 def _step_turns(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -306,7 +302,8 @@ def _noise_of_motion(tracks: Tracks, fit: Fit, free_scale: bool) -> tuple[float,
     covariance = np.zeros((6 * frames, 6 * frames))
     covariance[6:, 6:] = inverse[: 6 * frames - 6, : 6 * frames - 6]
     blocks = covariance.reshape(frames, 6, frames, 6)
-    back = np.swapaxes(fit.unknowns.poses[:, :3, :3], 1, 2)  # a tangent moves the centre by -R' tau, and turns by R' omega
+    # A tangent moves the centre by -R' tau and turns the camera by R' omega.
+    back = np.swapaxes(fit.unknowns.poses[:, :3, :3], 1, 2)
     carried = lambda part: np.einsum("fik,fkgl,gjl->figj", back, part, back, optimize=True)
     places = carried(blocks[:, :3, :, :3]).reshape(3 * frames, 3 * frames)
     centred = rigid.invert(fit.unknowns.poses)[:, :3, 3]

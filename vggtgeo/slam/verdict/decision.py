@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.verdict.alternatives import Consequence, Explanation, consequence
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.finding import Finding
 
 PLACES = 0.04
 """Metres, RMS over a window."""
@@ -66,39 +66,48 @@ def contradiction(explanation: Explanation, metric: bool) -> Contradiction | Non
     if size >= 1.0:
         cause = explanation.added[0].name if explanation.added else "poses"
         return Contradiction(explanation, found, cause, size)
-    if metric and not with_depth:
-        return Contradiction(explanation, found, "no depth", 1.0)
     return None
 
 
-def findings(estimate: Estimate, explanations: Sequence[Explanation]) -> list[Finding]:
+def findings(claim: Claim, explanations: Sequence[Explanation]) -> list[Finding]:
     """One finding a cause, the largest consequence first."""
-    found = [one for explanation in explanations if (one := contradiction(explanation, estimate.metric))]
+    found = [one for explanation in explanations if (one := contradiction(explanation, claim.metric))]
+    found += _without_depth(claim, explanations)
     causes = {one.cause: [other for other in found if other.cause == one.cause] for one in found}
     ordered = sorted(causes.values(), key=lambda ones: -sum(one.size for one in ones))
-    return [_finding(estimate, ones) for ones in ordered[:MAX_REASONS]]
+    return [_finding(claim, ones) for ones in ordered[:MAX_REASONS]]
 
 
-def _finding(estimate: Estimate, ones: list[Contradiction]) -> Finding:
+def _without_depth(claim: Claim, explanations: Sequence[Explanation]) -> list[Contradiction]:
+    """Windows of a metric run that show no depth, where others do."""
+    empty = [one for one in explanations if not np.isfinite(one.tracks.depth).any()]
+    if not claim.metric or len(empty) == len(explanations):
+        return []
+    return [Contradiction(one, consequence(one.tracks, one.best, True, one.as_one), "no depth", 1.0) for one in empty]
+
+
+def _finding(claim: Claim, ones: list[Contradiction]) -> Finding:
     rows = np.concatenate([one.explanation.tracks.rows for one in ones])
-    start, end = int(estimate.frames[rows.min()]), int(estimate.frames[rows.max()])
+    start, end = int(claim.frames[rows.min()]), int(claim.frames[rows.max()])
     worst = max(ones, key=lambda one: one.size)
     what, advice, scale = SENTENCES[worst.cause]
-    text = f"frames {start} to {end}: {what(ones)}; {_consequence(estimate, worst)}; {advice}"
-    return Finding(worst.cause, "degraded", text, start, end, scale=scale and estimate.metric)
+    text = f"frames {start} to {end}: {what(ones)}; {_consequence(claim, worst)}; {advice}"
+    return Finding(worst.cause, "degraded", text, start, end, scale=scale and claim.metric)
 
 
-def _consequence(estimate: Estimate, worst: Contradiction) -> str:
+def _consequence(claim: Claim, worst: Contradiction) -> str:
     found = worst.consequence
     turned = f", turns from frame to frame by {np.degrees(found.turn):.1f} degrees"
-    if estimate.metric:
-        return f"poses that allow for it differ by {100 * found.places:.0f} +- {100 * found.places_sigma:.0f} cm{turned}"
+    if claim.metric:
+        return (
+            f"poses that allow for it differ by {100 * found.places:.0f} +- {100 * found.places_sigma:.0f} cm{turned}"
+        )
     share = 100 * found.places / max(extent(worst.explanation.tracks.poses), 1e-12)
     return f"poses that allow for it differ by {share:.0f} % of the path's extent{turned}"
 
 
 def _pooled(ones: list[Contradiction]) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate and standard deviation of the first alternative, by inverse variance over windows."""
+    """Value and standard deviation of the first alternative, weighted by inverse variance over windows."""
     added = [one.explanation.added[0] for one in ones]
     weights = [np.linalg.pinv(what.covariance, hermitian=True) for what in added]
     covariance = np.linalg.pinv(sum(weights), hermitian=True)
@@ -109,7 +118,8 @@ def _pooled(ones: list[Contradiction]) -> tuple[np.ndarray, np.ndarray]:
 def _focal(ones: list[Contradiction]) -> str:
     (value,), (sigma,) = _pooled(ones)
     focal = ones[0].explanation.tracks.intrinsics[0]
-    return f"the images fit a focal length of {focal * np.exp(value):.0f} +- {focal * sigma:.0f} px; the run has {focal:.0f}"
+    fitted = f"{focal * np.exp(value):.0f} +- {focal * sigma:.0f} px"
+    return f"the images fit a focal length of {fitted}; the run has {focal:.0f}"
 
 
 def _zoom(ones: list[Contradiction]) -> str:

@@ -4,8 +4,8 @@
   deviation of the residuals with free poses, corrected for the unknowns that these residuals determine.
 - The depth errors of a track are common to it (an edge, a material): `n` depths of a track weigh as one.
 - Errors are not independent along a track, which drifts, nor within a frame. So covariances are cluster-robust, by
-  track and by frame (two-way, Cameron, Gelbach & Miller 2011): with the score `g_o` of each observation, `H` the reduced
-  information of the parameters that are asked for,
+  track and by frame (two-way, Cameron, Gelbach & Miller 2011): with the score `g_o` of each observation, and `H` the
+  reduced information of the parameters that are asked for,
 
       V = H^-1 (sum_track G G' + sum_frame G G' - sum_o g_o g_o') H^-1,   G the sum of the scores of a cluster.
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
-from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.evidence import FrameEvidence
 from vggtgeo.slam.verdict.adjustment import Tracks
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.witness import FrameEvidence
 
 WINDOW = 24
 """Frames that are adjusted together."""
@@ -32,7 +33,7 @@ def linked(evidence: Sequence[FrameEvidence], tracked: np.ndarray) -> list[np.nd
         return []
     cuts = [
         place + 1
-        for place, (row, after) in enumerate(zip(rows[:-1], rows[1:], strict=True))
+        for place, (row, after) in enumerate(pairwise(rows))
         if common(evidence[row], evidence[after]) < MIN_COMMON
     ]
     return np.split(rows, cuts)
@@ -61,7 +62,7 @@ def windows(rows: np.ndarray) -> list[np.ndarray]:
 
 
 def tracks_of(
-    estimate: Estimate, evidence: Sequence[FrameEvidence], rows: np.ndarray, size: tuple[int, int]
+    claim: Claim, evidence: Sequence[FrameEvidence], rows: np.ndarray, size: tuple[int, int]
 ) -> Tracks | None:
     """The tracks that at least `MIN_VIEWS` of these frames see; None where there are none.
 
@@ -71,7 +72,7 @@ def tracks_of(
     frame = np.repeat(np.arange(len(rows)), [len(evidence[row].ids) for row in rows])
     pixels = np.concatenate([evidence[row].pixels for row in rows]).astype(np.float64)
     depth = np.concatenate([evidence[row].depth for row in rows]).astype(np.float64)
-    velocity = np.concatenate([_velocities(evidence, row) for row in rows])
+    velocity = np.concatenate([_velocities(evidence, int(row)) for row in rows])
     order = np.lexsort((frame, ids))
     ids, frame, pixels, depth, velocity = ids[order], frame[order], pixels[order], depth[order], velocity[order]
     _, track, views = np.unique(ids, return_inverse=True, return_counts=True)
@@ -79,18 +80,23 @@ def tracks_of(
     if not kept.any():
         return None
     _, first, track = np.unique(ids[kept], return_index=True, return_inverse=True)
-    depth = np.where(depth > 0, depth, np.nan) if estimate.metric else np.full(len(depth), np.nan)
+    pixels = pixels[kept]
+    axis = 0 if claim.readout is not None and claim.readout.columns else 1
+    readout = (pixels[:, [axis]] / size[axis] - 0.5) * velocity[kept]
+    if claim.readout is not None:
+        pixels = pixels - claim.readout.seconds * readout
+    depth = np.where(depth > 0, depth, np.nan) if claim.metric else np.full(len(depth), np.nan)
     return Tracks(
         rows=rows,
-        times=estimate.times[rows],
-        poses=estimate.poses[rows],
-        intrinsics=np.asarray(estimate.intrinsics, np.float64),
+        times=claim.times[rows],
+        poses=claim.poses[rows],
+        intrinsics=np.asarray(claim.intrinsics, np.float64),
         size=size,
         frame=frame[kept],
         track=track,
-        pixels=pixels[kept],
+        pixels=pixels,
         depth=depth[kept],
-        velocity=velocity[kept],
+        readout=readout,
         first=first,
     )
 

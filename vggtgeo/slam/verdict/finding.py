@@ -1,4 +1,4 @@
-"""What a check has to say, and what all of them together say: the verdict."""
+"""Findings, and the verdict that all of them make."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ import numpy as np
 
 Level = Literal["good", "degraded", "failed"]
 LEVELS: tuple[Level, ...] = get_args(Level)
-MOST_NAMED = 5
-"""Places of one kind, stretches of lost frames say, that have a sentence each; more have one together."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is not as it should be.
+    """One reason not to trust a result.
 
-    check: the name of the check. level: what it makes of the run. text: for people, with the numbers. start, end:
-    first and last frame concerned; None = the whole run. scale: whether it puts the unit of length in doubt. local: it
-    concerns these frames alone, and the rest stands without them: it marks the segment, not the run.
+    check: its name. level: of the run. text: a sentence with the numbers. start, end: first and last frame concerned;
+    None: the whole run. scale: it puts the unit of length in doubt. local: it marks the segment, not the run.
     """
 
     check: str
@@ -34,7 +31,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Segment:
-    """Frames `start` to `end` (both included, times in s), how far they can be trusted, and which checks say so."""
+    """Frames `start` to `end` (both included; times in s), their level, and the names of the findings."""
 
     start: int
     end: int
@@ -61,11 +58,11 @@ class Segment:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How far a result can be trusted.
+    """Whether a result can be trusted.
 
     level: "good"; "degraded", something contradicts the result or is missing from it; "failed", it is not to be used.
     reasons: one sentence each, the worst first. segments: the run by time, in order, without gaps. metric: False where
-    lengths are no metres, or may be none.
+    lengths are not metres, or doubtful.
 
     Example:
         >>> import vggtgeo as vg
@@ -98,12 +95,12 @@ class Verdict:
 
 
 def worst(levels: Iterable[Level]) -> Level:
-    """The worst of some levels; "good" of none."""
+    """The worst of some levels; "good" where there are none."""
     return max(levels, key=LEVELS.index, default="good")
 
 
 def conclude(findings: Iterable[Finding], frames: Sequence[int], times: Sequence[float], metric: bool) -> Verdict:
-    """The verdict of all findings on a run with these frame numbers and times."""
+    """Combine the findings on a run with these frame numbers and times."""
     ordered = sorted(findings, key=lambda finding: -LEVELS.index(finding.level))
     doubtful = any(finding.scale and finding.level != "good" for finding in ordered)
     return Verdict(
@@ -131,7 +128,7 @@ def _segments(findings: Sequence[Finding], frames: np.ndarray, times: np.ndarray
 
 
 def spans(rows: np.ndarray, join: int = 1) -> list[tuple[int, int]]:
-    """Runs of the True values of bool [n], as first and last row; runs at most `join` rows apart are one."""
+    """First and last row of each run of True values of bool [n]; runs at most `join` rows apart are merged."""
     marked = np.nonzero(rows)[0]
     if not len(marked):
         return []

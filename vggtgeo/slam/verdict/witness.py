@@ -1,9 +1,7 @@
-"""What a run notes of every frame for its verdict: corners followed from image to image, and the sensor's depth there.
+"""The witness of the verdict: corners followed from image to image, and the measured depth there.
 
-The tracks (Lucas & Kanade, 1981, on images of 320 pixels) know nothing of the map, its features or its poses. So they
-are a witness that the estimate has not heard yet: poses that are right explain how these corners move, and depth that
-is right says how far away they are. About 4 ms a frame (640 x 480), 4 kB a frame; 50 ms more for a
-frame of which nearly nothing can be followed.
+The tracks (Lucas & Kanade, 1981, on images of 320 pixels) are independent of the map, its features and its poses. About
+4 ms a frame (640 x 480), 4 kB a frame.
 """
 
 from __future__ import annotations
@@ -21,14 +19,12 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.given import check_kind
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.edges import EVERY, edges_elsewhere
-from vggtgeo.slam.trust.enlargement import followed_enlargement, matched_corners
 
 WIDTH = 320
 """Pixels of the longer side of the images that corners are followed in."""
 CELL = 20
 """Pixels of these images a side of a cell. A cell holds one track: a poster does not outvote the walls around it."""
-LEAST_CORNER = 2e-5
+MIN_CORNER = 2e-5
 """Smallest eigenvalue of the structure tensor (OpenCV's unit). White noise of 3 grey levels gives 1e-5."""
 CONTRAST = 50.0
 """Grey levels, standard deviation."""
@@ -49,10 +45,8 @@ ROUND_TRIP = 0.5
 """Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
 STRIDE = 8
 """Pixels between the depths that are kept of the last frame."""
-MOST_WAITING = 4
+MAX_WAITING = 4
 """Frames that wait to be looked at; they hold their images."""
-LEAST_COMMON = 8
-"""Corners, if their median is to say how far the picture moved."""
 _PATCH = (15, 15)
 _FLOW = {
     "winSize": _PATCH,
@@ -63,14 +57,10 @@ _FLOW = {
 
 @dataclass(frozen=True, eq=False)
 class FrameEvidence:
-    """One frame's corners.
+    """The corners of one frame.
 
     ids: int32 [m], a track's number, the same in each frame that saw it. pixels: float32 [m, 2], of the ideal pinhole
-    image. depth: float32 [m], the sensor's, metres, NaN = none, or none but that of the picture before. depth_changed:
-    share of the pixels with depth whose depth is not exactly that of the frame before, NaN without depth. contrast:
-    standard deviation of the grey levels. enlarged: logarithm of the factor by which the picture is larger than the one
-    before, less what measured depth explains by coming nearer; None where nothing says. edges_elsewhere: see
-    `edges.py`, of one frame in `EVERY`.
+    image. depth: float32 [m], measured, metres; NaN where there is none, or the image repeats that of another picture.
     """
 
     frame: int
@@ -78,21 +68,16 @@ class FrameEvidence:
     ids: np.ndarray
     pixels: np.ndarray
     depth: np.ndarray
-    depth_median: float
-    depth_changed: float
-    contrast: float
-    enlarged: float | None = None
-    edges_elsewhere: float | None = None
 
     def through(self, lens: Camera) -> FrameEvidence:
-        """The same corners in images that the lens does not distort."""
+        """The same corners without the distortion of `lens`."""
         return replace(self, pixels=lens.undistorted(self.pixels).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
 class EvidenceSoFar:
-    """What an `EvidenceRecorder` noted, and what it needs to go on: small grey image and every eighth depth of the last
-    frame, the corners in that image with their tracks' numbers, the next number.
+    """State of an `EvidenceRecorder`: the frames so far; of the last one the small grey image, every `STRIDE`-th depth,
+    and the corners with their tracks' numbers; the next number.
     """
 
     frames: tuple[FrameEvidence, ...]
@@ -104,7 +89,7 @@ class EvidenceSoFar:
 
 
 class EvidenceRecorder(Callback):
-    """Collects a `FrameEvidence` of each frame. `vggtgeo.Result.of` takes its `frames`.
+    """Record a `FrameEvidence` of each frame, for `vggtgeo.Result.of`.
 
     Example:
         >>> import vggtgeo as vg
@@ -126,67 +111,51 @@ class EvidenceRecorder(Callback):
         self._camera = camera
         self._image: np.ndarray | None = None
         self._depth: np.ndarray | None = None
-        self._own_depth: np.ndarray | None = None
+        self._owned = True
         self._ids = np.zeros(0, np.int32)
         self._pixels = np.zeros((0, 2), np.float32)
         self._next = 0
 
     def leave_out(self, still: np.ndarray) -> None:
-        """No corner is followed where `still`, bool [H, W], says that the image belongs to the camera, nor so near that
-        the patch around it sees that.
-        """
+        """Mask `still`, bool [H, W], the static part of the picture, with a margin of the patch around a corner."""
         small = cv2.resize(still.astype(np.uint8), _small_size(still.shape), interpolation=cv2.INTER_AREA)
         self._left_out = cv2.dilate(small, np.ones(_PATCH, np.uint8)) > 0
 
     @property
     def frames(self) -> list[FrameEvidence]:
-        """What was noted of each frame so far."""
+        """Evidence of each frame so far."""
         while self._waiting:
             self._waiting.popleft().result()
         return self._frames
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        """Beside the run, in a thread of its own: nothing here needs its state."""
-        while len(self._waiting) > MOST_WAITING:
+        """Follow the corners in a thread of its own, beside the run."""
+        while len(self._waiting) > MAX_WAITING:
             self._waiting.popleft().result()
         self._waiting.append(self._pool.submit(self._add, frame))
 
     def so_far(self) -> EvidenceSoFar:
-        """Of the frames so far."""
+        """State to resume from."""
         return EvidenceSoFar(tuple(self.frames), self._image, self._depth, self._ids, self._pixels, self._next)
 
     def on_resume(self, so_far: EvidenceSoFar, slam: Slam) -> None:
-        """The next frame follows the last of these."""
+        """Continue after the last of these frames."""
         self._frames = list(so_far.frames)
         self._image, self._depth, self._next = so_far.image, so_far.depth, so_far.next
         self._ids, self._pixels = so_far.ids, so_far.pixels
-        # Depth that was another picture's was noted as none; where the last has none at its corners, none is asked.
-        self._own_depth = so_far.depth if so_far.frames and np.isfinite(so_far.frames[-1].depth).any() else None
+        self._owned = so_far.depth is None or bool(np.isfinite(so_far.frames[-1].depth).any())
 
     def add(self, frame: Frame) -> None:
-        """Follow the corners into this frame, and begin new ones where there are none."""
+        """Follow the corners into this frame, and detect new ones where there are none."""
         self.frames  # noqa: B018 - what came before is noted before
         self._add(frame)
 
     def _add(self, frame: Frame) -> None:
         scale = max(frame.image.shape[:2]) / WIDTH
-        grey, contrast = _small_grey(frame.image)
-        depth_before, (changed, median) = self._own_depth, self._compare_depth(frame.depth)
-        # The run does not use what was seen with another picture (`with_own_depth`).
-        other_picture = self._image is None or not np.array_equal(grey, self._image)
-        repeated = changed == 0 and (depth_before is None or other_picture)
-        own = None if repeated else frame.depth
-        self._own_depth = None if repeated else self._depth
-        enlarged = None
+        grey = _small_grey(frame.image)
         if self._image is not None and len(self._ids):
             pixels, kept = _follow_through_bands(self._image, grey, self._pixels)
             kept &= self._of_the_world(pixels)
-            nearer = lambda start, end: _nearer(depth_before, self._own_depth, start, end, scale)
-            corners = self._pixels[kept], pixels[kept]
-            enlarged = followed_enlargement(*corners, nearer(*corners))
-            if enlarged is None:
-                corners = matched_corners(self._image, grey, self._left_out)
-                enlarged = followed_enlargement(*corners, nearer(*corners))
             self._ids, self._pixels = one_a_cell(self._ids[kept], pixels[kept])
         fresh = new_corners(grey, self._pixels)
         fresh = fresh[self._of_the_world(fresh)]
@@ -194,18 +163,23 @@ class EvidenceRecorder(Callback):
         self._next += len(fresh)
         self._ids = np.concatenate([self._ids, numbers])
         self._pixels = np.concatenate([self._pixels, fresh])
-        self._image = grey
         full = (self._pixels + 0.5) * scale - 0.5
+        own = self._own_depth(frame.depth, grey)
         depth = np.full(len(full), np.nan, np.float32) if own is None else _read(own, full)
+        self._image = grey
         ideal = self._camera.undistorted(full).astype(np.float32)
-        numbers, edges = self._ids.copy(), None
-        if own is not None and len(self._frames) % EVERY == 0:
-            edges = edges_elsewhere(grey, own, self._left_out)
-        self._frames.append(
-            FrameEvidence(
-                *(frame.index, frame.timestamp, numbers, ideal, depth, median, changed, contrast, enlarged, edges)
-            )
-        )
+        self._frames.append(FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth))
+
+    def _own_depth(self, depth: np.ndarray | None, grey: np.ndarray) -> np.ndarray | None:
+        """The depth image, unless it repeats that of another picture: the run does not use it either."""
+        before, small = self._depth, None if depth is None else depth[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+        self._depth = None if small is None else small.copy()
+        same = before is not None and small is not None and np.array_equal(before, small, equal_nan=True)
+        if not same:
+            self._owned = True
+        elif not np.array_equal(grey, self._image):
+            self._owned = False
+        return depth if self._owned else None
 
     def _of_the_world(self, pixels: np.ndarray) -> np.ndarray:
         """Which corners of the small image may be followed."""
@@ -213,19 +187,6 @@ class EvidenceRecorder(Callback):
             return np.ones(len(pixels), bool)
         column, row = np.clip(np.rint(pixels), 0, np.array(self._left_out.shape[::-1]) - 1).astype(int).T
         return ~self._left_out[row, column]
-
-    def _compare_depth(self, depth: np.ndarray | None) -> tuple[float, float]:
-        """The share of pixels that changed since the last frame, and the median; NaN where there is no depth."""
-        if depth is None:
-            self._depth = None
-            return float("nan"), float("nan")
-        small = depth[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE].copy()
-        before, self._depth = self._depth, small
-        known = np.isfinite(small)
-        median = float(np.median(small[known])) if np.any(known) else float("nan")
-        if before is None or np.count_nonzero(known) < 0.05 * known.size:
-            return float("nan"), median
-        return float(np.mean(before[known] != small[known])), median
 
 
 def follow(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -275,7 +236,7 @@ def new_corners(grey: np.ndarray, taken: np.ndarray) -> np.ndarray:
     cells = strength[: rows * CELL, : columns * CELL].reshape(rows, CELL, columns, CELL)
     cells = cells.transpose(0, 2, 1, 3).reshape(rows, columns, -1)
     best = cells.argmax(2)
-    free = cells.max(2) > LEAST_CORNER
+    free = cells.max(2) > MIN_CORNER
     x, y = np.clip(taken // CELL, 0, (columns - 1, rows - 1)).astype(int).T
     free[y, x] = False
     row, column = np.nonzero(free)
@@ -290,8 +251,8 @@ def _small_size(shape: tuple[int, ...]) -> tuple[int, int]:
     return width, height
 
 
-def _small_grey(image: np.ndarray) -> tuple[np.ndarray, float]:
-    """The image that corners are followed in, uint8, and the standard deviation of its grey levels before.
+def _small_grey(image: np.ndarray) -> np.ndarray:
+    """The image that corners are followed in, uint8.
 
     Lucas and Kanade compare grey levels, and a camera changes its exposure, a lamp flickers: so each pixel is compared
     with the brightness around it. Not with that of its row, which bands of light would call for: what enters a row far
@@ -306,39 +267,13 @@ def _small_grey(image: np.ndarray) -> tuple[np.ndarray, float]:
     detail = levels - LIGHT_REMOVED * around - (1 - LIGHT_REMOVED) * mean
     detail *= mean / np.maximum(around, DARKEST * mean)
     gain = min(CONTRAST / max(deviation, 1e-3), 4.0)
-    return np.clip(gain * detail + 128.0, 0, 255).astype(np.uint8), deviation
+    return np.clip(gain * detail + 128.0, 0, 255).astype(np.uint8)
 
 
 def _read(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     columns, rows = np.rint(pixels).astype(int).T
     height, width = depth.shape
     return depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float32)
-
-
-def _nearer(
-    before: np.ndarray | None, after: np.ndarray | None, start: np.ndarray, end: np.ndarray, scale: float
-) -> np.ndarray | None:
-    """Logarithm of the depth at corners of one small image over that at the same corners of the next, float64 [m], NaN
-    = unknown; None without depth. before, after: float32 [h, w], every `STRIDE`-th depth.
-    """
-    if before is None or after is None:
-        return None
-    at = lambda depth, pixels: _read(depth, ((pixels + 0.5) * scale - 0.5 - STRIDE // 2) / STRIDE)
-    return np.asarray(np.log(at(before, start)) - np.log(at(after, end)), np.float64)
-
-
-def common(first: FrameEvidence, second: FrameEvidence) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the tracks that both frames saw."""
-    _, rows, others = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
-    return rows, others
-
-
-def flow(first: FrameEvidence, second: FrameEvidence) -> float:
-    """The median way of the corners that both frames saw, pixels; NaN where they are fewer than `LEAST_COMMON`."""
-    rows, others = common(first, second)
-    if len(rows) < LEAST_COMMON:
-        return np.nan
-    return float(np.median(np.linalg.norm(second.pixels[others] - first.pixels[rows], axis=1)))
 
 
 Evidence = Sequence[FrameEvidence]

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 import vggtgeo as vg
-from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.finding import Finding, conclude, spans
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.finding import Finding, conclude, spans
 
 
 def test_the_verdict_covers_the_run_without_gaps() -> None:
@@ -43,7 +43,7 @@ def test_a_lost_frame_keeps_its_place_in_the_claim() -> None:
     *_, slam = vg.run(vg.simulate("room", 3, size=(160, 120)))
     middle = replace(slam.frames[1], tracked=False)
     slam = replace(slam, frames=(slam.frames[0], middle, slam.frames[2]))
-    claim = Estimate.of(slam)
+    claim = Claim.of(slam)
     assert len(claim.times) == len(claim.poses) == len(claim.frames) == 3
     assert len(vg.frame_trajectory(slam)) == 2
     assert "lost" in str(vg.Result.of(slam).verdict)
