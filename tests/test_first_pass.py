@@ -50,10 +50,10 @@ def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
 
 def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that camera and lens are handed on, with a word for the user, and nothing else of the pass.
-    slam = begun(monkeypatch, found(lens=LENS, focal_without_lens=300.0))
+    slam = begun(monkeypatch, found(lens=LENS))
     assert slam is not None
     assert slam.camera_found
-    assert (slam.lens, slam.focal_without_lens) == (LENS, 300.0)
+    assert slam.lens == LENS
     assert slam.intrinsics.tolist() == slam.given_intrinsics.tolist() == list(LENS.intrinsics)
     for focal in (280.0, 5000.0):
         far = replace(slam, given_intrinsics=np.array([focal, focal, 158.0, 121.0]))

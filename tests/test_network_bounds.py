@@ -67,7 +67,7 @@ def test_depth_that_cannot_be_is_left_out_and_counted(tmp_path: Path, scale: flo
     if left:
         np.testing.assert_allclose(found.depth, np.float32(2.0), rtol=0.1)
     else:
-        assert "depth answered 1 of 1 times with nothing that can be" in findings[0].text
+        assert "depth gave no valid answer 1 of 1 times" in findings[0].text
 
 
 def test_values_that_are_not_finite_cost_the_answer_only() -> None:
@@ -155,7 +155,7 @@ def test_a_run_tells_what_was_refused(tmp_path: Path, scale: float) -> None:
         result = vg.reconstruct(vg.simulate("room", 2, 0, size[::-1]), perceived, SETTINGS)
     counts = result.summary["refused"]["depth"]
     assert counts["asked"] > 0
-    named = [reason for reason in result.verdict.reasons if "the network of depth answered" in reason]
+    named = [reason for reason in result.verdict.reasons if "the network of depth gave no valid answer" in reason]
     assert bool(named) == (scale == 1e30) == (counts["without"] == counts["asked"])
     assert (result.verdict.level == "good") == (scale == 1.0)
     assert np.abs(result.cloud.points).max(initial=0.0) < FARTHEST
