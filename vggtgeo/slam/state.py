@@ -148,8 +148,8 @@ class Slam:
     it no longer distorts (`lens.py`). camera_found: nobody gave the camera, and `given_intrinsics` and `lens`
     are what a first pass over the frames found (`first_pass.py`), or the run that made the map which this one goes on
     in: windows hold them, and the last adjustment estimates the camera once more. readout: of the rolling shutter that
-    the last adjustment found and took out of the poses (`rolling_shutter.py`); pixels and images stay as they were read.
-    between: rows of the last frames, and their views, that wait for the next keyframe (`frame_refinement.py`).
+    the last adjustment found and took out of the poses (`rolling_shutter.py`); pixels and images stay as they were
+    read. between: rows of the last frames, and their views, that wait for the next keyframe (`frame_refinement.py`).
     """
 
     intrinsics: np.ndarray

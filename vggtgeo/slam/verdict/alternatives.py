@@ -35,8 +35,6 @@ from vggtgeo.slam.verdict.noise import Scores, estimated, scores
 
 LEVEL = 1e-6
 """Significance of an alternative. Seven are tried in each window."""
-SIGMAS = 3.0
-"""Standard deviations of a consequence below which it may be chance."""
 MAX_ADDED = 3
 """Alternatives in one explanation."""
 MAX_TRIED = 3
@@ -259,19 +257,13 @@ class Consequence:
     turn: float
     turn_sigma: float
 
-    @property
-    def sure_places(self) -> float:
-        """Beyond the noise; zero where that may be all."""
-        return _beyond(self.places, self.places_sigma)
-
-    @property
-    def sure_turn(self) -> float:
-        """Beyond the noise; zero where that may be all."""
-        return _beyond(self.turn, self.turn_sigma)
+    def beyond_noise(self, least: float) -> tuple[float, float]:
+        """Places and turn without what their noise explains; zero below `least` standard deviations."""
+        return _beyond(self.places, self.places_sigma, least), _beyond(self.turn, self.turn_sigma, least)
 
 
-def _beyond(value: float, sigma: float) -> float:
-    return float(np.sqrt(value**2 - sigma**2)) if value > SIGMAS * sigma else 0.0
+def _beyond(value: float, sigma: float, least: float) -> float:
+    return float(np.sqrt(max(value**2 - sigma**2, 0.0))) if value > least * sigma else 0.0
 
 
 def consequence(tracks: Tracks, fit: Fit, free_scale: bool, as_one: float) -> Consequence:

@@ -2,8 +2,8 @@
 
 An explanation of a window (`alternatives.py`) is reported where
 
-- it explains the corners better than the run's claim does, beyond chance: the decrease of minus twice the log
-  likelihood, divided by the number of observations that count as one, exceeds the chi-square quantile of `LEVEL`; and
+- it is significant: an alternative was added at the level of `LEVEL`, or free poses differ from those of the run by
+  more than `SIGMAS` standard deviations; and
 - it has a consequence: places differ from those of the run by more than `PLACES` (without depth `SHARE` of the path's
   extent) beyond the explanation's own noise, or turns from frame to frame by more than `TURN`.
 
@@ -23,12 +23,14 @@ from vggtgeo.slam.verdict.alternatives import Consequence, Explanation, conseque
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.finding import Finding
 
-PLACES = 0.04
+PLACES = 0.05
 """Metres, RMS over a window."""
-SHARE = 0.03
+SHARE = 0.06
 """Of the path's extent where lengths have no unit."""
 TURN = np.deg2rad(0.45)
 """Radians from frame to frame of a window, RMS."""
+SIGMAS = 3.0
+"""Standard deviations by which free poses must differ from those of the run."""
 RIVAL = 0.2
 """Share of the explained corners that follow a second motion, beyond which it is not sure which one is the camera's."""
 DEPTH_NOISE = 0.08
@@ -58,7 +60,9 @@ def contradiction(explanation: Explanation, metric: bool) -> Contradiction | Non
     with_depth = bool(np.isfinite(tracks.depth).any())
     found = consequence(tracks, explanation.best, not with_depth, explanation.as_one)
     limit = PLACES if metric else SHARE * extent(tracks.poses)
-    size = max(found.sure_places / max(limit, 1e-12), found.sure_turn / TURN)
+    # An alternative that was added is significant by itself; poses alone are by what they differ from the claim.
+    places, turn = found.beyond_noise(1.0 if explanation.added else SIGMAS)
+    size = max(places / max(limit, 1e-12), turn / TURN)
     if explanation.rival > RIVAL * (explanation.rival + explanation.share):
         return Contradiction(explanation, found, "second motion", max(size, 1.0))
     if with_depth and explanation.noise.depth > DEPTH_NOISE:

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.evidence import STRONG_INLIERS
 from vggtgeo.slam.verdict.alternatives import Explanation, explain
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.decision import findings
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
-from vggtgeo.slam.verdict.record import check_record
+from vggtgeo.slam.verdict.record import MAX_LOST, check_record
 from vggtgeo.slam.verdict.windows import linked, thinned, tracks_of, windows
 from vggtgeo.slam.verdict.witness import Evidence, FrameEvidence
 
@@ -35,8 +38,11 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     found = [*input_findings, *check_record(claim)]
     known = frame_uncertainty(slam) if slam.keyframes else None
     found += check_extent(claim, None if known is None else known.translation)
-    if claim.started and len(claim) > 1:
-        found += findings(claim, explanations(slam, claim, evidence))
+    corners = aligned(slam, claim, evidence) if claim.started and len(claim) > 1 else None
+    if corners is not None:
+        stretches = linked(corners, claim.tracked)
+        found += unlinked(slam, claim, stretches)
+        found += findings(claim, explanations(slam, claim, corners, stretches))
     return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
 
 
@@ -70,14 +76,42 @@ def check_extent(claim: Claim, sigma: np.ndarray | None) -> list[Finding]:
     return [Finding("extent", "degraded", text)]
 
 
-def explanations(slam: Slam, claim: Claim, evidence: Evidence) -> list[Explanation]:
-    """What the corners of each window prefer; none where evidence of a frame is missing."""
-    corners = aligned(slam, claim, evidence)
-    if corners is None:
+def unlinked(slam: Slam, claim: Claim, stretches: Sequence[np.ndarray]) -> list[Finding]:
+    """Stretches of frames that neither corners nor `STRONG_INLIERS` matches of keyframes link to the largest one."""
+    if len(stretches) < 2:
         return []
+    stretch_of = np.full(len(claim), -1)
+    for number, rows in enumerate(stretches):
+        stretch_of[rows] = number
+    row_of = {int(frame): row for row, frame in enumerate(claim.frames)}
+    place = {key.number: stretch_of[row_of[key.frame]] for key in slam.keyframes if key.frame in row_of}
+    known = [
+        pair for pair in slam.pairs if len(pair.points) >= STRONG_INLIERS and {pair.first, pair.second} <= place.keys()
+    ]
+    ends = [(place[pair.first], place[pair.second]) for pair in known]
+    for record in slam.frames:
+        against = record.reference if record.arrival is None else record.arrival[0]
+        if record.tracked and against in place and (record.evidence.points_strong or record.evidence.placed_by_surface):
+            ends.append((stretch_of[row_of[record.frame]], place[against]))
+    first, second = np.array([end for end in ends if min(end) >= 0], int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(first)), (first, second)), (len(stretches),) * 2)
+    _, label = connected_components(graph, directed=False)
+    main = np.bincount(label, [len(rows) for rows in stretches]).argmax()
+    found = []
+    for rows in (rows for number, rows in enumerate(stretches) if label[number] != main):
+        start, end = int(claim.frames[rows[0]]), int(claim.frames[rows[-1]])
+        text = f"frames {start} to {end} hang on the rest by few matches only: their place is not confirmed"
+        found.append(Finding("link", "degraded", text, start, end, local=len(rows) < MAX_LOST * len(claim)))
+    return found
+
+
+def explanations(
+    slam: Slam, claim: Claim, corners: Sequence[FrameEvidence], stretches: Sequence[np.ndarray]
+) -> list[Explanation]:
+    """What the corners of each window prefer."""
     height, width = slam.keyframes[0].size
     found = []
-    for stretch in linked(corners, claim.tracked):
+    for stretch in stretches:
         for rows in windows(thinned(corners, stretch)):
             tracks = tracks_of(claim, corners, rows, (width, height)) if len(rows) >= MIN_FRAMES else None
             if tracks is not None:

@@ -33,7 +33,7 @@ def linked(evidence: Sequence[FrameEvidence], tracked: np.ndarray) -> list[np.nd
         return []
     cuts = [
         place + 1
-        for place, (row, after) in enumerate(pairwise(rows))
+        for place, (row, after) in enumerate(pairwise(rows.tolist()))
         if common(evidence[row], evidence[after]) < MIN_COMMON
     ]
     return np.split(rows, cuts)

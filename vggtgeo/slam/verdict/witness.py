@@ -177,7 +177,7 @@ class EvidenceRecorder(Callback):
         same = before is not None and small is not None and np.array_equal(before, small, equal_nan=True)
         if not same:
             self._owned = True
-        elif not np.array_equal(grey, self._image):
+        elif self._image is None or not np.array_equal(grey, self._image):
             self._owned = False
         return depth if self._owned else None
 
