@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from vggtgeo.evaluation.alignment import umeyama
@@ -27,7 +28,6 @@ from vggtgeo.slam.verdict.adjustment import (
     Noise,
     Tracks,
     Unknowns,
-    reduce,
     solve,
     start_of,
 )
@@ -229,9 +229,23 @@ def second_motion(tracks: Tracks, noise: Noise, outliers: np.ndarray) -> tuple[f
     theirs = np.zeros(len(tracks.first), bool)
     theirs[np.flatnonzero(outliers)[explained]] = True
     share = float(np.mean(theirs[tracks.track]))
-    if share < MIN_SHARE or np.count_nonzero(explained) < 0.5 * len(explained):
-        return 0.0, None, np.zeros(len(tracks.first), bool)
+    none = 0.0, None, np.zeros(len(tracks.first), bool)
+    if share < MIN_SHARE or not _predicts(own, other, noise):
+        return none
     return share, other.unknowns.poses, theirs
+
+
+def _predicts(tracks: Tracks, motion: Fit, noise: Noise) -> bool:
+    """Whether the motion, fitted to one half of the tracks, explains most of the other: few tracks have free poses that
+    fit them, whatever they do.
+    """
+    half = np.arange(len(tracks.first)) % 2 == 0
+    first, kept = subset(replace(tracks, depth=np.full(len(tracks.depth), np.nan)), half)
+    fit = solve(first, replace(motion.unknowns, points=motion.unknowns.points[kept]), noise)
+    second, kept = subset(replace(tracks, depth=np.full(len(tracks.depth), np.nan)), ~half)
+    start = replace(fit.unknowns, points=motion.unknowns.points[kept])
+    predicted = solve(second, start, noise, poses_free=False)
+    return float(np.mean(~_outliers(second, predicted))) > 0.5
 
 
 def _in_chart(tracks: Tracks, start: Unknowns, poses: np.ndarray) -> np.ndarray:
@@ -247,7 +261,7 @@ def _in_chart(tracks: Tracks, start: Unknowns, poses: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Consequence:
-    """How far a motion is from the claim, RMS over frames, with the standard deviations of the same.
+    """How far a motion is from the claim, RMS over frames, and the standard deviations of the same.
 
     places: after alignment, in the unit of the map. turn: from frame to frame, rad.
     """
@@ -257,58 +271,39 @@ class Consequence:
     turn: float
     turn_sigma: float
 
-    def beyond_noise(self, least: float) -> tuple[float, float]:
-        """Places and turn without what their noise explains; zero below `least` standard deviations."""
-        return _beyond(self.places, self.places_sigma, least), _beyond(self.turn, self.turn_sigma, least)
 
+def consequence(explanation: Explanation, free_scale: bool) -> Consequence:
+    """Of the preferred explanation, as both halves of the tracks confirm it.
 
-def _beyond(value: float, sigma: float, least: float) -> float:
-    return float(np.sqrt(max(value**2 - sigma**2, 0.0))) if value > least * sigma else 0.0
-
-
-def consequence(tracks: Tracks, fit: Fit, free_scale: bool, as_one: float) -> Consequence:
-    """Of the motion of a fit, against that of the run; with free scale after the best similarity."""
-    places, claimed = rigid.invert(fit.unknowns.poses)[:, :3, 3], rigid.invert(tracks.poses)[:, :3, 3]
-    fitted = umeyama(places, claimed, free_scale)
-    off = fitted.scale * places @ fitted.rotation.T + fitted.translation - claimed
-    turns = _step_turns(fit.unknowns.poses, tracks.poses)
-    sigmas = np.sqrt(as_one) * np.array(_noise_of_motion(tracks, fit, free_scale))
-    rms = np.sqrt([np.mean(np.sum(off**2, 1)), np.mean(turns**2)])
-    return Consequence(float(rms[0]), float(sigmas[0]), float(rms[1]), float(sigmas[1]))
-
-
-def _step_turns(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Angle between the turns from frame to frame of two motions, rad, [f - 1]."""
-    step = lambda poses: poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)
-    between = step(first) @ np.swapaxes(step(second), 1, 2)
-    return np.asarray(np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1) / 2, -1, 1)))
-
-
-def _noise_of_motion(tracks: Tracks, fit: Fit, free_scale: bool) -> tuple[float, float]:
-    """Standard deviations of the places after alignment, and of the turns from frame to frame, RMS over frames, for
-    independent observations.
+    Each half is fitted by itself. Errors of tracks, mistracked corners among them, are independent between the halves:
+    the mean product of what both differ from the claim by is free of their noise, and half of what they differ from
+    each other by is the standard deviation of their mean.
     """
-    frames = len(tracks.rows)
-    reduced = reduce(tracks, fit.linear, fit.columns, True, 0.0)
-    inverse = np.linalg.pinv(reduced.matrix[6:, 6:], hermitian=True)
-    covariance = np.zeros((6 * frames, 6 * frames))
-    covariance[6:, 6:] = inverse[: 6 * frames - 6, : 6 * frames - 6]
-    blocks = covariance.reshape(frames, 6, frames, 6)
-    # A tangent moves the centre by -R' tau and turns the camera by R' omega.
-    back = np.swapaxes(fit.unknowns.poses[:, :3, :3], 1, 2)
-    carried = lambda part: np.einsum("fik,fkgl,gjl->figj", back, part, back, optimize=True)
-    places = carried(blocks[:, :3, :, :3]).reshape(3 * frames, 3 * frames)
-    centred = rigid.invert(fit.unknowns.poses)[:, :3, 3]
-    centred = centred - centred.mean(0)
-    modes = [np.tile(np.eye(3), (frames, 1)), np.stack([np.cross(a, centred) for a in np.eye(3)], 2).reshape(-1, 3)]
-    if free_scale:
-        modes.append(centred.reshape(-1, 1))
-    left, values, _ = np.linalg.svd(np.hstack(modes), full_matrices=False)
-    left = left[:, values > 1e-9 * max(float(values[0]), 1e-12)]
-    moved = max(float(np.trace(places) - np.trace(left.T @ places @ left)), 0.0) / frames
-    turns = carried(blocks[:, 3:, :, 3:])
-    rows = np.arange(frames - 1)
-    own = np.einsum("fifi->f", turns)
-    both = np.einsum("fifi->f", turns[1:, :, :-1])
-    turned = max(float(np.mean(own[rows] + own[rows + 1] - 2 * both)), 0.0)
-    return float(np.sqrt(moved)), float(np.sqrt(turned))
+    tracks, best = explanation.tracks, explanation.best
+    halves = []
+    for half in (0, 1):
+        some, kept = subset(tracks, np.arange(len(tracks.first)) % 2 == half)
+        start = replace(best.unknowns, points=best.unknowns.points[kept])
+        fit = solve(some, start, explanation.noise, best.columns)
+        halves.append(_differences(fit.unknowns.poses, tracks.poses, free_scale))
+    values = []
+    for first, second in zip(*halves, strict=True):
+        values.append(np.sqrt(max(float(np.mean(np.sum(first * second, 1))), 0.0)))
+        values.append(0.5 * np.sqrt(float(np.mean(np.sum((first - second) ** 2, 1)))))
+    return Consequence(*map(float, values))
+
+
+def difference(explanation: Explanation, free_scale: bool) -> tuple[float, float]:
+    """Places and turns by which the preferred explanation differs from the claim, RMS, noise included."""
+    off = _differences(explanation.best.unknowns.poses, explanation.tracks.poses, free_scale)
+    places, turn = (float(np.sqrt(np.mean(np.sum(one**2, 1)))) for one in off)
+    return places, turn
+
+
+def _differences(poses: np.ndarray, claimed: np.ndarray, free_scale: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Of the places after alignment, float64 [f, 3], and of the turns from frame to frame, rad, [f - 1, 3]."""
+    places, theirs = rigid.invert(poses)[:, :3, 3], rigid.invert(claimed)[:, :3, 3]
+    fitted = umeyama(places, theirs, free_scale)
+    step = lambda poses: poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)
+    turns = Rotation.from_matrix(step(poses) @ np.swapaxes(step(claimed), 1, 2)).as_rotvec()
+    return fitted.scale * places @ fitted.rotation.T + fitted.translation - theirs, np.asarray(turns)

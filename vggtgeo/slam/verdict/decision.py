@@ -2,10 +2,10 @@
 
 An explanation of a window (`alternatives.py`) is reported where
 
-- it is significant: an alternative was added at the level of `LEVEL`, or free poses differ from those of the run by
-  more than `SIGMAS` standard deviations; and
+- it is significant: two halves of the tracks, fitted apart, confirm its consequence by more than `SIGMAS` standard
+  deviations; an alternative beside free poses is added only at the level of `LEVEL`; and
 - it has a consequence: places differ from those of the run by more than `PLACES` (without depth `SHARE` of the path's
-  extent) beyond the explanation's own noise, or turns from frame to frame by more than `TURN`.
+  extent), or turns from frame to frame by more than `TURN`.
 
 The cause is named by what was added first: a second motion, a calibration, or poses alone. Reasons are exclusive: one a
 cause, at most `MAX_REASONS`, the largest consequence first.
@@ -14,12 +14,12 @@ cause, at most `MAX_REASONS`, the largest consequence first.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.verdict.alternatives import Consequence, Explanation, consequence
+from vggtgeo.slam.verdict.alternatives import Consequence, Explanation, consequence, difference
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.finding import Finding
 
@@ -29,8 +29,8 @@ SHARE = 0.06
 """Of the path's extent where lengths have no unit."""
 TURN = np.deg2rad(0.45)
 """Radians from frame to frame of a window, RMS."""
-SIGMAS = 3.0
-"""Standard deviations by which free poses must differ from those of the run."""
+SIGMAS = 2.0
+"""Standard deviations of a consequence: two halves of the tracks then agree on four fifths of its square."""
 RIVAL = 0.2
 """Share of the explained corners that follow a second motion, beyond which it is not sure which one is the camera's."""
 DEPTH_NOISE = 0.08
@@ -58,19 +58,24 @@ def contradiction(explanation: Explanation, metric: bool) -> Contradiction | Non
     """What the explanation of a window contradicts; None where it does not matter."""
     tracks = explanation.tracks
     with_depth = bool(np.isfinite(tracks.depth).any())
-    found = consequence(tracks, explanation.best, not with_depth, explanation.as_one)
-    limit = PLACES if metric else SHARE * extent(tracks.poses)
-    # An alternative that was added is significant by itself; poses alone are by what they differ from the claim.
-    places, turn = found.beyond_noise(1.0 if explanation.added else SIGMAS)
-    size = max(places / max(limit, 1e-12), turn / TURN)
+    limits = PLACES if metric else SHARE * max(extent(tracks.poses), 1e-12), TURN
+    cause = None
     if explanation.rival > RIVAL * (explanation.rival + explanation.share):
-        return Contradiction(explanation, found, "second motion", max(size, 1.0))
-    if with_depth and explanation.noise.depth > DEPTH_NOISE:
-        return Contradiction(explanation, found, "depth", max(size, 1.0))
-    if size >= 1.0:
+        cause = "second motion"
+    elif with_depth and explanation.noise.depth > DEPTH_NOISE:
+        cause = "depth"
+    if cause is None and all(np.less(difference(explanation, not with_depth), limits)):
+        return None  # small even with its noise
+    found = consequence(explanation, not with_depth)
+    sizes = [
+        value / limit
+        for value, sigma, limit in zip(*np.reshape(astuple(found), (2, 2)).T, limits, strict=True)
+        if value > SIGMAS * sigma
+    ]
+    size = max(sizes, default=0.0)
+    if cause is None and size >= 1.0:
         cause = explanation.added[0].name if explanation.added else "poses"
-        return Contradiction(explanation, found, cause, size)
-    return None
+    return None if cause is None else Contradiction(explanation, found, cause, max(size, 1.0))
 
 
 def findings(claim: Claim, explanations: Sequence[Explanation]) -> list[Finding]:
@@ -87,7 +92,7 @@ def _without_depth(claim: Claim, explanations: Sequence[Explanation]) -> list[Co
     empty = [one for one in explanations if not np.isfinite(one.tracks.depth).any()]
     if not claim.metric or len(empty) == len(explanations):
         return []
-    return [Contradiction(one, consequence(one.tracks, one.best, True, one.as_one), "no depth", 1.0) for one in empty]
+    return [Contradiction(one, consequence(one, True), "no depth", 1.0) for one in empty]
 
 
 def _finding(claim: Claim, ones: list[Contradiction]) -> Finding:
