@@ -89,7 +89,7 @@ def test_a_healthy_walk_has_no_alternative(seed: int, metric: bool) -> None:
     found = here.explanation(metric=metric)
     assert found.added == ()
     assert found.rival == 0.0
-    off = consequence(found.tracks, found.best, not metric, found.as_one)
+    off = consequence(found, not metric)
     assert off.places < 3 * off.places_sigma + 0.002, off
     assert contradiction(found, metric) is None
 

@@ -275,15 +275,16 @@ class Consequence:
 def consequence(explanation: Explanation, free_scale: bool) -> Consequence:
     """Of the preferred explanation, as both halves of the tracks confirm it.
 
-    Each half is fitted by itself. Errors of tracks, mistracked corners among them, are independent between the halves:
-    the mean product of what both differ from the claim by is free of their noise, and half of what they differ from
-    each other by is the standard deviation of their mean.
+    Each half is fitted by itself, from the claimed poses, so that both do not begin at one wrong minimum. Errors of
+    tracks, mistracked corners among them, are independent between the halves: the mean product of what both differ from
+    the claim by is free of their noise, and half of what they differ from each other by is the standard deviation of
+    their mean.
     """
     tracks, best = explanation.tracks, explanation.best
     halves = []
     for half in (0, 1):
-        some, kept = subset(tracks, np.arange(len(tracks.first)) % 2 == half)
-        start = replace(best.unknowns, points=best.unknowns.points[kept])
+        some, _ = subset(tracks, np.arange(len(tracks.first)) % 2 == half)
+        start = replace(start_of(some), theta=best.unknowns.theta)
         fit = solve(some, start, explanation.noise, best.columns)
         halves.append(_differences(fit.unknowns.poses, tracks.poses, free_scale))
     values = []
