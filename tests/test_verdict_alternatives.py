@@ -160,3 +160,22 @@ def test_no_second_motion_in_noise() -> None:
     assert share == 0.0
     assert poses is None
     assert np.isfinite(start_of(wild).points).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_halves_confirm_a_displacement_and_not_mistracked_corners(seed: int) -> None:
+    """Few corners, a quarter of which wander off: what both halves of them differ from the true poses by is within the
+    noise; displaced poses are confirmed. Oracle: the truth.
+    """
+    here = walk(COUNT, seed=seed, density=60)
+    tracks = here.tracks()
+    rng = np.random.default_rng(seed)
+    wander = np.cumsum(3.0 * rng.standard_normal(tracks.pixels.shape), axis=0)
+    wander = np.where((tracks.track % 4 == 0)[:, None], wander - wander[tracks.first][tracks.track], 0.0)
+    wandering = replace(tracks, pixels=tracks.pixels + wander)
+    assert contradiction(explain(wandering), True) is None
+    poses = here.claim.poses.copy()
+    poses[8:14, 0, 3] += 0.15
+    one = contradiction(explain(replace(wandering, poses=poses)), True)
+    assert one is not None
+    assert one.consequence.places == pytest.approx(np.sqrt(0.15**2 * 6 / COUNT * (1 - 6 / COUNT)), rel=0.3)
