@@ -16,7 +16,7 @@ from vggtgeo.results.result import Result
 from vggtgeo.slam.verdict import judge as judge_module
 from vggtgeo.slam.verdict.decision import MAX_REASONS, findings
 from vggtgeo.slam.verdict.finding import Finding, Verdict
-from vggtgeo.slam.verdict.judge import judge, judge_or_report
+from vggtgeo.slam.verdict.judge import check_unit, judge, judge_or_report
 from vggtgeo.slam.verdict.windows import WINDOW, linked, thinned, windows
 from vggtgeo.slam.verdict.witness import EvidenceRecorder
 
@@ -103,3 +103,13 @@ def test_windows_cover_all_linked_frames_and_break_where_nothing_is_common() -> 
     assert (parts[0][0], parts[-1][-1]) == (0, 99)
     assert all(len(part) == WINDOW for part in parts)
     assert all(second[0] < first[-1] for first, second in pairwise(parts))
+
+
+def test_a_wrong_unit_of_depth_is_reported() -> None:
+    """Depths ten times too small or five times too large put the scale in doubt; oracle: the factor."""
+    here = walk(4)
+    for factor, told in ((1.0, False), (0.1, True), (5.0, True)):
+        corners = [replace(frame, depth=(factor * frame.depth).astype(np.float32)) for frame in here.evidence]
+        found = check_unit(here.claim, corners)
+        assert [one.scale for one in found] == [True] * told, factor
+    assert check_unit(replace(here.claim, metric=False), here.evidence) == []

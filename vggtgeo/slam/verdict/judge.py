@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from vggtgeo.datasets.check import PLAUSIBLE
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import STRONG_INLIERS
@@ -21,6 +22,8 @@ from vggtgeo.slam.verdict.witness import Evidence, FrameEvidence
 
 MIN_FRAMES = 4
 """Frames of a window; in fewer, free poses explain nearly all."""
+NEAREST = 0.2
+"""Metres: sensors for rooms see nothing nearer."""
 MAX_UNKNOWN = 0.55
 """Median standard deviation of the places over their spread, beyond which a path without depth has no shape."""
 
@@ -40,6 +43,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     found += check_extent(claim, None if known is None else known.translation)
     corners = aligned(slam, claim, evidence) if claim.started and len(claim) > 1 else None
     if corners is not None:
+        found += check_unit(claim, corners)
         stretches = linked(corners, claim.tracked)
         found += unlinked(slam, claim, stretches)
         found += findings(claim, explanations(slam, claim, corners, stretches))
@@ -74,6 +78,22 @@ def check_extent(claim: Claim, sigma: np.ndarray | None) -> list[Finding]:
         "moves, and without depth the path is not determined"
     )
     return [Finding("extent", "degraded", text)]
+
+
+def check_unit(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
+    """Whether measured depths are in the range of sensors for rooms: images alone cannot tell a wrong unit."""
+    depths = np.concatenate([frame.depth for frame in corners])
+    depths = depths[np.isfinite(depths)]
+    if not claim.metric or not len(depths):
+        return []
+    near, middle = np.quantile(depths, [0.1, 0.5])
+    if near >= NEAREST and PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
+        return []
+    text = (
+        f"the median depth of the corners is {middle:.2g} m, and a tenth of them is within {near:.2g} m, outside the "
+        "range of sensors for rooms: check the unit of the depth images"
+    )
+    return [Finding("depth unit", "degraded", text, scale=True)]
 
 
 def unlinked(slam: Slam, claim: Claim, stretches: Sequence[np.ndarray]) -> list[Finding]:
