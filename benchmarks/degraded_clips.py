@@ -14,7 +14,7 @@ from vggtgeo.benchmark.inputs import DegradedWalk
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation.degradations import Degradation, Recording
-from vggtgeo.slam.trust.evidence import Evidence
+from vggtgeo.slam.verdict.witness import Evidence
 
 
 def degraded_clips(

@@ -3,8 +3,8 @@
     .venv/bin/python benchmarks/followed_corners.py ../shared/data/* [--frames 120]
 
 A row for each clip and light: how many corners two neighbouring frames share (median, least), the share of them that
-the true poses and depths explain (median, lowest twentieth), and steps that would be called contradicted. No run takes
-part: what is wrong here is a false alarm of `vggtgeo/slam/trust/steps.py`; fewer than 8 corners say nothing. Bands:
+the true poses and depths explain to `AGREE` pixels (median, lowest twentieth), and steps with too few to link two
+frames. Bands:
 grey levels, root mean square, by which two images differ in what is common to a row (median, highest twentieth).
 """
 
@@ -21,8 +21,11 @@ import numpy as np
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, in_bands_of_light, with_images
-from vggtgeo.slam.trust.evidence import common_to_rows
-from vggtgeo.slam.trust.steps import LEAST_CORNERS, Step, compare
+from vggtgeo.slam.verdict.windows import MIN_COMMON
+from vggtgeo.slam.verdict.witness import FrameEvidence, common_to_rows
+
+AGREE = 3.0
+"""Pixels."""
 
 
 def main() -> None:
@@ -31,9 +34,7 @@ def main() -> None:
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=120)
     options = parser.parse_args()
-    print(
-        "| clip | light | corners | least | agree | lowest 5 % | contradicted | too few | bands |\n" + "|---" * 9 + "|"
-    )
+    print("| clip | light | corners | least | agree | lowest 5 % | too few | bands |\n" + "|---" * 8 + "|")
     for folder in options.clips:
         if not folder.is_dir():
             continue
@@ -44,18 +45,18 @@ def main() -> None:
         recording = Recording(list(clip.frames(0, options.frames)), clip.camera, truth)
         for name, light in LIGHTS.items():
             found, bands = _steps(with_images(recording, light))
-            counts, shares = np.array([len(s.agrees) for s in found]), np.array([_share(s) for s in found])
-            few, wrong = np.count_nonzero(counts < LEAST_CORNERS), sum(step.contradicted for step in found)
+            counts, shares = np.array([len(off) for off in found]), np.array([_share(off) for off in found])
+            few = np.count_nonzero(counts < MIN_COMMON)
             print(
                 f"| {clip.name} | {name} | {np.median(counts):.0f} | {counts.min()} | {np.nanmedian(shares):.2f} | "
-                f"{np.nanquantile(shares, 0.05):.2f} | {wrong} | {few} | "
+                f"{np.nanquantile(shares, 0.05):.2f} | {few} | "
                 f"{np.median(bands):.1f}, {np.quantile(bands, 0.95):.1f} |",
                 flush=True,
             )
 
 
-def _steps(recording: Recording) -> tuple[list[Step], list[float]]:
-    """The true steps against the corners, and the bands of light from image to image."""
+def _steps(recording: Recording) -> tuple[list[np.ndarray], list[float]]:
+    """How far corners are from where the truth carries them, step by step, and the bands of light."""
     recorder, images = vg.callbacks.EvidenceRecorder(recording.camera), []
     for frame in recording.frames:
         recorder.add(frame)
@@ -64,12 +65,21 @@ def _steps(recording: Recording) -> tuple[list[Step], list[float]]:
     nearest = [int(np.abs(times - frame.timestamp).argmin()) for frame in recording.frames]
     poses, inner = rigid.invert(recording.truth.poses[nearest]), np.array(recording.camera.intrinsics)
     pairs = pairwise(zip(recorder.frames, poses, strict=True))
-    taken = [compare(a, b, after @ rigid.invert(before), inner) for (a, before), (b, after) in pairs]
+    taken = [_off(a, before, b, after, inner) for (a, before), (b, after) in pairs]
     return taken, [float(np.sqrt(np.mean(common_to_rows(*pair) ** 2))) for pair in pairwise(images)]
 
 
-def _share(step: Step) -> float:
-    return float(np.mean(step.agrees)) if len(step.agrees) else float("nan")
+def _off(
+    first: FrameEvidence, before: np.ndarray, second: FrameEvidence, after: np.ndarray, inner: np.ndarray
+) -> np.ndarray:
+    _, rows, others = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+    points = rigid.unproject(first.pixels[rows].astype(np.float64), 1.0 / first.depth[rows], before, inner)
+    return np.asarray(np.linalg.norm(rigid.project(points, after, inner) - second.pixels[others], axis=1))
+
+
+def _share(off: np.ndarray) -> float:
+    known = off[np.isfinite(off)]
+    return float(np.mean(known < AGREE)) if len(known) else float("nan")
 
 
 def _whole(image: np.ndarray) -> np.ndarray:

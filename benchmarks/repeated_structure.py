@@ -26,7 +26,7 @@ from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.connected import loop_edges
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.verdict.judge import judge
 from vggtgeo.slam.window.pending_window import settled
 
 HEADER = (

@@ -188,14 +188,14 @@ def run(case: Case, render: Callable[[Walk], Recording], out: Path) -> str:
     part.mkdir(parents=True)
     sequence = SequenceView(DegradedWalk(case.name, recording), recording.camera, not case.rgb_only)
     judged_by: list[tuple[Any, ...]] = []
-    judge = reconstruction.judged_or_told
+    judge = reconstruction.judge_or_report
 
     def noting(*arguments: Any) -> vg.Verdict:
         judged_by.append(arguments)
         return judge(*arguments)
 
     facts: dict[str, Any] = {}
-    with warnings.catch_warnings(), mock.patch.object(reconstruction, "judged_or_told", noting):
+    with warnings.catch_warnings(), mock.patch.object(reconstruction, "judge_or_report", noting):
         warnings.simplefilter("ignore")
         try:
             result = vg.reconstruct(sequence, dense="none")
@@ -358,7 +358,7 @@ def _options() -> argparse.Namespace:
     making.add_argument("--count", type=int, default=420, help="runs in both halves together")
     making.add_argument("--jobs", type=int, default=1, help="processes; each runs many cases")
     judging.add_argument("--saved", action="store_true", help="take the verdicts that the runs gave")
-    judging.add_argument("--judge", default="vggtgeo.slam.trust.judge", help="module with the function `judge`")
+    judging.add_argument("--judge", default="vggtgeo.slam.verdict.judge", help="module with the function `judge`")
     judging.add_argument("--half", choices=HALVES, help="this half alone")
     judging.add_argument("--verbose", action="store_true", help="print each run whose verdict is not right")
     judging.add_argument("--page", type=Path, help="file that gets the table, too")

@@ -121,10 +121,10 @@ def shared_cases() -> Path:
 
 @pytest.fixture(scope="session")
 def healthy() -> Any:
-    """A synthetic walk that no check of the verdict has anything to say of."""
+    """A synthetic walk in which the verdict finds nothing."""
     from witness import walk  # after the hook above
 
-    return walk()
+    return walk(40)
 
 
 @pytest.fixture

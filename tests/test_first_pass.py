@@ -26,7 +26,7 @@ from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.estimate import Estimate
+from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.window.pending_window import settled
 from vggtgeo.slam.window.sliding_window import _camera_sigma
 
@@ -50,10 +50,10 @@ def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
 
 def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that camera and lens are handed on, with a word for the user, and nothing else of the pass.
-    slam = begun(monkeypatch, found(lens=LENS, focal_without_lens=300.0))
+    slam = begun(monkeypatch, found(lens=LENS))
     assert slam is not None
     assert slam.camera_found
-    assert (slam.lens, slam.focal_without_lens) == (LENS, 300.0)
+    assert slam.lens == LENS
     assert slam.intrinsics.tolist() == slam.given_intrinsics.tolist() == list(LENS.intrinsics)
     for focal in (280.0, 5000.0):
         far = replace(slam, given_intrinsics=np.array([focal, focal, 158.0, 121.0]))
@@ -76,7 +76,7 @@ def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
         numbers = frozenset(range(count))
         pairs = tuple(pair for pair in wide.pairs if numbers.issuperset(pair.key))
         frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
-        assert Estimate.of(replace(slam, pairs=pairs, frames=frames, factors=(), origins=(0,))).guessed == held
+        assert Claim.of(replace(slam, pairs=pairs, frames=frames, factors=(), origins=(0,))).guessed == held
 
 
 def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,8 +31,8 @@ from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.sparse_map.known_map import as_map, entered, save_map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
-from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.judge import judge
 from vggtgeo.slam.window.pending_window import settled
 
 FRAMES, HALF = 18, 9
@@ -128,8 +128,8 @@ def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: P
         place = [name for name, _ in header["classes"]].index("Keyframe")
         header["version"] = 1
         header["classes"][place][1].remove("recorded")
-        # Of versions 10, 9, 8, 7, 5, 4 and 3.
-        later = ("focal_with_lens", "focal_without_lens", "between", "readout", "focal_wanted", "camera_found", "lens")
+        # Of versions 8, 7, 4 and 3.
+        later = ("between", "readout", "camera_found", "lens")
         for field in later:
             assert header["classes"][header["tree"]["c"]][1].pop() == field
             header["tree"]["v"].pop()
@@ -190,8 +190,8 @@ def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     slam = run(0, 6, seed=3, settings=FIXED, known_map=known)
     assert not any(record.tracked for record in slam.frames)
     assert len(slam.waiting) == 6
-    assert "none of the 6 frames was found in the known map" in judge(slam).reasons[0]
-    assert not Estimate.of(first_half()).in_known_map
+    assert "0 of 6 frames were found in the known map" in judge(slam).reasons[0]
+    assert not Claim.of(first_half()).in_known_map
 
 
 def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS, recorded_run
-from same_leaves import differences
 from vggtgeo.models import pinhole
 from vggtgeo.models.classical import NoDepth, SiftMatcher
 
@@ -28,9 +27,9 @@ from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, larges
 from vggtgeo.slam.global_map.global_adjustment import _taken_lens
 from vggtgeo.slam.sparse_map.known_map import as_map, entered
 from vggtgeo.slam.state import SeenPoints, Slam
-from vggtgeo.slam.trust import judge as judging
-from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.evidence import FrameEvidence
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.judge import aligned
+from vggtgeo.slam.verdict.witness import FrameEvidence
 from vggtgeo.slam.window.pending_window import settled
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
@@ -121,18 +120,14 @@ def test_few_keyframes_tell_no_lens() -> None:
     assert enough.needed < float("inf")
 
 
-def test_a_lens_that_is_not_taken_leaves_its_focal_length() -> None:
-    # Proves that the state keeps what a lens would change that matches do not ask for, for the verdict to tell, and
-    # forgets it where the next adjustment finds none, or one that folds the image. Oracle: the lens.
+def test_a_lens_that_does_not_pay_is_not_taken() -> None:
+    # Proves that the state stays where matches do not ask for a lens, or it folds the image. Oracle: the state.
     slam = settled(recorded_run().states[-1])
     assert slam.solved is not None
     adjustment, state = slam.solved
     left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
-    kept = _taken_lens(slam, adjustment, left_out)
-    assert kept.focal_with_lens == LENS.intrinsics[0] == Estimate.of(kept).focal_with_lens
-    assert list(differences(replace(kept, focal_with_lens=None), slam)) == []
-    for found in (None, replace(left_out, warp=float("inf"))):
-        assert _taken_lens(kept, adjustment, found).focal_with_lens is None
+    for found in (None, left_out, replace(left_out, warp=float("inf"))):
+        assert _taken_lens(slam, adjustment, found) is slam
 
 
 def test_a_lens_that_folds_the_image_is_none() -> None:
@@ -200,15 +195,14 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
     np.testing.assert_allclose(redrawn(last.pixels), kept.pixels, atol=1e-3)
 
 
-def test_corners_of_the_verdict_go_through_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_corners_of_the_verdict_go_through_the_lens() -> None:
     # Proves that the witness sees the same camera as the map. Oracle: what it is given, back through the lens.
     slam = undistorted(run_of_room(), LENS)
     seen = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]], np.float32)
     nothing = np.zeros(3, np.float32)
-    noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing, 1.0, 0.5, 30.0) for r in slam.frames]
-    given: list[FrameEvidence] = []
-    monkeypatch.setattr(judging, "_images", lambda slam, estimate, evidence, size: given.extend(evidence) or [])
-    judging.judge(slam, noted)
+    noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing) for r in slam.frames]
+    given = aligned(slam, Claim.of(slam), noted)
+    assert given is not None
     assert len(given) == len(slam.frames) > 1
     np.testing.assert_allclose(redrawn(given[0].pixels), seen, atol=1e-3)
 

@@ -12,7 +12,7 @@ import pytest
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.camera.calibration import Refinement, free_focal, try_camera
+from vggtgeo.slam.camera.calibration import Refinement, try_camera
 from vggtgeo.slam.camera.camera_of_pairs import CameraPair, _Points, camera_of_pairs
 
 HELD = 1e-6
@@ -108,23 +108,3 @@ def test_the_derivatives_of_pairs_are_those_of_their_residuals() -> None:
         expected = (changed(step) - changed(-step)) / (2 * size)
         np.testing.assert_allclose(exact[:, :, 6 + column], expected, rtol=1e-4, atol=1e-3)
     np.testing.assert_array_equal(exact[:, :, 10], points.residuals(poses, camera, intrinsics))
-
-
-def test_matches_alone_tell_a_wrong_focal_length() -> None:
-    # Proves that without any depth a camera 20 % off is told, with the right focal length to 3 %, and that nothing else
-    # than the right one is wanted of a camera that is right. Oracle: the camera that the window was drawn with.
-    window = vg.simulate_window(seed=2, **WINDOW)
-    solve = lambda problem, state: _solve(problem, state).state
-    for factor in (0.8, 1.0, 1.2):
-        given = window.intrinsics * np.array([factor, factor, 1.0, 1.0])
-        problem, initial, _ = window.pack(
-            fixed_intrinsics=False, intrinsics_mean=given, intrinsics_sigma=np.full(4, HELD * given[0])
-        )
-        problem = problem.with_term(problem.depth.reweighted(jnp.zeros_like(problem.depth.weight)))
-        start = eqx.tree_at(lambda state: state.intrinsics, initial, jnp.asarray(given))
-        wanted = free_focal(problem, solve(problem, start), solve)
-        if factor == 1.0:
-            assert wanted is None or np.abs(wanted / given[:2] - 1).max() < 0.03
-        else:
-            assert wanted is not None, factor
-            np.testing.assert_allclose(wanted, window.intrinsics[:2], rtol=0.03)

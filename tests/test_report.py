@@ -25,7 +25,7 @@ from vggtgeo.report import write_page
 from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.finding import Finding, Verdict, conclude
+from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 

@@ -29,8 +29,8 @@ from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.evidence import FrameEvidence
-from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.verdict.judge import judge
+from vggtgeo.slam.verdict.witness import FrameEvidence
 
 TIMES = ("seconds_by_stage", "frames_per_second", "peak_memory_gb")
 
@@ -79,7 +79,7 @@ def run(monkeypatch: pytest.MonkeyPatch, checkpoints: Checkpoints | None = None,
         seen.extend(evidence)
         return judge(slam, evidence, *rest)
 
-    monkeypatch.setattr(reconstruction, "judged_or_told", judged)
+    monkeypatch.setattr(reconstruction, "judge_or_report", judged)
     given = {"frames": sequence(), "roles": ROLES, "settings": SETTINGS, "dense": "none", **options}
     return Run(reconstruct(**given, checkpoints=checkpoints), tuple(seen))
 

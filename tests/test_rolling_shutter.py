@@ -33,9 +33,6 @@ from vggtgeo.slam.camera.rolling_shutter import (
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
 from vggtgeo.slam.state import Readout
 from vggtgeo.slam.tracking.carried_poses import carried_poses
-from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.trust.evidence import EvidenceRecorder, FrameEvidence, common
-from vggtgeo.slam.trust.shutter import check_shutter, corners_at_once
 
 WIDTH, HEIGHT = SIZE
 KEYFRAMES = 8
@@ -244,17 +241,6 @@ def test_frames_far_apart_say_nothing_of_the_motion() -> None:
     assert np.all(camera_motions(replace(slam, frames=lost), 3)[1] == 0)
 
 
-@pytest.mark.parametrize(("shift", "columns", "told"), [(12.0, False, True), (12.0, True, True), (2.0, False, False)])
-def test_a_readout_that_moves_much_is_told(shift: float, columns: bool, told: bool) -> None:
-    """The sentence names the time and the direction; what moves matches by a few pixels is no fault."""
-    estimate = replace(Estimate.of(recorded_run().slam), readout=Readout(-0.0301, columns, shift))
-    reasons = [finding.text for finding in check_shutter(estimate)]
-    assert len(reasons) == told
-    for reason in reasons:
-        assert "over about 30 ms" in reason
-        assert ("columns" if columns else "rows") in reason
-
-
 @pytest.mark.slow
 def test_rows_are_drawn_as_the_simulated_camera_draws_them() -> None:
     """A picture of one moment, drawn again row by row by its depth and the true motion, is the one that the simulated
@@ -276,41 +262,6 @@ def test_rows_are_drawn_as_the_simulated_camera_draws_them() -> None:
     assert left < 0.35 * changed, (changed, left)
     with pytest.raises(vg.InputError, match="has no depth; a rolling shutter is drawn by it"):
         rolled(replace(frames[0], depth=None), velocities[0], at_once.camera.intrinsics, 0.02)
-
-
-@pytest.mark.long
-def test_corners_that_judge_are_of_the_middle_of_the_image() -> None:
-    """Where rows are read one by one, depth and true motion carry corners beside where they were followed, and nearer
-    to that once the readout is taken out of them; oracle: the simulated camera.
-    """
-    readout = 0.08
-    sensor = vg.simulation.Sensor(readout_time=readout)
-    sequence = vg.simulate("room", 9, 0, (320, 240), rate=10.0, speed=1.5, sensor=sensor)
-    recorder = EvidenceRecorder(sequence.camera)
-    for frame in sequence.frames():
-        recorder.add(frame)
-    run = recorded_run().slam
-    poses = rigid.invert(sequence.ground_truth().poses)
-    frames = tuple(
-        replace(record, reference=0, relative=pose @ rigid.invert(poses[0]), arrival=None)
-        for record, pose in zip(run.frames, poses, strict=True)
-    )
-    first = replace(run.keyframes[0], pose=poses[0])
-    slam = replace(run, keyframes=(first, *run.keyframes[1:]), frames=frames, readout=Readout(readout, False, 9.0))
-
-    def off(evidence: list[FrameEvidence]) -> float:
-        """Median distance of corners from where depth and true motion carry them over two frames, pixels."""
-        found = []
-        for row in range(len(poses) - 2):
-            here, there = common(evidence[row], evidence[row + 2])
-            places = rigid.unproject(
-                evidence[row].pixels[here], 1 / evidence[row].depth[here], poses[row], slam.intrinsics
-            )
-            carried = rigid.project(places, poses[row + 2], slam.intrinsics)
-            found.append(np.linalg.norm(carried - evidence[row + 2].pixels[there], axis=1))
-        return float(np.nanmedian(np.concatenate(found)))
-
-    assert off(corners_at_once(slam, recorder.frames)) < 0.6 * off(recorder.frames)
 
 
 @pytest.mark.slow  # two runs whose cameras are compiled anew: two minutes

@@ -107,7 +107,7 @@ def test_a_new_run_replaces_the_old_one_as_a_whole(frames: Path, tmp_path: Path)
 STAGES = (
     "vggtgeo.results.reconstruction.finish",
     "vggtgeo.results.reconstruction.dense_map",
-    "vggtgeo.results.reconstruction.judged_or_told",
+    "vggtgeo.results.reconstruction.judge_or_report",
     "vggtgeo.results.result.write_settings",
     "vggtgeo.results.result.write_json",
     "vggtgeo.results.result.write_page",

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from witness import Walk
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.run import with_own_depth
-from vggtgeo.slam.trust.depth_images import check_frozen
-from vggtgeo.slam.trust.evidence import EvidenceRecorder
+from vggtgeo.slam.verdict.witness import EvidenceRecorder
 
 rng = np.random.default_rng(0)
 
@@ -47,12 +43,3 @@ def test_depth_of_another_picture_is_not_used() -> None:
     for frame in frames[:7]:
         recorder.add(frame)
     assert [bool(np.isfinite(noted.depth).any()) for noted in recorder.frames] == own[:7]
-    assert [noted.depth_changed == 0 for noted in recorder.frames] == [False, True, False, True, True, True, False]
-
-
-def test_a_slower_depth_camera_is_no_fault(healthy: Walk) -> None:
-    """Depth at half and at a fifth of the rate of the pictures is not frozen; what stays longer is."""
-    for every, told in ((2, False), (5, False), (7, True)):
-        frames = [replace(f, depth_changed=1.0 if f.frame % every == 0 else 0.0) for f in healthy.evidence]
-        found = check_frozen(healthy.estimate, frames, harmless=lambda first, last: False)
-        assert bool(found) == told, every

@@ -76,10 +76,7 @@ def full(slam: Slam) -> Slam:
         pose_sigma=np.ones((2, 2)),
         pending=PendingWindow(7, slam, under_way),
         lens=Camera((140.0, 140.0, 80.0, 60.0), 160, 120, (-0.1, 0.0, 0.0, 0.0), known=False),
-        focal_wanted=np.array([140.0, 141.0]),
         readout=Readout(0.02, False, 3.0),
-        focal_without_lens=150.0,
-        focal_with_lens=130.0,
     )
 
 

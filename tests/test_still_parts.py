@@ -22,8 +22,8 @@ from vggtgeo.slam.camera.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.trust.evidence import EvidenceRecorder
-from vggtgeo.slam.trust.input import check_still_parts
+from vggtgeo.slam.verdict.input import check_still_parts
+from vggtgeo.slam.verdict.witness import EvidenceRecorder
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = vg.Camera((300.0, 300.0, 159.5, 119.5), WIDTH, HEIGHT)
@@ -142,7 +142,7 @@ def test_what_covers_most_of_the_picture_is_told(row: int, separable: bool) -> N
     assert found.share == pytest.approx(1 - row / HEIGHT, abs=0.06)
     (finding,) = check_still_parts(found, left_out=separable)
     assert finding.level == "degraded"
-    assert ("left out: if it is the room" if separable else "nothing was left out") in finding.text
+    assert ("masked as the camera's own" if separable else "nothing was masked") in finding.text
 
 
 @pytest.mark.parametrize(("count", "every"), [(11, 1), (30, 1), (50, 1), (50, 13), (600, 1)])

@@ -34,7 +34,7 @@ from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
-from vggtgeo.slam.trust.evidence import EvidenceSoFar, FrameEvidence
+from vggtgeo.slam.verdict.witness import EvidenceSoFar, FrameEvidence
 from vggtgeo.slam.window.window_recorder import WindowRecord
 
 _CONTEXT, _EXCERPT = 30, 110

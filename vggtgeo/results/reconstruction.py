@@ -37,10 +37,10 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.sparse_map.known_map import entered
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.evidence import EvidenceRecorder
-from vggtgeo.slam.trust.finding import Verdict
-from vggtgeo.slam.trust.input import check_input, check_refusals
-from vggtgeo.slam.trust.judge import judged_or_told
+from vggtgeo.slam.verdict.finding import Verdict
+from vggtgeo.slam.verdict.input import check_input, check_refusals
+from vggtgeo.slam.verdict.judge import judge_or_report
+from vggtgeo.slam.verdict.witness import EvidenceRecorder
 from vggtgeo.slam.window.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
@@ -224,7 +224,7 @@ def _conclude(
     def judge() -> Verdict:
         with clock.measure("verdict (own thread)"):
             of_input = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals) + overlay.findings()
-            return judged_or_told(slam, evidence.frames, of_input)
+            return judge_or_report(slam, evidence.frames, of_input)
 
     hooks.each("on_stage", "dense map and verdict")
     with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:

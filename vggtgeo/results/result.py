@@ -43,9 +43,9 @@ from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_unce
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.known_map import save_map
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.evidence import Evidence
-from vggtgeo.slam.trust.finding import Verdict
-from vggtgeo.slam.trust.judge import judge
+from vggtgeo.slam.verdict.finding import Verdict
+from vggtgeo.slam.verdict.judge import judge
+from vggtgeo.slam.verdict.witness import Evidence
 from vggtgeo.slam.window.pending_window import settled
 from vggtgeo.slam.window.window_recorder import WindowRecord
 

@@ -14,8 +14,8 @@ from vggtgeo.results.source import Source
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.still_parts import APART, PICTURES, StillParts, find_still_parts, small_grey, still_parts_of
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.finding import Finding
-from vggtgeo.slam.trust.input import check_still_parts
+from vggtgeo.slam.verdict.finding import Finding
+from vggtgeo.slam.verdict.input import check_still_parts
 
 
 class StaticOverlaySearch(Callback):

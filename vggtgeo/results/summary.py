@@ -22,7 +22,7 @@ from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.trust.finding import Verdict
+from vggtgeo.slam.verdict.finding import Verdict
 
 
 def compare_with_truth(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:

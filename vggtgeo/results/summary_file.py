@@ -10,7 +10,7 @@ from typing import Any
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.text_files import whole_text
-from vggtgeo.slam.trust.finding import Verdict
+from vggtgeo.slam.verdict.finding import Verdict
 
 
 def read_summary(folder: Path) -> tuple[dict[str, Any], Verdict]:

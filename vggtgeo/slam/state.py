@@ -147,13 +147,9 @@ class Slam:
     read, where the last adjustment found one: pixels and images of all keyframes, and `intrinsics`, are of images that
     it no longer distorts (`lens.py`). camera_found: nobody gave the camera, and `given_intrinsics` and `lens`
     are what a first pass over the frames found (`first_pass.py`), or the run that made the map which this one goes on
-    in: windows hold them, and the last adjustment estimates the camera once more. focal_wanted: the focal lengths that
-    the last adjustment of a given camera without measured depth finds if they are free, float64 [2], pixels; None where
-    they explain matches no better than chance. readout: of the rolling shutter that the last adjustment found and took
-    out of the poses (`rolling_shutter.py`); pixels and images stay as they were read. between: rows of the last frames,
-    and their views, that wait for the next keyframe (`frame_refinement.py`). focal_without_lens: the focal length, in
-    pixels, that the frames by which `lens` was found had told before it. focal_with_lens: the one that the last
-    adjustment found with a lens that it did not take.
+    in: windows hold them, and the last adjustment estimates the camera once more. readout: of the rolling shutter that
+    the last adjustment found and took out of the poses (`rolling_shutter.py`); pixels and images stay as they were
+    read. between: rows of the last frames, and their views, that wait for the next keyframe (`frame_refinement.py`).
     """
 
     intrinsics: np.ndarray
@@ -181,11 +177,8 @@ class Slam:
     pending: PendingWindow | None = None
     lens: Camera | None = None
     camera_found: bool = False
-    focal_wanted: np.ndarray | None = None
     readout: Readout | None = None
     between: tuple[tuple[int, RgbdView], ...] = ()
-    focal_without_lens: float | None = None
-    focal_with_lens: float | None = None
 
     def __repr__(self) -> str:
         frames, keyframes = len(self.frames), len(self.keyframes)

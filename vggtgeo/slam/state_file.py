@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import jaxlie
 
@@ -69,7 +70,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 13
+VERSION = 14
 
 
 def _with_recorded_times(header: Header) -> Header:
@@ -90,18 +91,6 @@ def _with_first_pass(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
-def _with_focal_wanted(header: Header) -> Header:
-    """Version 4 did not ask maps without depth whether their focal length is right."""
-    tree, classes = with_field(header["tree"], header["classes"], "Slam", "focal_wanted")
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_enlargement(header: Header) -> Header:
-    """Version 5 did not note by what factor a picture is larger than the one before."""
-    tree, classes = with_field(header["tree"], header["classes"], "FrameEvidence", "enlarged")
-    return {**header, "tree": tree, "classes": classes}
-
-
 def _with_readout(header: Header) -> Header:
     """Version 6 did not know rolling shutters."""
     tree, classes = with_field(header["tree"], header["classes"], "Slam", "readout")
@@ -115,18 +104,6 @@ def _with_second_motions(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
-def _with_focal_without_lens(header: Header) -> Header:
-    """Version 8 did not keep by how much a lens that was found changed the focal length."""
-    tree, classes = with_field(header["tree"], header["classes"], "Slam", "focal_without_lens")
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_focal_with_lens(header: Header) -> Header:
-    """Version 9 did not keep what the focal length would be with a lens that was tried and not taken."""
-    tree, classes = with_field(header["tree"], header["classes"], "Slam", "focal_with_lens")
-    return {**header, "tree": tree, "classes": classes}
-
-
 def _with_fisheyes(header: Header) -> Header:
     """Version 10 did not know fisheyes."""
     tree, classes = with_field(header["tree"], header["classes"], "Camera", "fisheye", False)
@@ -134,9 +111,8 @@ def _with_fisheyes(header: Header) -> Header:
 
 
 def _with_seen_points(header: Header) -> Header:
-    """Version 11 did not place frames against the points of the map as it is in the end, nor look at edges of depth."""
+    """Version 11 did not place frames against the points of the map as it is in the end."""
     tree, classes = with_field(header["tree"], header["classes"], "FramePose", "seen")
-    tree, classes = with_field(tree, classes, "FrameEvidence", "edges_elsewhere")
     return {**header, "tree": tree, "classes": classes}
 
 
@@ -148,19 +124,52 @@ def _with_rows(header: Header) -> Header:
     return {**header, "tree": tree, "classes": classes}
 
 
+def _as_it_is(header: Header) -> Header:
+    """What the next version added has gone since."""
+    return header
+
+
+def _without_old_checks(header: Header) -> Header:
+    """Version 13 kept what single checks of the verdict needed."""
+    gone = {
+        "Slam": ("focal_wanted", "focal_without_lens", "focal_with_lens"),
+        "FrameEvidence": ("depth_median", "depth_changed", "contrast", "enlarged", "edges_elsewhere"),
+    }
+    kept = {
+        number: [place for place, field in enumerate(fields) if field not in gone.get(kind, ())]
+        for number, (kind, fields) in enumerate(header["classes"])
+    }
+
+    def without(part: Any) -> Any:
+        if isinstance(part, list):
+            return [without(item) for item in part]
+        if not isinstance(part, dict):
+            return part
+        inside = {key: without(item) for key, item in part.items()}
+        if part.keys() == {"c", "v"}:
+            inside["v"] = [inside["v"][place] for place in kept[part["c"]] if place < len(inside["v"])]
+        return inside
+
+    classes = [
+        [kind, [fields[place] for place in kept[number]]] for number, (kind, fields) in enumerate(header["classes"])
+    ]
+    return {**header, "tree": without(header["tree"]), "classes": classes}
+
+
 UPGRADES = {
     1: _with_recorded_times,
     2: _with_lens,
     3: _with_first_pass,
-    4: _with_focal_wanted,
-    5: _with_enlargement,
+    4: _as_it_is,
+    5: _as_it_is,
     6: _with_readout,
     7: _with_second_motions,
-    8: _with_focal_without_lens,
-    9: _with_focal_with_lens,
+    8: _as_it_is,
+    9: _as_it_is,
     10: _with_fisheyes,
     11: _with_seen_points,
     12: _with_rows,
+    13: _without_old_checks,
 }
 """Of states, and of maps and checkpoints, which hold them."""
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)

@@ -15,10 +15,8 @@ a whole map knows better. So, once, in the last adjustment:
 
 Surfaces take no part in the trial: they were measured with the camera as it was given, and would hold it there.
 
-Without measured depth, pairs know only what depth the given camera made, and ask for that camera, whatever it is:
-building-walk's first 40 frames with a focal length 20 % too long came out 9 cm off, and nothing was said. So there the
-map is adjusted once more with the focal lengths free (`free_focal`). That is told, not taken: frames were matched,
-tracked and closed with the given ones, see `first_pass.py`.
+Without measured depth, pairs know only what depth the given camera made, and ask for that camera, whatever it is. So
+there the camera stays, and the verdict tests it.
 """
 
 from __future__ import annotations
@@ -44,8 +42,6 @@ PRIOR = 0.01
 CENTRE = 0.002
 """The same of the principal point, whose shift looks like a turn: with 1 %, two clips of one camera moved it by 1 and 8
 px, and the second lost by it (corridor-office 1.82 cm, now 1.46)."""
-FREE = 0.5
-"""Standard deviation of a focal length that nothing holds, relative."""
 SHARE = 0.5
 """Most variance of a direction by the pairs, of the prior's, for it to be moved at all."""
 SET_ASIDE = 0.2
@@ -115,25 +111,6 @@ def try_camera(pairs: list[CameraPair], problem: Problem, state: State, solve: S
     # The weights that count are those of the whole problem: training saw none of these matches.
     found, needed = gain((problem, held), (problem, moved), aside)
     return Refinement(given, wanted, distortion, moved, found, needed)
-
-
-def free_focal(problem: Problem, state: State, solve: Solve) -> np.ndarray | None:
-    """The focal lengths that explain the matches of a map best, float64 [2], pixels; None where they do so by no more
-    than chance.
-
-    problem, state: an adjustment without measured depth, its camera a `Pinhole` that was held. solve: adjusts any
-    problem of its shape.
-    """
-    prior = problem.intrinsics_prior
-    given = np.asarray(state.intrinsics, np.float64)
-    weight = prior.weight.at[:2].set(1.0 / (FREE * given[:2]) ** 2)
-    free = problem.with_term(eqx.tree_at(lambda term: term.weight, prior, weight))
-    moved = solve(free, state)
-    found = np.asarray(moved.intrinsics, np.float64)[:2]
-    if not (np.isfinite(found).all() and (found > 0).all()):
-        return None
-    better, needed = gain((problem, state), (free, moved), np.asarray(problem.points.present()), fitted=2)
-    return found if better > needed else None
 
 
 def camera_held_at(problem: Problem, intrinsics: np.ndarray) -> Problem:

@@ -29,8 +29,7 @@ LEAST_KEYFRAMES = 10
 """Without depth; as many as a window has: the camera of fewer is estimated from all of them while the run goes on, too.
 101 frames of icl-office, images alone, have six keyframes and hardly any parallax: 516 px (481 is true). With depth
 three tell it, as many as the last adjustment needs: 52 of these frames had 480.6 px in the end, but each pose the
-camera of its moment, 0.89 cm off in all; with a first pass 480.5 px and 0.08 cm (`benchmarks/starts.py
-../shared/data/icl-office --frames 52 --first 8 --depth --uncalibrated`)."""
+camera of its moment, 0.89 cm off in all; with a first pass 480.5 px and 0.08 cm."""
 MOST_PASSES, SETTLED = 3, 0.03
 """Of the same frames, and how far the focal length may be from the one that they were tracked with, relative. With a
 lens of k1 = -0.25, images alone: corridor-office 843 px and no lens after the first pass, 517 px and -0.20 after the
@@ -64,7 +63,6 @@ def begin_with_found_camera(
             given_intrinsics=found.intrinsics,
             camera_found=True,
             lens=found.lens,
-            focal_without_lens=found.focal_without_lens,
             notes=(_note(found, passes, camera),),
         )
         moved = np.abs(found.intrinsics[:2] / last[0].intrinsics[:2] - 1).max()

@@ -9,7 +9,7 @@ energy, whose derivative at an adjusted map needs no other adjustment (the envel
 A phone that is held upright reads columns of what is shown; the direction whose slope is surer is taken.
 
 Without measured depth the map bends to explain such images, and fits them: 240 frames of building-walk, whose camera
-takes 10 ms, were 7.5 cm off, and are 5.0. What is found is told where it is large (`trust/shutter.py`): frames were
+takes 10 ms, were 7.5 cm off, and are 5.0. Frames were
 matched and tracked as if each were of one moment, and where they move by 10 px in that time a map may be lost.
 """
 

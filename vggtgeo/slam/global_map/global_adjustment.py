@@ -10,7 +10,7 @@ import numpy as np
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
-from vggtgeo.slam.camera.calibration import Refinement, Solve, free_focal, keyframe_pairs, try_camera, without_surfaces
+from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted
 from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
 from vggtgeo.slam.camera.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
@@ -103,8 +103,6 @@ class _Whole:
         estimated, is held (see `_of_any_camera`).
         """
         before = slam.intrinsics
-        if slam.calibrated and not slam.metric:
-            slam = replace(slam, focal_wanted=free_focal(adjustment.problem, state, _solves(settings)))
         if settings.camera.refine_intrinsics != "never":
             slam = _with_its_camera(slam, adjustment, state, self.edges, settings)
         if settings.refinement.global_rounds == 1 or (slam.calibrated and slam.intrinsics is before):
@@ -219,14 +217,10 @@ def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, 
 
 
 def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
-    """The state of the run with its lens taken out, if that pays, and a word on it; else with what it would change."""
-    if found is None or np.isinf(found.warp):
-        return replace(slam, focal_with_lens=None)
-    if not found.pays:
-        return replace(slam, focal_with_lens=found.camera.intrinsics[0])
-    without = float(slam.intrinsics[0])
+    """The state of the run with its lens taken out, if that pays, and a note on it."""
+    if found is None or np.isinf(found.warp) or not found.pays:
+        return slam
     adjusted = undistorted(_taken(slam, adjustment, found.state), found.camera)
-    adjusted = replace(adjusted, focal_without_lens=without, focal_with_lens=None)
     k1, k2, *_ = found.camera.distortion
     note = (
         f"nobody gave the camera, and its lens distorts: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "

@@ -42,10 +42,8 @@ CALIBRATION = 0.01
 which every turn that is seen is too large or too small. Makers and calibration tools reach it
 (`slam/camera/calibration.py`); two runs with one camera refined it to 482.6 and 488.4 px."""
 CENTRE = 0.014
-"""Of the images' width and height: root mean square of how far published principal points are from the middle
-(`trust/calibration.py`). Where a calibration puts it there to the pixel nobody has measured it, and it turns every
-camera by one unknown angle: redkitchen's is 4 px aside, and with depth 44 % of its places, 59 % of its rotations lay
-within three standard deviations of COLMAP's, now 80 and 87."""
+"""Of the images' width and height: root mean square of how far published principal points are from the middle.
+Where a calibration puts it there to the pixel it was not measured, and it turns every camera by one unknown angle."""
 MIDDLE = 0.5
 """Pixels, within which a principal point is the middle, by whichever of the two ways to count pixels."""
 SHARED_ERRORS = 6.0

@@ -71,9 +71,9 @@ class MeasuredRelativePose:
 
 FREE_LENGTH = 0.1
 """Relative standard deviation of the length of a tracked motion without measured depth: as well as one keyframe hands
-its unit on to the next, 0.01 (redkitchen) to 0.09 (building-walk, `trust/scale_hand_over.py`). As sure as its
+its unit on to the next, 0.01 (redkitchen) to 0.09 (building-walk). As sure as its
 direction, the unit of the moment counts as measured again and again, and its drift is locked in: frames 160 to 239 of
-building-walk were 44.2 cm off, and are 2.2 (`benchmarks/starts.py --jpeg 95`). At 0.5 nothing holds it where a camera
+building-walk were 44.2 cm off, and are 2.2. At 0.5 nothing holds it where a camera
 turns on the spot: all of that clip was 38 cm off."""
 TIE_WIDTH = 12.6**0.5
 """Mahalanobis distance at which a measured motion counts half, so that one that all else contradicts (a false loop)

@@ -1,0 +1,27 @@
+"""A path that is no longer than its own error.
+
+The defect is planted into a healthy synthetic walk, which the check is silent about without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from witness import Walk
+
+from vggtgeo.slam.verdict.judge import check_extent
+
+
+def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) -> None:
+    """Of free scale, places that are known to two thirds of their spread are told, and those known to a third are not;
+    with metres it is no matter of scale. Oracle: the spread of the walk's own path.
+    """
+    free = replace(healthy.claim, metric=False)
+    spread = float(np.sqrt(free.centres.var(0).sum()))
+    sigma = np.where(np.arange(len(free)) % 3, np.nan, spread / 1.5)
+    assert [f.check for f in check_extent(free, sigma)] == ["extent"]
+    assert "67 % of their spread" in check_extent(free, sigma)[0].text
+    assert check_extent(free, sigma / 2) == []
+    assert check_extent(free, None) == []
+    assert check_extent(healthy.claim, sigma) == []

@@ -1,0 +1,67 @@
+"""Frames that were lost, and runs that never began.
+
+The defect is planted into a healthy synthetic walk, which the check is silent about without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from witness import Walk
+
+from vggtgeo.slam.verdict.record import check_record
+
+
+def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
+    """Two lost frames mark their segment; a tenth of them the run; most of them fail it; a second origin is told."""
+    lose = lambda rows: replace(healthy.claim, tracked=~np.isin(np.arange(40), rows))
+    assert [(f.start, f.end, f.local) for f in check_record(lose([7, 8]))] == [(7, 8, True)]
+    assert [f.local for f in check_record(lose(np.arange(10, 16)))] == [False]
+    assert "failed" in {f.level for f in check_record(lose(np.arange(8, 40)))}
+    assert [f.check for f in check_record(replace(healthy.claim, pieces=2))] == ["parts"]
+
+
+def test_many_losses_are_one_sentence(healthy: Walk) -> None:
+    """Every fourth frame lost, once two in a row: one reason, and each loss marks its own segment.
+
+    Forty sentences hid the other reasons of a run in which every second picture was of another place.
+    """
+    lost = np.arange(40) % 4 == 2
+    lost[11] = True
+    findings = check_record(replace(healthy.claim, tracked=~lost))
+    (reason,) = [finding for finding in findings if not finding.local]
+    assert reason.text == "11 of 40 frames were lost, 10 times, longest from frame 10 to 11; they have no pose"
+    assert [(f.start, f.end) for f in findings if f.local] == [(n, n + (n == 10)) for n in range(2, 40, 4)]
+
+
+def test_a_run_that_never_began_has_failed(healthy: Walk) -> None:
+    """No map, or one tracked frame: failed."""
+    never = replace(healthy.claim, tracked=np.arange(40) == 0)
+    assert [f.level for f in check_record(never)] == ["failed"]
+    assert [f.level for f in check_record(replace(healthy.claim, started=False))] == ["failed"]
+
+
+def test_a_single_frame_is_no_run(healthy: Walk) -> None:
+    """Nothing was compared with it, unless it was found in a map; two frames were."""
+    first = lambda count: replace(
+        healthy.claim,
+        **{name: getattr(healthy.claim, name)[:count] for name in ("frames", "times", "poses", "tracked")},
+    )
+    assert [f.level for f in check_record(first(1))] == ["degraded"]
+    assert not check_record(replace(first(1), in_known_map=True))
+    assert not check_record(first(2))
+
+
+def test_a_run_that_is_found_nowhere_in_a_map_says_so(healthy: Walk) -> None:
+    """In a known map the reason is that no frame, or one alone, was found there; oracle: the sentence."""
+    for found in (0, 1):
+        claim = replace(healthy.claim, tracked=np.arange(40) < found, in_known_map=True)
+        (finding,) = check_record(claim)
+        assert finding.level == "failed"
+        assert finding.text.startswith(f"{found} of 40 frames were found in the known map")
+
+
+def test_a_camera_that_is_a_guess_is_reported(healthy: Walk) -> None:
+    """An unknown camera of which too little was seen is a reason of its own; oracle: the claim."""
+    assert [f.check for f in check_record(replace(healthy.claim, guessed=True))] == ["camera"]

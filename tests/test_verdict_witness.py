@@ -1,0 +1,76 @@
+"""The recorder of the evidence that the checks look at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded_run import recorded_run
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.simulation.degradations import in_bands_of_light
+from vggtgeo.slam.verdict.witness import EvidenceRecorder
+
+
+def test_the_recorder_follows_a_real_picture() -> None:
+    """Corners of a rendered room are where the true poses carry them, to a pixel; oracle: the renderer's poses."""
+    run = recorded_run()
+    recorder = recorded(run.frames)
+    off = off_truth(recorder, 3)
+    assert len(off) > 30
+    assert np.nanmedian(off) < 1.0, f"median {np.nanmedian(off):.2f} px"
+    assert all(np.isfinite(frame.depth).mean() > 0.5 for frame in recorder.frames)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_corners_are_followed_through_bands_of_light(turned: bool) -> None:
+    """Lamps that flicker while rows are read one after another, by 30 % in 50 rows, leave the corners where the
+    world has them; so in a picture that was turned, whose rows are upright.
+    """
+    turn = lambda image: np.ascontiguousarray(np.rot90(image)) if turned else image
+    frames = []
+    for number, frame in enumerate(recorded_run().frames[:4]):
+        image = in_bands_of_light(frame.image, number, share=0.3, period=50, speed=40)
+        frames.append(replace(frame, image=turn(image), depth=turn(frame.depth)))
+    recorder = recorded(frames)
+    if turned:  # to where they were before: `rot90` puts column c of row r at row W - 1 - c, column r
+        width = recorded_run().frames[0].image.shape[1]
+        back = lambda pixels: np.column_stack([width - 1 - pixels[:, 1], pixels[:, 0]])
+        recorder.frames[:] = [replace(frame, pixels=back(frame.pixels)) for frame in recorder.frames]
+    off = off_truth(recorder, 1)
+    assert len(off) > 30
+    assert np.nanmean(off < 1.5) > 0.8, f"{np.nanmean(off < 1.5):.0%} within 1.5 px"
+
+
+def recorded(frames: list[Frame]) -> EvidenceRecorder:
+    """The evidence of frames of the recorded run."""
+    recorder = EvidenceRecorder(recorded_run().sequence.camera)
+    for frame in frames:
+        recorder.add(frame)
+    return recorder
+
+
+def off_truth(recorder: EvidenceRecorder, later: int) -> np.ndarray:
+    """Pixels by which the first frame's corners are not where the true poses carry them in a later one."""
+    run = recorded_run()
+    first, last = recorder.frames[0], recorder.frames[later]
+    _, rows, others = np.intersect1d(first.ids, last.ids, assume_unique=True, return_indices=True)
+    k = np.array(run.sequence.camera.intrinsics)
+    inverse = 1 / first.depth[rows].astype(float)
+    points = rigid.unproject(first.pixels[rows].astype(float), inverse, run.sequence.pose(0), k)
+    return np.linalg.norm(rigid.project(points, run.sequence.pose(later), k) - last.pixels[others], axis=1)
+
+
+def test_the_recorder_takes_what_there_is() -> None:
+    """Black frames, frames without depth and a distorted lens leave evidence, and no error."""
+    frame = recorded_run().frames[0]
+    recorder = EvidenceRecorder(Camera(recorded_run().sequence.camera.intrinsics, 320, 240, (-0.2, 0.0, 0.0, 0.0)))
+    recorder.add(replace(frame, image=np.zeros_like(frame.image)))
+    recorder.add(replace(frame, depth=None))
+    recorder.add(replace(frame, depth=np.full_like(frame.depth, np.nan)))
+    assert len(recorder.frames[0].ids) == 0
+    assert len(recorder.frames[1].ids) > 30
+    assert np.isnan(recorder.frames[2].depth).all()

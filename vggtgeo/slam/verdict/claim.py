@@ -1,0 +1,62 @@
+"""What a run claims and the verdict tests: poses and camera, in plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.sparse_map.connected import pieces_by_size
+from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Readout, Slam
+from vggtgeo.slam.tracking.frame_poses import frame_poses
+
+
+@dataclass(frozen=True, eq=False)
+class Claim:
+    """The claim of a run.
+
+    frames: int [n]. times: float64 [n], s. poses: float64 [n, 4, 4], world -> camera. tracked: bool [n]. intrinsics:
+    fx, fy, cx, cy, pixels. metric: lengths are metres. pieces: number of parts of the map. started: there was a map.
+    in_known_map: the run began in the map of an earlier one. guessed: the camera is unknown, and too little was seen to
+    estimate it. readout: of the rolling shutter that the last adjustment found.
+    """
+
+    frames: np.ndarray
+    times: np.ndarray
+    poses: np.ndarray
+    tracked: np.ndarray
+    intrinsics: np.ndarray
+    metric: bool
+    pieces: int = 1
+    started: bool = True
+    in_known_map: bool = False
+    guessed: bool = False
+    readout: Readout | None = None
+
+    @classmethod
+    def of(cls, slam: Slam) -> Self:
+        """The claim of a state."""
+        times, poses = frame_poses(slam)
+        return cls(
+            frames=np.array([record.frame for record in slam.frames], int),
+            times=times,
+            poses=poses,
+            tracked=np.array([record.tracked for record in slam.frames], bool),
+            intrinsics=np.asarray(slam.intrinsics, np.float64),
+            metric=slam.metric,
+            pieces=max(len(pieces_by_size(slam)), 1),
+            started=any(np.isfinite(keyframe.points.inverse_depth).any() for keyframe in slam.keyframes),
+            in_known_map=any(keyframe.frame < 0 for keyframe in slam.keyframes),
+            guessed=not (slam.calibrated or slam.camera_found) and len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA,
+            readout=slam.readout,
+        )
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def centres(self) -> np.ndarray:
+        """Camera centres, float64 [n, 3]."""
+        return rigid.invert(self.poses)[:, :3, 3]

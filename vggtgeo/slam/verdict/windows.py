@@ -1,0 +1,114 @@
+"""Corner tracks of windows of frames, as arrays for the adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from vggtgeo.slam.verdict.adjustment import Tracks
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.witness import FrameEvidence
+
+WINDOW = 24
+"""Frames that are adjusted together."""
+MIN_VIEWS = 3
+"""Frames of a window that a track is seen in; two of them determine its point."""
+MIN_COMMON = 10
+"""Corners that link a frame to the next: twenty numbers for six unknowns."""
+SHARED, MAX_STEP = 0.5, 3
+"""The next frame of a window is the farthest one that still shows this share of the corners, at most so many on."""
+
+
+def common(first: FrameEvidence, second: FrameEvidence) -> int:
+    """How many tracks both frames saw."""
+    return len(np.intersect1d(first.ids, second.ids, assume_unique=True))
+
+
+def linked(evidence: Sequence[FrameEvidence], tracked: np.ndarray) -> list[np.ndarray]:
+    """Stretches of tracked frames, each linked to the next by corners: rows, increasing."""
+    rows = np.flatnonzero(tracked)
+    if not len(rows):
+        return []
+    cuts = [
+        place + 1
+        for place, (row, after) in enumerate(pairwise(rows.tolist()))
+        if common(evidence[row], evidence[after]) < MIN_COMMON
+    ]
+    return np.split(rows, cuts)
+
+
+def thinned(evidence: Sequence[FrameEvidence], rows: np.ndarray) -> np.ndarray:
+    """The frames of a stretch between which corners move enough to tell, first and last included."""
+    chosen, place = [0], 0
+    while place < len(rows) - 1:
+        here = evidence[rows[place]]
+        farthest = place + 1
+        for ahead in range(place + 2, min(place + MAX_STEP, len(rows) - 1) + 1):
+            if common(here, evidence[rows[ahead]]) < max(SHARED * len(here.ids), MIN_COMMON):
+                break
+            farthest = ahead
+        chosen.append(farthest)
+        place = farthest
+    return rows[chosen]
+
+
+def windows(rows: np.ndarray) -> list[np.ndarray]:
+    """Windows of at most `WINDOW` of these rows, evenly spread, that overlap by a third at least."""
+    last = max(len(rows) - WINDOW, 0)
+    starts = np.linspace(0, last, int(np.ceil(last / (WINDOW * 2 / 3))) + 1).astype(int)
+    return [rows[start : start + WINDOW] for start in starts]
+
+
+def tracks_of(
+    claim: Claim, evidence: Sequence[FrameEvidence], rows: np.ndarray, size: tuple[int, int]
+) -> Tracks | None:
+    """The tracks that at least `MIN_VIEWS` of these frames see; None where there are none.
+
+    rows: int [f], increasing, of tracked frames.
+    """
+    ids = np.concatenate([evidence[row].ids for row in rows])
+    frame = np.repeat(np.arange(len(rows)), [len(evidence[row].ids) for row in rows])
+    pixels = np.concatenate([evidence[row].pixels for row in rows]).astype(np.float64)
+    depth = np.concatenate([evidence[row].depth for row in rows]).astype(np.float64)
+    velocity = np.concatenate([_velocities(evidence, int(row)) for row in rows])
+    order = np.lexsort((frame, ids))
+    ids, frame, pixels, depth, velocity = ids[order], frame[order], pixels[order], depth[order], velocity[order]
+    _, track, views = np.unique(ids, return_inverse=True, return_counts=True)
+    kept = views[track] >= MIN_VIEWS
+    if not kept.any():
+        return None
+    _, first, track = np.unique(ids[kept], return_index=True, return_inverse=True)
+    pixels = pixels[kept]
+    axis = 0 if claim.readout is not None and claim.readout.columns else 1
+    readout = (pixels[:, [axis]] / size[axis] - 0.5) * velocity[kept]
+    if claim.readout is not None:
+        pixels = pixels - claim.readout.seconds * readout
+    depth = np.where(depth > 0, depth, np.nan) if claim.metric else np.full(len(depth), np.nan)
+    return Tracks(
+        rows=rows,
+        times=claim.times[rows],
+        poses=claim.poses[rows],
+        intrinsics=np.asarray(claim.intrinsics, np.float64),
+        size=size,
+        frame=frame[kept],
+        track=track,
+        pixels=pixels,
+        depth=depth[kept],
+        readout=readout,
+        first=first,
+    )
+
+
+def _velocities(evidence: Sequence[FrameEvidence], row: int) -> np.ndarray:
+    """Pixels a second of the corners of a frame, from the frames before and after."""
+    here = evidence[row]
+    moved, seconds = np.zeros(here.pixels.shape), np.zeros(len(here.ids))
+    for other, sign in ((row - 1, -1.0), (row + 1, 1.0)):
+        if 0 <= other < len(evidence):
+            there = evidence[other]
+            _, own, theirs = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)
+            moved[own] += sign * (there.pixels[theirs] - here.pixels[own])
+            seconds[own] += abs(there.timestamp - here.timestamp)
+    return np.asarray(moved / np.maximum(seconds, 1e-6)[:, None])
