@@ -71,7 +71,7 @@ def _row(name: str, start: int, frames: int, result: vg.Result) -> str:
     lens = "" if result.metric else f"{largest_change(slam)[0]:.3f}"
     best = best_parallax(slam)
     parallax = "" if best is None else f"{np.rad2deg(best):.1f}"
-    others = (slam.focal_with_lens, slam.focal_without_lens)
+    others = (slam.camera.focal_with_lens, slam.camera.focal_without_lens)
     focal = ", ".join(f"{value:.1f}" for value in (slam.intrinsics[0], *others) if value is not None)
     error, length = float("nan"), float("nan")
     if result.record.truth is not None and len(result.trajectory) > 2:

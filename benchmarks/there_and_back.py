@@ -61,7 +61,8 @@ def _print(name: str, slam: Slam, truth: Trajectory) -> None:
     errors = 100 * found.se3.statistics.rmse, 100 * found.sim3.statistics.rmse
     tracked = sum(record.tracked for record in slam.frames)
     print(
-        f"{name}: {tracked}/{len(slam.frames)} tracked, keyframes of each piece {sizes}, {len(slam.ties)} ties, "
+        f"{name}: {tracked}/{len(slam.frames)} tracked, keyframes of each piece {sizes}, "
+        f"{len(slam.map.odometry_factors)} odometry factors, "
         f"ATE of the largest {errors[0]:.2f} cm SE(3), {errors[1]:.2f} cm Sim(3)",
         flush=True,
     )

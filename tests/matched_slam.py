@@ -10,9 +10,12 @@ from test_trust_sensor_drift import K
 from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.keyframe import Slots
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker
 
 GUESSED = np.array([0.3 * K[0], 0.3 * K[1], 10.0, 10.0])
 NOISE = 0.5
@@ -36,4 +39,8 @@ def matched_slam(world: np.ndarray, poses: np.ndarray, seed: int = 1) -> Slam:
             both = PointMatches(rows, rows, found[first].points.pixels, found[second].points.pixels, one)
             pairs.append(replace(without_matches(first, second), points=both))
     records = [FramePose(k.frame, k.timestamp, k.number, np.eye(4), True, points) for k in found]
-    return Slam(K, K, GUESSED, False, keyframes=tuple(found), pairs=tuple(pairs), frames=tuple(records))
+    return Slam(
+        map=Map(metric=False, keyframes=tuple(found), pairs=tuple(pairs)),
+        camera=CameraEstimate(intrinsics=K, given=K, sigma=GUESSED),
+        tracker=Tracker(frames=tuple(records)),
+    )

@@ -158,7 +158,7 @@ def test_depth_of_another_scene_is_told(kind: str) -> None:
     keyframes = tuple(replace(member, images=other(member)) for member in slam.keyframes)
     found = list(check_surfaces(keyframes, np.asarray(slam.intrinsics)))
     assert [finding.level for finding in found] == (["degraded"] if kind == "random" else [])
-    verdict = judge(replace(slam, keyframes=keyframes))
+    verdict = judge(replace(slam, map=replace(slam.map, keyframes=keyframes)))
     assert any("neighbouring keyframes disagrees" in reason for reason in verdict.reasons) == (kind == "random")
 
 

@@ -18,6 +18,7 @@ from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
 from vggtgeo.slam.camera import calibration
 from vggtgeo.slam.camera.calibration import keyframe_pairs
+from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.rolling_shutter import (
     _descend,
     _Search,
@@ -31,7 +32,6 @@ from vggtgeo.slam.camera.rolling_shutter import (
     without_readout,
 )
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
-from vggtgeo.slam.state import Readout
 from vggtgeo.slam.tracking.carried_poses import carried_poses
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import EvidenceRecorder, FrameEvidence, common
@@ -169,7 +169,7 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
     height, width = slam.keyframes[0].size
     motions = dict(zip(by_number, some_motions(2), strict=False))
     at = {"seconds": seconds, "camera": slam.intrinsics, "size": (width, height)}
-    edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
+    edges = [edge for pair in slam.map.pairs for edge in directions(pair, by_number)]
     expected = keyframe_pairs(slam, edges)
     usual = float(np.median(np.concatenate([pair.depth for pair in expected])))
 
@@ -192,11 +192,14 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
         replace(k, points=replace(k.points, pixels=rolled_pixels(k.points.pixels, k.points.prior, k.number)))
         for k in slam.keyframes
     )
-    seen = replace(slam, keyframes=keyframes)
+    seen = replace(slam, map=replace(slam.map, keyframes=keyframes))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibration, "camera_motions", lambda _, room: np.stack([motions[n] for n in by_number])[:room])
         wrong = keyframe_pairs(seen, [moved(edge) for edge in edges])
-        right = keyframe_pairs(replace(seen, readout=Readout(seconds, False, 0.0)), [moved(edge) for edge in edges])
+        right = keyframe_pairs(
+            replace(seen, camera=replace(seen.camera, readout=Readout(seconds, False, 0.0))),
+            [moved(edge) for edge in edges],
+        )
     for name in ("before", "after"):
         true, disturbed, repaired = (
             np.concatenate([getattr(pair, name) for pair in pairs]) for pairs in (expected, wrong, right)
@@ -235,13 +238,16 @@ def test_frames_far_apart_say_nothing_of_the_motion() -> None:
     slam = recorded_run().slam
     second = slam.keyframes[1].frame
     paused = tuple(replace(f, timestamp=f.timestamp + 5.0 * (f.frame > second)) for f in slam.frames)
-    whole, short = camera_motions(slam, len(slam.keyframes)), camera_motions(replace(slam, frames=paused), 3)
+    whole, short = (
+        camera_motions(slam, len(slam.keyframes)),
+        camera_motions(replace(slam, tracker=replace(slam.tracker, frames=paused)), 3),
+    )
     times, poses = carried_poses(slam)
     there = lie.exp(jnp.asarray(short[1] * (times[second] - times[second - 1]))).as_matrix() @ poses[second - 1]
     assert np.allclose(there, poses[second], atol=1e-6)
     assert not np.allclose(short[1], whole[1], atol=1e-6)
     lost = tuple(replace(f, tracked=f.frame in (0, second)) for f in slam.frames)
-    assert np.all(camera_motions(replace(slam, frames=lost), 3)[1] == 0)
+    assert np.all(camera_motions(replace(slam, tracker=replace(slam.tracker, frames=lost)), 3)[1] == 0)
 
 
 @pytest.mark.parametrize(("shift", "columns", "told"), [(12.0, False, True), (12.0, True, True), (2.0, False, False)])
@@ -296,7 +302,12 @@ def test_corners_that_judge_are_of_the_middle_of_the_image() -> None:
         for record, pose in zip(run.frames, poses, strict=True)
     )
     first = replace(run.keyframes[0], pose=poses[0])
-    slam = replace(run, keyframes=(first, *run.keyframes[1:]), frames=frames, readout=Readout(readout, False, 9.0))
+    slam = replace(
+        run,
+        map=replace(run.map, keyframes=(first, *run.keyframes[1:])),
+        tracker=replace(run.tracker, frames=frames),
+        camera=replace(run.camera, readout=Readout(readout, False, 9.0)),
+    )
 
     def off(evidence: list[FrameEvidence]) -> float:
         """Median distance of corners from where depth and true motion carry them over two frames, pixels."""

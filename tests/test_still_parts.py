@@ -254,7 +254,8 @@ def test_a_lens_that_was_found_undistorts_the_mask(monkeypatch: pytest.MonkeyPat
     lens = vg.Camera(CAMERA.intrinsics, WIDTH, HEIGHT, (-0.3, 0.05, 0.0, 0.0))
     parts = StillParts(np.tile(np.arange(HEIGHT)[:, None] < 30, (1, WIDTH)))
     settings, given = vg.SlamSettings(), {}
-    known = replace(begin(CAMERA, vg.Roles(), settings), lens=lens)
+    known = begin(CAMERA, vg.Roles(), settings)
+    known = replace(known, camera=replace(known.camera, lens=lens))
     described = lambda frames, camera, roles, clock, waiting: given.update(camera=camera, roles=roles) or iter(())
     monkeypatch.setattr("vggtgeo.slam.run._described", described)
     assert not list(run_frames(iter(()), CAMERA, vg.Roles(still_parts=parts), settings, Clock(), known))

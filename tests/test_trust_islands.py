@@ -13,9 +13,12 @@ from test_keyframe_depth import SIZE, keyframe
 from vggtgeo.models.roles import PointMatches
 from witness import Walk
 
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.covisibility import Pair, without_matches
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.islands import check_islands
@@ -48,7 +51,11 @@ def _found(
     like = keyframe(0, np.ones(SIZE))
     keyframes = tuple(replace(like, number=number, frame=frame) for number, frame in enumerate(KEYFRAMES))
     given = np.array([500.0, 500.0, 320.0, 240.0])
-    slam = Slam(given, given, np.ones(4), True, keyframes=keyframes, pairs=pairs, frames=tuple(records))
+    slam = Slam(
+        map=Map(metric=True, keyframes=keyframes, pairs=pairs),
+        camera=CameraEstimate(intrinsics=given, given=given, sigma=np.ones(4)),
+        tracker=Tracker(frames=tuple(records)),
+    )
     seen = [replace(noted, ids=noted.ids + (10_000 if noted.frame in OTHER else 0)) for noted in healthy.evidence]
     tracked = np.array([record.tracked for record in records])
     estimate: Estimate = replace(healthy.estimate, tracked=tracked)

@@ -60,7 +60,7 @@ def test_a_run_is_judged_as_a_whole() -> None:
     assert judge(run.slam, recorder.frames).level == "good"
     assert Result.of(run.slam, recorder.frames).verdict.level == "good"
     keyframes = [replace(k, pose=k.pose @ _turn(30.0 * k.number)) for k in run.slam.keyframes]
-    stirred = judge(replace(run.slam, keyframes=tuple(keyframes)), recorder.frames)
+    stirred = judge(replace(run.slam, map=replace(run.slam.map, keyframes=tuple(keyframes))), recorder.frames)
     assert stirred.level != "good"
     again = Verdict.from_dict(json.loads(json.dumps(stirred.to_dict())), stirred.metric)
     assert again == stirred
@@ -75,7 +75,7 @@ def test_matches_are_asked_with_depth_and_without(monkeypatch: pytest.MonkeyPatc
     slam = recorded_run().slam
     monkeypatch.setattr(judge_module, "check_matches", says)
     for metric in (True, False):
-        reasons = judge(replace(slam, metric=metric)).reasons
+        reasons = judge(replace(slam, map=replace(slam.map, metric=metric))).reasons
         assert f"{len(slam.keyframes)} keyframes, alone=True, {metric=}" in reasons
 
 

@@ -13,9 +13,12 @@ from test_keyframe_depth import INTRINSICS, SIZE, keyframe
 from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.keyframe import Slots
-from vggtgeo.slam.state import FramePose, SeenPoints, Slam
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.tracking.tracker import FramePose, SeenPoints, Tracker
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.own_points import IN_A_ROW, agreeing_landmarks, check_own_points
@@ -44,13 +47,9 @@ def _glide(noise: float) -> Slam:
         seen = SeenPoints(np.arange(POINTS, dtype=np.int32), shown.astype(np.float32))
         records.append(FramePose(row, row / 10, 0, motion, True, POINTS, seen=seen))
     return Slam(
-        INTRINSICS,
-        INTRINSICS,
-        np.full(4, 1.0),
-        False,
-        keyframes=(first,),
-        frames=tuple(records),
-        pose_sigma=np.full((1, 2), 0.01),
+        map=Map(metric=False, keyframes=(first,), pose_sigma=np.full((1, 2), 0.01)),
+        camera=CameraEstimate(intrinsics=INTRINSICS, given=INTRINSICS, sigma=np.full(4, 1.0)),
+        tracker=Tracker(frames=tuple(records)),
     )
 
 
@@ -59,7 +58,9 @@ def _with_wrong_depths(slam: Slam) -> Slam:
     first = slam.keyframes[0]
     inverse = first.points.inverse_depth
     wrong = np.where(inverse > 0.5, inverse / 1.5, inverse)
-    return replace(slam, keyframes=(replace(first, points=replace(first.points, inverse_depth=wrong)),))
+    return replace(
+        slam, map=replace(slam.map, keyframes=(replace(first, points=replace(first.points, inverse_depth=wrong)),))
+    )
 
 
 @pytest.mark.parametrize("noise", [0.5, 2.0])
@@ -86,7 +87,7 @@ def test_picture_that_stands_still_is_one_witness(again: bool) -> None:
             elsewhere = rng.normal(0, 20, seen.pixels.shape) * (rng.random((POINTS, 1)) < 0.25)
             seen = replace(seen, pixels=(seen.pixels + elsewhere).astype(np.float32))
         records[row] = replace(records[row], relative=records[FIRST_OFF if again else row].relative, seen=seen)
-    changed = replace(slam, frames=tuple(records))
+    changed = replace(slam, tracker=replace(slam.tracker, frames=tuple(records)))
     assert len(agreeing_landmarks(changed, frame_poses(changed)[1])[0]) == FRAMES - (10 if again else 1)
     assert len(_told(changed)) == (not again)
 
@@ -104,6 +105,6 @@ def test_map_of_wrong_depths_is_told_where_its_frames_have_moved() -> None:
 
 def test_nothing_is_asked_with_depth_of_few_frames_and_before_the_end() -> None:
     wrong = _with_wrong_depths(_glide(0.5))
-    assert _told(replace(wrong, metric=True)) == []
-    assert _told(replace(wrong, frames=wrong.frames[:IN_A_ROW])) == []
-    assert _told(replace(wrong, pose_sigma=None)) == []
+    assert _told(replace(wrong, map=replace(wrong.map, metric=True))) == []
+    assert _told(replace(wrong, tracker=replace(wrong.tracker, frames=wrong.frames[:IN_A_ROW]))) == []
+    assert _told(replace(wrong, map=replace(wrong.map, pose_sigma=None))) == []

@@ -23,13 +23,13 @@ def test_hardly_any_parallax_is_told(step: float, told: bool) -> None:
     assert np.rad2deg(angles.max()) == pytest.approx(np.rad2deg(3 * step / 3.0), rel=0.1)
     for texts in ([f.text for f in check_parallax(slam)], list(judge(slam).reasons)):
         assert any("hardly any parallax" in text for text in texts) == told
-    assert check_parallax(replace(slam, metric=True)) == []
+    assert check_parallax(replace(slam, map=replace(slam.map, metric=True))) == []
 
 
 def test_a_map_without_matches_has_no_parallax_to_ask_for() -> None:
     """Nothing is said of nothing; a point of unknown depth does not count. Oracle: the counts."""
     slam = _walk([0.1] * 3)
-    assert check_parallax(replace(slam, pairs=())) == []
+    assert check_parallax(replace(slam, map=replace(slam.map, pairs=()))) == []
     first = slam.keyframes[0]
     blind = replace(first, points=replace(first.points, inverse_depth=np.full(60, np.nan)))
-    assert len(largest_parallax(replace(slam, keyframes=(blind, *slam.keyframes[1:])))) == 3 * 60
+    assert len(largest_parallax(replace(slam, map=replace(slam.map, keyframes=(blind, *slam.keyframes[1:]))))) == 3 * 60

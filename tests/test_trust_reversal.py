@@ -48,7 +48,11 @@ def _wrong_way() -> Slam:
         replace(keyframe, pose=pose, points=replace(keyframe.points, inverse_depth=own))
         for keyframe, pose, own in zip(slam.keyframes, found.poses, inverse, strict=True)
     )
-    return replace(slam, keyframes=keyframes, intrinsics=K * np.exp([*found.focal[:2], 0.0, 0.0]))
+    return replace(
+        slam,
+        map=replace(slam.map, keyframes=keyframes),
+        camera=replace(slam.camera, intrinsics=K * np.exp([*found.focal[:2], 0.0, 0.0])),
+    )
 
 
 def test_map_of_the_wrong_motion_is_told() -> None:
@@ -78,11 +82,14 @@ def test_reversal_that_comes_back_is_no_rival(monkeypatch: pytest.MonkeyPatch) -
 
 def test_given_camera_or_measured_depth_is_not_asked() -> None:
     """Their focal length, or their depth, tells the two apart."""
-    assert not check_reversal(replace(_wrong_way(), intrinsics_sigma=np.ones(4)))
-    assert not check_reversal(replace(_wrong_way(), metric=True))
+    slam = _wrong_way()
+    assert not check_reversal(replace(slam, camera=replace(slam.camera, sigma=np.ones(4))))
+    assert not check_reversal(replace(slam, map=replace(slam.map, metric=True)))
 
 
 def test_few_keyframes_say_nothing() -> None:
     """Three are less than what is asked for."""
     slam = _pan()
-    assert not check_reversal(replace(slam, keyframes=slam.keyframes[:3], pairs=slam.pairs[:2]))
+    assert not check_reversal(
+        replace(slam, map=replace(slam.map, keyframes=slam.keyframes[:3], pairs=slam.map.pairs[:2]))
+    )

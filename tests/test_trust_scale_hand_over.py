@@ -10,11 +10,14 @@ import pytest
 from test_keyframe_depth import SIZE, keyframe
 from vggtgeo.models.roles import Features, PointMatches
 
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.sparse_map.covisibility import Pair, without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Slots
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.scale_hand_over import ALONE, check_hand_over, hand_over_sigma
 
@@ -47,8 +50,12 @@ def _walk(steps: list[float], across: dict[int, int] | None = None) -> Slam:
         motion = keyframes[second].pose @ np.linalg.inv(keyframes[second - 1].pose)
         ties.append(MeasuredRelativePose(second - 1, second, motion, np.eye(6)))
     records = [FramePose(k.frame, k.timestamp, k.number, np.eye(4), True, POINTS) for k in keyframes]
-    state = Slam(K, K, np.ones(4), False, keyframes=tuple(keyframes), pairs=tuple(pairs), frames=tuple(records))
-    return replace(state, factors=tuple(ties), origins=(0,))
+    state = Slam(
+        map=Map(metric=False, keyframes=tuple(keyframes), pairs=tuple(pairs)),
+        camera=CameraEstimate(intrinsics=K, given=K, sigma=np.ones(4)),
+        tracker=Tracker(frames=tuple(records)),
+    )
+    return replace(state, map=replace(state.map, factors=tuple(ties), roots=(0,)))
 
 
 def _pair(first: int, second: int, before: Slots, after: Slots, count: int) -> Pair:
@@ -84,7 +91,7 @@ def test_a_scale_that_little_hands_on_is_told(across: dict[int, int], told: bool
     # The next keyframes know the depth of those two alone, too.
     assert all(re.search("fewest at frame (8|9|10):", finding.text) for finding in found)
     assert any("is handed on by few" in reason for reason in judge(slam).reasons) == told
-    assert check_hand_over(replace(slam, metric=True)) == []
+    assert check_hand_over(replace(slam, map=replace(slam.map, metric=True))) == []
 
 
 def test_a_step_at_the_end_moves_nothing() -> None:
@@ -97,6 +104,6 @@ def test_a_step_at_the_end_moves_nothing() -> None:
 def test_matches_that_are_no_key_points_say_nothing() -> None:
     """Oracle: a dense matcher's targets are of no landmark, so that nobody knows what is handed on."""
     slam = _walk([0.1] * 15, {7: 0})
-    dense = [replace(p, points=replace(p.points, index_j=np.full(len(p.points), -1))) for p in slam.pairs]
+    dense = [replace(p, points=replace(p.points, index_j=np.full(len(p.points), -1))) for p in slam.map.pairs]
     assert check_hand_over(slam) != []
-    assert check_hand_over(replace(slam, pairs=tuple(dense))) == []
+    assert check_hand_over(replace(slam, map=replace(slam.map, pairs=tuple(dense)))) == []

@@ -55,12 +55,16 @@ def _walk(focal: float = 1.0, unit: float = 1.0, noise: float = 0.01, poses_off:
 
 def _seen(slam: Slam, keyframes: list[Keyframe]) -> Slam:
     """The state with these keyframes, whose neighbours match at the pixels that they have now."""
-    near = [pair for pair in slam.pairs if pair.second - pair.first <= REACH]
+    near = [pair for pair in slam.map.pairs if pair.second - pair.first <= REACH]
     pixels_of = lambda number: keyframes[number].points.pixels
     pairs = tuple(
         replace(p, points=replace(p.points, pixels_i=pixels_of(p.first), pixels_j=pixels_of(p.second))) for p in near
     )
-    return replace(slam, intrinsics=K, metric=True, keyframes=tuple(keyframes), pairs=pairs)
+    return replace(
+        slam,
+        camera=replace(slam.camera, intrinsics=K),
+        map=replace(slam.map, metric=True, keyframes=tuple(keyframes), pairs=pairs),
+    )
 
 
 def test_a_sensor_that_stays_is_told_nothing() -> None:
@@ -149,7 +153,7 @@ def test_a_way_straight_to_a_wall_says_nothing_of_the_lens() -> None:
         prior = keyframe.points.inverse_depth * (1 + rng.normal(0, 0.01, POINTS))
         seen.append(replace(keyframe, points=replace(keyframe.points, pixels=pixels, prior=prior)))
     slam = _seen(slam, seen)
-    found = [compare(pair, K).focal for pair in directed_pairs(slam, list(slam.pairs))]
+    found = [compare(pair, K).focal for pair in directed_pairs(slam, list(slam.map.pairs))]
     assert min(sigma for _, sigma in found) > MOST_SIGMA
     assert max(abs(value) for value, _ in found) > MOST_CHANGE
     said = statements(slam)
@@ -170,9 +174,9 @@ def test_what_is_below_the_bar_and_what_one_pair_says_is_not_told() -> None:
     other = replace(keyframe, points=replace(keyframe.points, prior=prior))
     keyframes = (*slam.keyframes[:AT], other, *slam.keyframes[AT + 1 :])
     only = lambda m: replace(m, **{field.name: getattr(m, field.name)[few] for field in fields(m)})
-    pairs = tuple(replace(p, points=only(p.points)) if p.key == (AT - 1, AT) else p for p in slam.pairs)
-    assert list(check_sensors(replace(slam, keyframes=keyframes, pairs=pairs))) == []
+    pairs = tuple(replace(p, points=only(p.points)) if p.key == (AT - 1, AT) else p for p in slam.map.pairs)
+    assert list(check_sensors(replace(slam, map=replace(slam.map, keyframes=keyframes, pairs=pairs)))) == []
     jumped = _walk(unit=FACTOR)
-    crossing = [pair for pair in jumped.pairs if pair.first < AT <= pair.second]
-    kept = tuple(pair for pair in jumped.pairs if pair not in crossing or pair.key == (AT - 1, AT))
-    assert list(check_sensors(replace(jumped, pairs=kept))) == []
+    crossing = [pair for pair in jumped.map.pairs if pair.first < AT <= pair.second]
+    kept = tuple(pair for pair in jumped.map.pairs if pair not in crossing or pair.key == (AT - 1, AT))
+    assert list(check_sensors(replace(jumped, map=replace(jumped.map, pairs=kept)))) == []

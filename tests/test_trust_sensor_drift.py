@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.models import pinhole
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.rolling_shutter import camera_motions, image_shift
-from vggtgeo.slam.state import Readout
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.judge import judge
@@ -145,8 +145,8 @@ def test_the_error_of_a_sensor_at_a_distance_is_no_change() -> None:
 def test_keyframes_of_a_run_agree() -> None:
     """Pairs of a simulated run, whose lens and depth stay; oracle: none, within five standard deviations and 1 %."""
     slam = recorded_run().slam
-    pairs = list(directed_pairs(slam, list(slam.pairs)))
-    assert {pair.numbers for pair in pairs} == {way for pair in slam.pairs for way in (pair.key, pair.key[::-1])}
+    pairs = list(directed_pairs(slam, list(slam.map.pairs)))
+    assert {pair.numbers for pair in pairs} == {way for pair in slam.map.pairs for way in (pair.key, pair.key[::-1])}
     for pair in pairs:
         found = compare(pair, np.asarray(slam.intrinsics, np.float64))
         for value, sigma in (found.focal, found.depth):
@@ -187,8 +187,8 @@ def test_pairs_are_without_the_rolling_shutter_that_was_found() -> None:
     """Oracle: each match of a simulated run, moved by the time of its row."""
     slam = recorded_run().slam
     number = len(slam.keyframes)
-    rolled = replace(slam, readout=Readout(0.03, False, 1.0))
-    pairs, still = (list(directed_pairs(state, list(slam.pairs))) for state in (slam, rolled))
+    rolled = replace(slam, camera=replace(slam.camera, readout=Readout(0.03, False, 1.0)))
+    pairs, still = (list(directed_pairs(state, list(slam.map.pairs))) for state in (slam, rolled))
     motions, camera, size = camera_motions(slam, number), np.asarray(slam.intrinsics), slam.keyframes[0].size
     moved = 0.0
     for pair, found in zip(pairs, still, strict=True):

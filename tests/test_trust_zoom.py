@@ -13,10 +13,13 @@ from test_trust_sensor_drift import KEYFRAMES, Curve, K, grows, still
 from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.camera.rolling_shutter import camera_motions, image_shift
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.keyframe import Slots
-from vggtgeo.slam.state import FramePose, Readout, Slam
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker
 from vggtgeo.slam.trust import zoom
 from vggtgeo.slam.trust.judge import judge
 from vggtgeo.slam.trust.zoom import KNOWN, STRETCH, FocalLengths, check_zoom, focal_lengths
@@ -57,7 +60,11 @@ def _walk(curve: Curve, seed: int = 0, keyframes: int = KEYFRAMES, noise: float 
             pairs.append(replace(without_matches(first, second), points=points))
     found = [replace(k, features=Features(k.points.pixels, one)) for k in found]
     records = [FramePose(k.frame, k.timestamp, k.number, np.eye(4), True, POINTS) for k in found]
-    return Slam(K, K, np.ones(4), False, keyframes=tuple(found), pairs=tuple(pairs), frames=tuple(records))
+    return Slam(
+        map=Map(metric=False, keyframes=tuple(found), pairs=tuple(pairs)),
+        camera=CameraEstimate(intrinsics=K, given=K, sigma=np.ones(4)),
+        tracker=Tracker(frames=tuple(records)),
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -85,7 +92,7 @@ def test_a_zoom_is_told(curve: Curve, percent: tuple[int, int] | None) -> None:
         return
     size = float(told[0].split("about ")[1].split(" %")[0])
     assert percent[0] <= size <= percent[1]
-    assert check_zoom(replace(slam, metric=True)) == [], "measured depth is asked otherwise"
+    assert check_zoom(replace(slam, map=replace(slam.map, metric=True))) == [], "measured depth is asked otherwise"
 
 
 def test_noise_is_no_zoom() -> None:
@@ -115,10 +122,10 @@ def test_one_keyframe_is_no_zoom() -> None:
 def test_few_keyframes_or_matches_say_nothing() -> None:
     """Three keyframes; no match; none of a known depth."""
     slam = _walk(grows)
-    assert check_zoom(replace(slam, keyframes=slam.keyframes[:3])) == []
-    assert focal_lengths(replace(slam, pairs=()), np.arange(KEYFRAMES)) is None
+    assert check_zoom(replace(slam, map=replace(slam.map, keyframes=slam.keyframes[:3]))) == []
+    assert focal_lengths(replace(slam, map=replace(slam.map, pairs=())), np.arange(KEYFRAMES)) is None
     blind = [replace(k, points=replace(k.points, inverse_depth=np.full(POINTS, np.nan))) for k in slam.keyframes]
-    assert focal_lengths(replace(slam, keyframes=tuple(blind)), np.arange(KEYFRAMES)) is None
+    assert focal_lengths(replace(slam, map=replace(slam.map, keyframes=tuple(blind))), np.arange(KEYFRAMES)) is None
 
 
 @pytest.mark.long
@@ -135,13 +142,13 @@ def test_every_keyframe_is_in_a_stretch() -> None:
     assert finding.end is not None
     assert finding.start < round(0.8 * 3 * STRETCH) <= finding.end
     known = [replace(k, recorded=0.0) if k.number >= 0.75 * 3 * STRETCH else k for k in slam.keyframes]
-    assert check_zoom(replace(slam, keyframes=tuple(known))) == []
+    assert check_zoom(replace(slam, map=replace(slam.map, keyframes=tuple(known)))) == []
 
 
 def test_matches_are_without_the_rolling_shutter_that_was_found() -> None:
     """Oracle: each key point, moved by the time of its row."""
     slam, every = _walk(still), np.arange(KEYFRAMES)
-    states = slam, replace(slam, readout=Readout(0.3, False, 1.0))
+    states = slam, replace(slam, camera=replace(slam.camera, readout=Readout(0.3, False, 1.0)))
     plain, rolled = (zoom.matches_among(state, every) for state in states)
     assert plain is not None
     assert rolled is not None

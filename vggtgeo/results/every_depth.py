@@ -42,7 +42,7 @@ def _own_depths(slam: Slam, frames: Frames | None) -> Iterator[tuple[int, DepthM
     """Rows of `slam.frames`, each with the depth that came with the frame."""
     left = set(range(len(slam.frames)))
     if frames is not None and frames.has_depth and slam.metric:
-        undistorter, sensor = (slam.lens or frames.camera).undistorter(), SensorDepth()
+        undistorter, sensor = (slam.camera.lens or frames.camera).undistorter(), SensorDepth()
         for row, frame in read_again(slam, frames):
             left.remove(row)
             yield row, None if frame.depth is None else _measured(frame.image, frame.depth, undistorter, sensor)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.slam.state import FramePose
+from vggtgeo.slam.tracking.tracker import FramePose
 
 
 class FramesInHand:

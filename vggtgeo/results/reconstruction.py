@@ -134,7 +134,7 @@ def reconstruct(
         )
         before = resumed(source.resumable(checkpoints), wanted)
         # The verdict takes the lens of a known map out of these corners, as it does with one that this run finds.
-        seen_by = source.camera if first is None or first.lens is None else source.camera.pinhole
+        seen_by = source.camera if first is None or first.camera.lens is None else source.camera.pinhole
         windows, evidence, still = WindowRecorder(), EvidenceRecorder(seen_by), StillSearch()
         hooks = RunCallbacks((windows, evidence, still, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
@@ -168,7 +168,7 @@ def reconstruct(
             clock,
             began,
             dense,
-            (slam.lens or source.camera).undistorter().valid,
+            (slam.camera.lens or source.camera).undistorter().valid,
         )
         return _concluded(ending, settings, hooks, windows.records, (still, evidence))
 

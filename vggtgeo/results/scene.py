@@ -82,7 +82,7 @@ class Scene:
         """
         keyframes = _shown(slam)
         numbers = {keyframe.number for keyframe in keyframes}
-        pairs = [pair for pair in slam.pairs if numbers.issuperset(pair.key)]
+        pairs = [pair for pair in slam.map.pairs if numbers.issuperset(pair.key)]
         height, width = keyframes[0].size
         return cls(
             np.array([keyframe.frame for keyframe in keyframes]),
@@ -256,7 +256,7 @@ def _other_frames(folder: Path, slam: Slam, scene: Scene, frames: Frames) -> Ite
     written.
     """
     piece, poses = {keyframe.number for keyframe in _shown(slam)}, frame_poses(slam)[1]
-    known, undistorter = set(scene.frames.tolist()), (slam.lens or frames.camera).undistorter()
+    known, undistorter = set(scene.frames.tolist()), (slam.camera.lens or frames.camera).undistorter()
     for row, frame in read_again(slam, frames):
         record = slam.frames[row]
         if record.tracked and record.reference in piece and record.frame not in known:

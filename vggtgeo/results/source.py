@@ -150,5 +150,5 @@ def as_read(source: Source, slam: Slam) -> dict[str, Any]:
     enlarged = lambda camera: camera.resized(source.read.width, source.read.height)
     found = enlarged(replace(source.camera, intrinsics=(fx, fy, cx, cy)))
     camera = dict(zip(("fx", "fy", "cx", "cy"), found.intrinsics, strict=True))
-    lens = {} if slam.lens is None else {"lens": lens_of(enlarged(slam.lens))}
+    lens = {} if slam.camera.lens is None else {"lens": lens_of(enlarged(slam.camera.lens))}
     return {"images_reduced": {"from": read, "to": size, "intrinsics_as_read": camera}, **lens}

@@ -10,6 +10,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.precision import in_double_precision
@@ -18,9 +19,10 @@ from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.sparse_map.pieces import join_pieces
 from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
@@ -36,6 +38,7 @@ from vggtgeo.slam.tracking.track import (
     track,
     track_by_map,
 )
+from vggtgeo.slam.tracking.tracker import FramePose
 from vggtgeo.slam.window.pending_window import begin_window, is_due, settled
 from vggtgeo.slam.window.sliding_window import adjust, enter
 
@@ -54,7 +57,7 @@ def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
         focal = settings.camera.guessed_intrinsics_sigma * intrinsics[0]
         centre = settings.camera.guessed_centre_sigma * np.array([camera.width, camera.height])
         sigma = np.array([focal, focal, *centre])
-    return Slam(intrinsics, intrinsics, sigma, roles.metric)
+    return Slam(Map(roles.metric), CameraEstimate(intrinsics, given=intrinsics, sigma=sigma))
 
 
 @in_double_precision
@@ -84,12 +87,14 @@ def _settled(slam: Slam, clock: Clock) -> Slam:
 
 def _started(slam: Slam) -> bool:
     """Whether there is a map to track in. A later keyframe may well be without depth: its neighbours have some."""
-    return len(slam.window) > 1 or bool(np.any(np.isfinite(slam.keyframes[slam.window[-1]].points.inverse_depth)))
+    return len(slam.window.members) > 1 or bool(
+        np.any(np.isfinite(slam.keyframes[slam.window.members[-1]].points.inverse_depth))
+    )
 
 
 def _in_known_map(slam: Slam) -> bool:
     """Whether there is a map that no frame has been tracked in so far, or none that became a keyframe."""
-    return not slam.window
+    return not slam.window.members
 
 
 def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
@@ -99,17 +104,9 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, len(features))
     return replace(
         slam,
-        keyframes=(*slam.keyframes, keyframe),
-        window=(number,),
-        prior=None,
-        solved=None,
-        origins=(*slam.origins, number),
-        held=(),
-        axes=(),
-        frames=(*slam.frames, record),
-        velocity=np.eye(4),
-        reference=None,
-        lost=0,
+        map=replace(slam.map, keyframes=(*slam.keyframes, keyframe), roots=(*slam.map.roots, number), axes=()),
+        window=replace(slam.window, members=(number,), prior=None, solved=None, held=()),
+        tracker=replace(slam.tracker, frames=(*slam.frames, record), velocity=np.eye(4), reference=None, lost=0),
     )
 
 
@@ -119,7 +116,7 @@ def _follow(
     with clock.measure("track"):
         sight = _with_lines(sight_of(frame, description, slam, roles), roles, settings)
         # In a map of another run nothing tells where the first frame is: it is searched by what it looks like alone.
-        blind = _in_known_map(slam) and slam.reference is None
+        blind = _in_known_map(slam) and slam.tracker.reference is None
         found = None if blind else _find(slam, sight, roles, settings)
     if slam.pending is not None and (found is None or not found.accepted):
         slam = _settled(slam, clock)
@@ -128,27 +125,29 @@ def _follow(
     if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
         slam = _settled(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
-    if slam.lost and (found is None or not found.accepted):
+    if slam.tracker.lost and (found is None or not found.accepted):
         with clock.measure("relocalise"):
             place = relocalise(sight, slam.keyframes, slam, roles)
         if place is not None:
             return _found_again(slam, sight, place, roles, settings, clock)
     if found is None or not found.accepted:
         return _missed(slam, sight, Evidence() if found is None else found.evidence, roles, settings)
-    was_lost = bool(slam.lost)
+    was_lost = bool(slam.tracker.lost)
     if was_lost:
         slam = _noted_found(slam, frame)
     velocity = np.eye(4) if was_lost else found.pose @ rigid.invert(slam.last_pose)
-    slam = _enter_frame(replace(slam, velocity=velocity, lost=0), sight, found, roles, settings, clock)
+    slam = _enter_frame(
+        replace(slam, tracker=replace(slam.tracker, velocity=velocity, lost=0)), sight, found, roles, settings, clock
+    )
     return place_waiting(slam, roles) if was_lost else slam
 
 
 def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Track:
     """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
-    predicted = rigid.orthonormal(slam.velocity @ slam.last_pose)
-    expected = Expectation(predicted, slam.velocity, slam.lost)
-    first = slam.reference[0] if slam.reference is not None else slam.window[-1]
-    others = [number for number in reversed(slam.window) if number != first][:2]
+    predicted = rigid.orthonormal(slam.tracker.velocity @ slam.last_pose)
+    expected = Expectation(predicted, slam.tracker.velocity, slam.tracker.lost)
+    first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
+    others = [number for number in reversed(slam.window.members) if number != first][:2]
     window = [slam.keyframes[number] for number in (first, *others)]
     best: Track | None = None
     for keyframe in window:
@@ -161,7 +160,7 @@ def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Tra
     # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
     if not settings.tracking.search_map or (best.accepted and not sight.description.described):
         return best
-    piece = slam.keyframes[slam.origins[-1] :]
+    piece = slam.keyframes[slam.map.roots[-1] :]
     if not best.accepted:
         source = view_of(best.keyframe, slam, roles)
         joint = track_by_map(sight, piece, best.keyframe, source, expected, slam.intrinsics, roles)
@@ -189,7 +188,7 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
             slam = slam if settings.keyframes.localise_only else tied
     if settings.keyframes.localise_only or not _needs_keyframe(found, settings):
         slam = _refer_to(slam, found.keyframe, roles)
-        slam = replace(slam, frames=(*slam.frames, record_of(frame, found)))
+        slam = replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record_of(frame, found))))
         return with_view(slam, sight.view, roles, settings)
     number = len(slam.keyframes)
     with clock.measure("keyframe"):
@@ -200,7 +199,7 @@ def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     arrival = (found.keyframe.number, found.relative)
     evidence = found.evidence
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)
-    return replace(slam, frames=(*slam.frames, record))
+    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record)))
 
 
 def _mapped(
@@ -211,28 +210,33 @@ def _mapped(
     Beside tracking where the keyframe's own depth places the next frames, and where there is one piece of map only.
     """
     tie, tied_to = tie_to(found, keyframe.number), found.keyframe.number
-    if tied_to not in slam.window:
+    if tied_to not in slam.window.members:
         slam = _window_around(slam, tied_to, settings)
     reference = (keyframe.number, sight.view)
 
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
             entered = enter(slam, keyframe, roles, settings, tied_to=tied_to)
-            entered = _with_pair(replace(entered, factors=(*slam.factors, tie), reference=reference), tie)
+            entered = _with_pair(
+                replace(
+                    entered,
+                    map=replace(entered.map, factors=(*slam.map.factors, tie)),
+                    tracker=replace(entered.tracker, reference=reference),
+                ),
+                tie,
+            )
             entered = constrain_rotation(entered, settings)
         with clock.measure("place frames" + own):
             entered = against_reference(entered)
         with clock.measure("adjust window" + own):
             return adjust(entered, settings)
 
-    if slam.metric and len(slam.origins) == 1:
+    if slam.metric and len(slam.map.roots) == 1:
         begun = replace(
             slam,
-            keyframes=(*slam.keyframes, keyframe),
-            window=(*slam.window, keyframe.number),
-            factors=(*slam.factors, tie),
-            reference=reference,
-            between=(),
+            map=replace(slam.map, keyframes=(*slam.keyframes, keyframe), factors=(*slam.map.factors, tie)),
+            window=replace(slam.window, members=(*slam.window.members, keyframe.number)),
+            tracker=replace(slam.tracker, reference=reference, between=()),
         )
         return begin_window(begun, lambda: adjusted(" (own thread)"))
     slam = adjusted("")
@@ -242,15 +246,17 @@ def _mapped(
 
 def _with_pair(slam: Slam, tie: MeasuredRelativePose) -> Slam:
     """A pair for the tie, if without a match, so that the surfaces of both are compared in the last adjustment."""
-    if any(pair.key == (tie.first, tie.second) for pair in slam.pairs):
+    if any(pair.key == (tie.first, tie.second) for pair in slam.map.pairs):
         return slam
-    return replace(slam, pairs=(*slam.pairs, without_matches(tie.first, tie.second)))
+    return replace(slam, map=replace(slam.map, pairs=(*slam.map.pairs, without_matches(tie.first, tie.second))))
 
 
 def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
-    if slam.reference is not None and slam.reference[0] == keyframe.number:
+    if slam.tracker.reference is not None and slam.tracker.reference[0] == keyframe.number:
         return slam
-    return against_reference(replace(slam, reference=(keyframe.number, view_of(keyframe, slam, roles))))
+    return against_reference(
+        replace(slam, tracker=replace(slam.tracker, reference=(keyframe.number, view_of(keyframe, slam, roles))))
+    )
 
 
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
@@ -263,12 +269,12 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     window = tuple(other for other in around if label[other] == label[number])[-(settings.window.size - 1) :]
     # Without metric depth one held pose leaves the unit free: two hold it.
     held = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
-    return replace(slam, window=window, prior=None, solved=None, held=held)
+    return replace(slam, window=replace(slam.window, members=window, prior=None, solved=None, held=held))
 
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:
-    note = f"found again at frame {frame.index} ({frame.name}), {slam.lost} frames after tracking was lost"
-    if _in_known_map(slam) and slam.reference is None:
+    note = f"found again at frame {frame.index} ({frame.name}), {slam.tracker.lost} frames after tracking was lost"
+    if _in_known_map(slam) and slam.tracker.reference is None:
         note = f"frame {frame.index} ({frame.name}) is the first that was found in the map"
     return replace(slam, notes=(*slam.notes, note))
 
@@ -276,7 +282,8 @@ def _noted_found(slam: Slam, frame: Frame) -> Slam:
 def _found_again(slam: Slam, sight: Sight, place: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
     """Go on in the map where the camera was found."""
     frame = sight.frame
-    slam = replace(_noted_found(slam, frame), velocity=np.eye(4), lost=0)
+    slam = _noted_found(slam, frame)
+    slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4), lost=0))
     slam = _enter_frame(slam, sight, place, roles, settings, clock)
     return place_waiting(slam, roles)
 
@@ -284,11 +291,11 @@ def _found_again(slam: Slam, sight: Sight, place: Track, roles: Roles, settings:
 def _missed(slam: Slam, sight: Sight, evidence: Evidence, roles: Roles, settings: SlamSettings) -> Slam:
     """No pose; after too many such frames begin a piece of map of its own."""
     frame, features = sight.frame, sight.features
-    if slam.lost == 0:
+    if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
-        slam = replace(slam, notes=(*slam.notes, note), velocity=np.eye(4))
+        slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
     waiting = wait(slam, frame, features, MOST_WAITING)
-    slam = replace(slam, lost=slam.lost + 1)
+    slam = replace(slam, tracker=replace(slam.tracker, lost=slam.tracker.lost + 1))
     shown = sum(len(other.features) > settings.tracking.least_inliers for other in waiting)
     patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE
     if not patient and len(features) > settings.tracking.least_inliers:
@@ -300,7 +307,7 @@ def _missed(slam: Slam, sight: Sight, evidence: Evidence, roles: Roles, settings
         return place_waiting(begun, roles) if _started(begun) else begun
     reference, relative = (slam.frames[-1].reference, slam.frames[-1].relative) if slam.frames else (0, np.eye(4))
     record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, evidence)
-    return replace(slam, frames=(*slam.frames, record), waiting=waiting)
+    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record), waiting=waiting))
 
 
 def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
@@ -312,7 +319,7 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     near = _nearest(slam, found, settings)
     again = None
     if near is not None:
-        expected = Expectation(found.pose, slam.velocity)
+        expected = Expectation(found.pose, slam.tracker.velocity)
         again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
         if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
             again = None  # drift may have put another keyframe there
@@ -321,9 +328,9 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
         return slam, found
     near = again.keyframe
-    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
+    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):
         return slam, again
-    return replace(slam, factors=(*slam.factors, tie_between(found, again))), again
+    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie_between(found, again)))), again
 
 
 def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | None:

@@ -122,7 +122,7 @@ def run_frames(
     """
     slam = begin(camera, roles, settings) if known is None else known
     # Frames of a map whose camera's lens was found are as that lens drew them.
-    seen_by = slam.lens or camera
+    seen_by = slam.camera.lens or camera
     if roles.still_parts is not None:
         roles = replace(roles, still_parts=roles.still_parts.undistorted(seen_by))
     last = slam.frames[-1].timestamp if slam.frames else -math.inf

@@ -257,7 +257,7 @@ def log_tracking(stream: Any, slam: Slam) -> None:
     import rerun as rr
 
     stream.log("plots/tracking/inliers", rr.Scalars(float(slam.frames[-1].inliers)))
-    stream.log("plots/tracking/lost", rr.Scalars(float(slam.lost)))
+    stream.log("plots/tracking/lost", rr.Scalars(float(slam.tracker.lost)))
 
 
 def log_note(stream: Any, text: str, level: str = "WARN") -> None:

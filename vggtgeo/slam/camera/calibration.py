@@ -149,7 +149,7 @@ def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
     and 488 px, and without the readout 489 and 487.
     """
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
-    readout = slam.readout
+    readout = slam.camera.readout
     motions = {} if readout is None else dict(zip(by_number, camera_motions(slam, len(by_number)), strict=True))
     found = []
     chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MOST_PAIRS).astype(int))

@@ -30,7 +30,8 @@ from vggtgeo.slam.camera.camera_gain import gain
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import FramePose
 
 RADIAL = 0.3
 """Standard deviation of k1 and k2 before anything is seen: lenses of phones and action cameras are within."""
@@ -128,11 +129,16 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
     """The map as the ideal pinhole of `lens` sees it; its poses and depths stay."""
     undistorter = lens.undistorter()
     keyframes = tuple(_keyframe(keyframe, lens, undistorter) for keyframe in slam.keyframes)
-    pairs = tuple(_pair(pair, lens) for pair in slam.pairs)
+    pairs = tuple(_pair(pair, lens) for pair in slam.map.pairs)
     frames = tuple(_frame(record, lens) for record in slam.frames)
     intrinsics = np.array(lens.intrinsics, np.float64)
-    moved = replace(slam, keyframes=keyframes, pairs=pairs, frames=frames, intrinsics=intrinsics, lens=lens)
-    return replace(moved, solved=None, prior=None)
+    moved = replace(
+        slam,
+        map=replace(slam.map, keyframes=keyframes, pairs=pairs),
+        tracker=replace(slam.tracker, frames=frames),
+        camera=replace(slam.camera, intrinsics=intrinsics, lens=lens),
+    )
+    return replace(moved, window=replace(moved.window, solved=None, prior=None))
 
 
 def _frame(record: FramePose, lens: Camera) -> FramePose:

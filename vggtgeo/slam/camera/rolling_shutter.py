@@ -28,8 +28,9 @@ from scipy.stats import t as student_t
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.geometry.cameras import SquarePinhole
+from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.camera_gain import LEAST_HOSTS, gain, match_energies
-from vggtgeo.slam.state import Readout, Slam
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.carried_poses import carried_poses
 

@@ -16,8 +16,8 @@ def piece_of(slam: Slam) -> np.ndarray:
     A pair joins with enough matches of points or lines, a factor always: a tracked motion, the unit of a new map.
     """
     count = len(slam.keyframes)
-    ends = [factor.keyframes for factor in slam.factors if not isinstance(factor, MeasuredRotation)]
-    ends += [pair.key for pair in slam.pairs if len(pair.points) + len(pair.lines)]
+    ends = [factor.keyframes for factor in slam.map.factors if not isinstance(factor, MeasuredRotation)]
+    ends += [pair.key for pair in slam.map.pairs if len(pair.points) + len(pair.lines)]
     first, second = np.array(ends, int).reshape(-1, 2).T
     graph = coo_array((np.ones(len(first)), (first, second)), (count, count))
     _, label = connected_components(graph, directed=False)
@@ -39,8 +39,8 @@ def loop_edges(slam: Slam, apart: int) -> tuple[tuple[int, int], ...]:
     """Pairs of keyframes, by their numbers, that saw one place at different times: joined by matches or by a measured
     motion, and at least `apart` keyframes (those of a window) apart.
     """
-    ends = [tie.keyframes for tie in slam.ties] + [
-        pair.key for pair in slam.pairs if len(pair.points) + len(pair.lines)
+    ends = [tie.keyframes for tie in slam.map.odometry_factors] + [
+        pair.key for pair in slam.map.pairs if len(pair.points) + len(pair.lines)
     ]
     return tuple(sorted({(first, second) for first, second in ends if abs(second - first) >= apart}))
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.state import SecondMotion, Slam
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.evidence import LEAST_CORRELATION, LEAST_OVERLAP, LEAST_SURFACE, Evidence
 from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE, with_systematic
@@ -25,6 +25,7 @@ from vggtgeo.slam.tracking.map_points import in_view
 from vggtgeo.slam.tracking.relocalisation import view_of
 from vggtgeo.slam.tracking.rgbd_alignment import Aligned, RgbdAlignment
 from vggtgeo.slam.tracking.rgbd_view import RgbdView
+from vggtgeo.slam.tracking.tracker import SecondMotion
 
 FINEST = (4, 0, 0)
 """Iterations by level, the finest first: a frame begins within millimetres of where it ends."""
@@ -40,26 +41,34 @@ def with_view(slam: Slam, view: RgbdView | None, roles: Roles, settings: SlamSet
     measured = settings.refinement.frames and isinstance(roles.depth, SensorDepth) and roles.alignment is not None
     if view is None or not (measured and slam.metric):
         return slam
-    slam = replace(slam, between=(*slam.between, (len(slam.frames) - 1, view)))
-    return against_nearest(slam, roles) if len(slam.between) == MOST else slam
+    slam = replace(slam, tracker=replace(slam.tracker, between=(*slam.tracker.between, (len(slam.frames) - 1, view))))
+    return against_nearest(slam, roles) if len(slam.tracker.between) == MOST else slam
 
 
 def against_reference(slam: Slam) -> Slam:
     """The state after the keyframe that frames are tracked against has changed: frames that waited for it are aligned
     to it.
     """
-    return replace(slam, between=()) if slam.reference is None else _against(slam, *slam.reference)
+    return (
+        replace(slam, tracker=replace(slam.tracker, between=()))
+        if slam.tracker.reference is None
+        else _against(slam, *slam.tracker.reference)
+    )
 
 
 def against_nearest(slam: Slam, roles: Roles) -> Slam:
     """The state after no other keyframe has come for long, or will: frames that wait are aligned to the nearest one
     that they were not tracked against.
     """
-    if not slam.between:
+    if not slam.tracker.between:
         return slam
-    last = slam.frames[slam.between[-1][0]]
-    near = in_view(slam.keyframes[slam.origins[-1] :], slam.pose(last), last.reference)
-    return _against(slam, near[0].number, view_of(near[0], slam, roles)) if near else replace(slam, between=())
+    last = slam.frames[slam.tracker.between[-1][0]]
+    near = in_view(slam.keyframes[slam.map.roots[-1] :], slam.pose(last), last.reference)
+    return (
+        _against(slam, near[0].number, view_of(near[0], slam, roles))
+        if near
+        else replace(slam, tracker=replace(slam.tracker, between=()))
+    )
 
 
 def _against(slam: Slam, number: int, source: RgbdView | None) -> Slam:
@@ -76,9 +85,9 @@ def _against(slam: Slam, number: int, source: RgbdView | None) -> Slam:
         return SecondMotion(number, rigid.orthonormal(found.motion), with_systematic(found.information, found.motion))
 
     frames = list(slam.frames)
-    for (row, _), motion in zip(slam.between, map_in_threads(second, slam.between), strict=True):
+    for (row, _), motion in zip(slam.tracker.between, map_in_threads(second, slam.tracker.between), strict=True):
         frames[row] = replace(frames[row], second=motion)
-    return replace(slam, frames=tuple(frames), between=())
+    return replace(slam, tracker=replace(slam.tracker, frames=tuple(frames), between=()))
 
 
 def by_both(slam: Slam, poses: np.ndarray) -> np.ndarray:

@@ -13,12 +13,13 @@ from vggtgeo.models.classical import place_vector
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state import FramePose, Slam, Waiting
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import STEP_GATE
 from vggtgeo.slam.tracking.odometry import Odometry
 from vggtgeo.slam.tracking.rgbd_view import RgbdView
 from vggtgeo.slam.tracking.track import Expectation, Sight, Track, tie_between, track
+from vggtgeo.slam.tracking.tracker import FramePose, Waiting
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
@@ -47,7 +48,7 @@ def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | N
     place that odometry contradicts only looks the same. Without metric depth the unit drifts, too, and loops wait for
     the end.
     """
-    recent = slam.window[0] if slam.window else 0
+    recent = slam.window.members[0] if slam.window.members else 0
     centres = np.array([rigid.centre(keyframe.pose) for keyframe in slam.keyframes])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     way = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # from each keyframe to the newest
@@ -56,7 +57,7 @@ def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | N
     place = place_vector(sight.features) if slam.metric and old else None
     if place is None:
         return None
-    near = [slam.keyframes[number].place for number in slam.window]
+    near = [slam.keyframes[number].place for number in slam.window.members]
     usual = np.median([known @ place for known in near if known is not None] or [1.0])
     similarity = [float(k.place @ place) for k in old if k.place is not None]
     best = int(np.argmax(similarity))
@@ -65,7 +66,7 @@ def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | N
     found = track(sight, old[best], view_of(old[best], slam, roles), None, slam.intrinsics, roles)
     if not (found.accepted and found.evidence.certain):
         return None
-    distance = Odometry.of(slam.ties, len(slam.keyframes)).distances([tie_between(current, found)])
+    distance = Odometry.of(slam.map.odometry_factors, len(slam.keyframes)).distances([tie_between(current, found)])
     return None if distance[0] >= STEP_GATE else found
 
 
@@ -83,15 +84,15 @@ def view_of(keyframe: Keyframe, slam: Slam, roles: Roles) -> RgbdView | None:
     """What the alignment needs of a keyframe; that of the reference is at hand, any other is made again."""
     if roles.alignment is None:
         return None
-    if slam.reference is not None and slam.reference[0] == keyframe.number:
-        return slam.reference[1]
+    if slam.tracker.reference is not None and slam.tracker.reference[0] == keyframe.number:
+        return slam.tracker.reference[1]
     depth = keyframe.depth.astype(np.float32), keyframe.depth_sigma.astype(np.float32)
     return RgbdView.of(keyframe.image, depth, slam.intrinsics)
 
 
 def wait(slam: Slam, frame: Frame, features: Features, most: int) -> tuple[Waiting, ...]:
     """The waiting frames with this one, the oldest forgotten beyond `most`."""
-    return (*slam.waiting, Waiting(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
+    return (*slam.tracker.waiting, Waiting(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
 
 
 def place_waiting(slam: Slam, roles: Roles) -> Slam:
@@ -100,7 +101,7 @@ def place_waiting(slam: Slam, roles: Roles) -> Slam:
     pose, step = slam.last_pose, np.eye(4)
     keyframe = slam.keyframes[slam.frames[-1].reference]
     source = view_of(keyframe, slam, roles)
-    for number, waiting in enumerate(reversed(slam.waiting)):
+    for number, waiting in enumerate(reversed(slam.tracker.waiting)):
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
         sight = sight_of(frame, Description.of(waiting.features), slam, roles)
         expected = Expectation(step @ pose, step, waited=min(number, 3))
@@ -110,7 +111,7 @@ def place_waiting(slam: Slam, roles: Roles) -> Slam:
         step, pose = found.pose @ rigid.invert(pose), found.pose
         placed[waiting.frame] = record_of(frame, found)
     frames = tuple(placed.get(record.frame, record) for record in slam.frames)
-    return replace(slam, frames=frames, waiting=())
+    return replace(slam, tracker=replace(slam.tracker, frames=frames, waiting=()))
 
 
 def sight_of(frame: Frame, description: Description, slam: Slam, roles: Roles) -> Sight:

@@ -8,8 +8,9 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA, Readout, was_given
 from vggtgeo.slam.sparse_map.connected import pieces_by_size
-from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Readout, Slam, was_given
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_poses import frame_poses
 
 
@@ -60,21 +61,22 @@ class Estimate:
             poses,
             np.array([record.tracked for record in slam.frames], bool),
             np.asarray(slam.intrinsics, np.float64),
-            np.asarray(slam.given_intrinsics, np.float64),
-            np.asarray(slam.intrinsics_sigma, np.float64),
+            np.asarray(slam.camera.given, np.float64),
+            np.asarray(slam.camera.sigma, np.float64),
             slam.metric,
             np.array([record.inliers for record in slam.frames], int),
             np.isin([record.frame for record in slam.frames], [keyframe.frame for keyframe in slam.keyframes]),
             max(len(pieces_by_size(slam)), 1),
             known,
             np.array([record.evidence.placed_by_surface for record in slam.frames], bool),
-            slam.focal_wanted,
-            slam.readout,
+            slam.camera.focal_wanted,
+            slam.camera.readout,
             any(keyframe.frame < 0 for keyframe in slam.keyframes),
-            not (slam.calibrated or slam.camera_found) and len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA,
-            slam.focal_without_lens,
-            slam.focal_with_lens,
-            slam.camera_found,
+            not (slam.camera.calibrated or slam.camera.self_calibrated)
+            and len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA,
+            slam.camera.focal_without_lens,
+            slam.camera.focal_with_lens,
+            slam.camera.self_calibrated,
         )
 
     def __len__(self) -> int:

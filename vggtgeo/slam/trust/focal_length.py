@@ -36,7 +36,7 @@ stretch that knows it holds the others."""
 
 def check_focal_length(slam: Slam) -> list[Finding]:
     """Whether no stretch of the map knows the focal length that the run found."""
-    if slam.metric or slam.calibrated:
+    if slam.metric or slam.camera.calibrated:
         return []
     asked = False
     for stretch in short_stretches(slam):

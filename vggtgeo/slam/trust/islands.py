@@ -89,7 +89,7 @@ def _matched(slam: Slam, estimate: Estimate, stretches: list[tuple[int, int]]) -
     row_of = {int(frame): row for row, frame in enumerate(estimate.frames)}
     # What is of an earlier run, and lies in no stretch, counts to the first.
     of = [int(np.searchsorted(ends, row_of.get(keyframe.frame, 0))) for keyframe in slam.keyframes]
-    yield from ((of[pair.first], of[pair.second]) for pair in slam.pairs if len(pair.points) >= STRONG_INLIERS)
+    yield from ((of[pair.first], of[pair.second]) for pair in slam.map.pairs if len(pair.points) >= STRONG_INLIERS)
     for number, (first, last) in enumerate(stretches):
         for record in slam.frames[first : last + 1]:
             # The frame of a keyframe hangs on itself, and came from an older one.

@@ -50,8 +50,8 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     estimate = Estimate.of(slam)
     by_frame = {noted.frame: noted for noted in evidence}
     aligned = [by_frame[frame] for frame in estimate.frames if frame in by_frame]
-    if slam.lens is not None:
-        aligned = [noted.through(slam.lens) for noted in aligned]
+    if slam.camera.lens is not None:
+        aligned = [noted.through(slam.camera.lens) for noted in aligned]
     if len(aligned) == len(slam.frames):
         aligned = corners_at_once(slam, aligned)
     known = frame_uncertainty(slam) if slam.keyframes else None

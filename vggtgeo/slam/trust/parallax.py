@@ -48,7 +48,7 @@ def largest_parallax(slam: Slam) -> np.ndarray:
     """Of each point that two keyframes share: the largest angle between its rays, radians, float64 [n]."""
     keyframes = {keyframe.number: keyframe for keyframe in slam.keyframes}
     largest = {number: np.full(len(keyframe.points.inverse_depth), np.nan) for number, keyframe in keyframes.items()}
-    for pair in slam.pairs:
+    for pair in slam.map.pairs:
         sides = (pair.first, pair.second, pair.points.index_i), (pair.second, pair.first, pair.points.index_j)
         for host, other, indices in sides:
             slots = indices[indices >= 0]

@@ -49,7 +49,7 @@ NEAREST = 0.1
 
 def check_reversal(slam: Slam) -> list[Finding]:
     """Whether no stretch of the map refuses its reversal."""
-    if slam.metric or slam.calibrated:
+    if slam.metric or slam.camera.calibrated:
         return []
     asked = False
     for stretch in short_stretches(slam):

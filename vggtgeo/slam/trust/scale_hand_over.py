@@ -48,8 +48,8 @@ def check_hand_over(slam: Slam) -> list[Finding]:
     """
     if slam.metric:
         return []
-    of_both = sum(np.count_nonzero(pair.points.index_j >= 0) for pair in slam.pairs)
-    if of_both < LEAST_OF_BOTH * sum(len(pair.points) for pair in slam.pairs):
+    of_both = sum(np.count_nonzero(pair.points.index_j >= 0) for pair in slam.map.pairs)
+    if of_both < LEAST_OF_BOTH * sum(len(pair.points) for pair in slam.map.pairs):
         return []
     sigma = hand_over_sigma(slam)
     frames = np.array([keyframe.frame for keyframe in slam.keyframes])
@@ -100,7 +100,7 @@ def _sensitivities(slam: Slam) -> _Seen:
     """Of each keyframe as a host: the other keyframe of a pair, slots [m], and `s^2` of each [m], pixels squared."""
     intrinsics = np.asarray(slam.intrinsics, np.float64)
     seen: _Seen = [[] for _ in slam.keyframes]
-    for pair in slam.pairs:
+    for pair in slam.map.pairs:
         first, second = slam.keyframes[pair.first], slam.keyframes[pair.second]
         slots, others = pair.points.index_i, pair.points.index_j[pair.points.index_j >= 0]
         seen[pair.first].append((pair.second, slots, _moved(first, second, slots, intrinsics)))
@@ -123,7 +123,7 @@ def _moved(host: Keyframe, target: Keyframe, slots: np.ndarray, intrinsics: np.n
 def _matches_across(slam: Slam) -> list[list[tuple[int, int, np.ndarray, np.ndarray]]]:
     """Of each step from a keyframe to the next: the pairs on whose two sides they are, and their slots."""
     across: list[list[tuple[int, int, np.ndarray, np.ndarray]]] = [[] for _ in slam.keyframes]
-    for pair in slam.pairs:
+    for pair in slam.map.pairs:
         if pair.second - pair.first <= FARTHEST:
             both = pair.points.index_j >= 0
             of_pair = pair.first, pair.second, pair.points.index_i[both], pair.points.index_j[both]

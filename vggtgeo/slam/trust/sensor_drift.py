@@ -147,7 +147,7 @@ class Statements:
 def statements(slam: Slam) -> Statements:
     """Of the keyframes that are at most `REACH` apart, both ways."""
     camera = np.asarray(slam.intrinsics, np.float64)
-    near = list(directed_pairs(slam, [pair for pair in slam.pairs if pair.second - pair.first <= REACH]))
+    near = list(directed_pairs(slam, [pair for pair in slam.map.pairs if pair.second - pair.first <= REACH]))
     found = [compare(pair, camera) for pair in near]
     numbers = [pair.numbers for pair in near]
     focal, unit = (Ratios.of(numbers, said) for said in ([f.focal for f in found], [f.depth for f in found]))
@@ -347,7 +347,7 @@ def directed_pairs(slam: Slam, pairs: list[Pair]) -> Iterator[DepthPair]:
     """Both directions of pairs of keyframes: errors of depth pull them apart. Where a rolling shutter was found they
     are without it: turning up or down, it stretches the picture as a lens does.
     """
-    motions = None if slam.readout is None else camera_motions(slam, len(slam.keyframes))
+    motions = None if slam.camera.readout is None else camera_motions(slam, len(slam.keyframes))
     for pair in pairs:
         first, second = slam.keyframes[pair.first], slam.keyframes[pair.second]
         for found in (_directed(pair, first, second, False), _directed(pair, second, first, True)):
@@ -357,11 +357,13 @@ def directed_pairs(slam: Slam, pairs: list[Pair]) -> Iterator[DepthPair]:
 
 def _at_once(pair: DepthPair, slam: Slam, motions: np.ndarray) -> DepthPair:
     """The pair without the readout of its images; motions: [n, 6], of the keyframes."""
-    assert slam.readout is not None
+    assert slam.camera.readout is not None
     first, second = pair.numbers
     camera = np.asarray(slam.intrinsics, np.float64)
     moving, size = (motions[first], motions[second]), slam.keyframes[first].size
-    before, after = pair_at_once(pair.before, pair.after, pair.depth, pair.relative, moving, camera, size, slam.readout)
+    before, after = pair_at_once(
+        pair.before, pair.after, pair.depth, pair.relative, moving, camera, size, slam.camera.readout
+    )
     return replace(pair, before=before, after=after)
 
 

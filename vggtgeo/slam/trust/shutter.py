@@ -29,7 +29,7 @@ def corners_at_once(slam: Slam, evidence: Sequence[FrameEvidence]) -> list[Frame
 
     evidence: of the frames of the run, in their order.
     """
-    readout = slam.readout
+    readout = slam.camera.readout
     if readout is None:
         return list(evidence)
     intrinsics, size = np.asarray(slam.intrinsics, np.float64), slam.keyframes[0].size

@@ -234,10 +234,10 @@ def matches_among(slam: Slam, stretch: np.ndarray) -> Matches | None:
     place_of = {keyframes[place].number: row for row, place in enumerate(stretch)}
     by_number = {number: keyframes[stretch[row]] for number, row in place_of.items()}
     intrinsics = np.asarray(slam.intrinsics, np.float64)
-    motions = None if slam.readout is None else camera_motions(slam, len(keyframes))
+    motions = None if slam.camera.readout is None else camera_motions(slam, len(keyframes))
     starts = np.cumsum([0, *(len(keyframes[place].points.inverse_depth) for place in stretch)])
     columns = []
-    inside = [pair for pair in slam.pairs if pair.first in place_of and pair.second in place_of]
+    inside = [pair for pair in slam.map.pairs if pair.first in place_of and pair.second in place_of]
     thin = max(1, int(np.ceil(sum(2 * len(pair.points) for pair in inside) / MOST_MATCHES)))
     for pair in inside:
         for edge in directions(pair, by_number):
@@ -248,11 +248,11 @@ def matches_among(slam: Slam, stretch: np.ndarray) -> Matches | None:
                 continue
             before, after = host.points.pixels[edge.slots[known]], edge.pixels[known]
             ends = place_of[edge.host], place_of[edge.target]
-            if motions is not None and slam.readout is not None:
+            if motions is not None and slam.camera.readout is not None:
                 relative = target.pose @ rigid.invert(host.pose)
                 moving = motions[stretch[ends[0]]], motions[stretch[ends[1]]]
                 before, after = pair_at_once(
-                    *(before, after, 1.0 / inverse[known], relative, moving, intrinsics, host.size, slam.readout)
+                    *(before, after, 1.0 / inverse[known], relative, moving, intrinsics, host.size, slam.camera.readout)
                 )
             slots = starts[ends[0]] + edge.slots[known]
             columns.append((np.tile(ends, (len(known), 1)), slots, before, after, np.log(inverse[known])))

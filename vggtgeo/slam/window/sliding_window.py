@@ -20,12 +20,13 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.models.classical import can_search
+from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Slam
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.window.gauge import Gauge, gauge_notes, with_one_gauge
@@ -114,15 +115,15 @@ def make_room(slam: Slam, settings: SlamSettings, needed: int | None = None) -> 
 
     needed: a keyframe that stays, because the next one is tied to it.
     """
-    if len(slam.window) < settings.window.size:
+    if len(slam.window.members) < settings.window.size:
         return slam
-    leaving = next(number for number in slam.window if number != needed)
-    staying = tuple(number for number in slam.window if number != leaving)
-    if slam.solved is None or leaving not in slam.solved[0].keyframes:
-        return replace(slam, window=staying)
-    adjustment, state = slam.solved
+    leaving = next(number for number in slam.window.members if number != needed)
+    staying = tuple(number for number in slam.window.members if number != leaving)
+    if slam.window.solved is None or leaving not in slam.window.solved[0].keyframes:
+        return replace(slam, window=replace(slam.window, members=staying))
+    adjustment, state = slam.window.solved
     prior = marginalise_jit(adjustment.problem, state, jnp.asarray(adjustment.keyframes.index(leaving)))
-    return replace(slam, window=staying, prior=WindowPrior(adjustment.keyframes, prior))
+    return replace(slam, window=replace(slam.window, members=staying, prior=WindowPrior(adjustment.keyframes, prior)))
 
 
 def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, tied_to: int | None = None) -> Slam:
@@ -132,17 +133,21 @@ def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, 
     """
     slam = make_room(slam, settings, tied_to)
     match = lambda number: match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics)
-    matched = map_in_threads(match, slam.window, alone=not can_search(keyframe.features))
+    matched = map_in_threads(match, slam.window.members, alone=not can_search(keyframe.features))
     pairs = tuple(pair for pair in matched if pair is not None)
-    inside = (*slam.window, keyframe.number)
+    inside = (*slam.window.members, keyframe.number)
     kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in slam.keyframes)
-    return replace(slam, keyframes=(*kept, keyframe), window=inside, pairs=(*slam.pairs, *pairs))
+    return replace(
+        slam,
+        map=replace(slam.map, keyframes=(*kept, keyframe), pairs=(*slam.map.pairs, *pairs)),
+        window=replace(slam.window, members=inside),
+    )
 
 
 def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
     slam = slam if slam.metric else _with_line_depths(slam)
-    members = [slam.keyframes[number] for number in slam.window]
+    members = [slam.keyframes[number] for number in slam.window.members]
     adjustment, gauge = window_problem(slam, members, settings)
     told = (note for note in gauge_notes(gauge, adjustment.keyframes, "window") if note not in slam.notes)
     slam = replace(slam, notes=(*slam.notes, *told))
@@ -156,11 +161,14 @@ def adjust(slam: Slam, settings: SlamSettings) -> Slam:
     history = np.asarray(solution.history, np.float64)
     return replace(
         slam,
-        keyframes=tuple(keyframes),
-        intrinsics=intrinsics,
-        solved=(adjustment, solution.state),
-        energies=history[np.isfinite(history)],
-        iterations=solution.record,
+        map=replace(slam.map, keyframes=tuple(keyframes)),
+        camera=replace(slam.camera, intrinsics=intrinsics),
+        window=replace(
+            slam.window,
+            solved=(adjustment, solution.state),
+            energies=history[np.isfinite(history)],
+            iterations=solution.record,
+        ),
     )
 
 
@@ -169,27 +177,31 @@ def _with_line_depths(slam: Slam) -> Slam:
 
     Not beside measured depth: what that leaves out is glass, mirrors and what is far away.
     """
-    inside = {number: slam.keyframes[number] for number in slam.window}
+    inside = {number: slam.keyframes[number] for number in slam.window.members}
     keyframes = list(slam.keyframes)
     for number, keyframe in with_segment_depths(inside, window_edges(slam), slam.intrinsics).items():
         keyframes[number] = keyframe
-    return replace(slam, keyframes=tuple(keyframes))
+    return replace(slam, map=replace(slam.map, keyframes=tuple(keyframes)))
 
 
 def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> tuple[Adjustment, Gauge]:
     """The problem of the current window, each of its connected pieces held."""
     numbers = tuple(keyframe.number for keyframe in members)
     places = {number: row for row, number in enumerate(numbers)}
-    prior = no_prior(settings.window.size) if slam.prior is None else slam.prior.aligned(numbers, settings.window.size)
+    prior = (
+        no_prior(settings.window.size)
+        if slam.window.prior is None
+        else slam.window.prior.aligned(numbers, settings.window.size)
+    )
     adjustment = build(
         members,
         window_edges(slam),
         slam.intrinsics,
         settings,
         size=window_size(settings),
-        camera=CameraPrior(slam.given_intrinsics, _camera_sigma(slam, settings)),
+        camera=CameraPrior(slam.camera.given, _camera_sigma(slam, settings)),
         fixed_pose=_held(numbers, slam),
-        terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric), metric=slam.metric)),
+        terms=(prior, *factor_terms(slam.map.factors, places, factor_room(settings, slam.metric), metric=slam.metric)),
     )
     problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(members), slam.metric)
     return replace(adjustment, problem=problem), gauge
@@ -199,17 +211,17 @@ def _camera_sigma(slam: Slam, settings: SlamSettings) -> np.ndarray:
     """Of the camera's prior in a window, float64 [4], pixels: what a first pass found is held, as a given one is, and
     so is a guess while there are two keyframes. 521 px, both, became 524 and 580 by such two and their depth.
     """
-    if not slam.camera_found and (slam.calibrated or len(slam.keyframes) >= LEAST_TO_FIND_A_CAMERA):
-        return slam.intrinsics_sigma
-    return np.full(4, settings.camera.known_intrinsics_sigma * slam.given_intrinsics[0])
+    if not slam.camera.self_calibrated and (slam.camera.calibrated or len(slam.keyframes) >= MIN_KEYFRAMES_FOR_CAMERA):
+        return slam.camera.sigma
+    return np.full(4, settings.camera.known_intrinsics_sigma * slam.camera.given[0])
 
 
 def _held(numbers: tuple[int, ...], slam: Slam) -> np.ndarray:
     """Which members hold the window: what it hangs on, where the camera came back to an old part of the map, else the
     origins of the map.
     """
-    hung = np.isin(numbers, slam.held)
-    return hung if hung.any() else np.isin(numbers, slam.origins)
+    hung = np.isin(numbers, slam.window.held)
+    return hung if hung.any() else np.isin(numbers, slam.map.roots)
 
 
 def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
@@ -221,14 +233,14 @@ def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
 
 def window_edges(slam: Slam) -> list[Directed]:
     """Both directions of every pair inside the window."""
-    inside = set(slam.window)
-    pairs = [pair for pair in slam.pairs if pair.first in inside and pair.second in inside]
+    inside = set(slam.window.members)
+    pairs = [pair for pair in slam.map.pairs if pair.first in inside and pair.second in inside]
     by_number = {number: slam.keyframes[number] for number in inside}
     return [edge for pair in pairs for edge in directions(pair, by_number)]
 
 
 def scale_anchor(slam: Slam) -> MeasuredBaseline:
     """What holds the distance between the first two keyframes: the unit of a map without metric depth."""
-    first, second = slam.window[:2]
+    first, second = slam.window.members[:2]
     centres = [rigid.centre(slam.keyframes[number].pose) for number in (first, second)]
     return MeasuredBaseline(first, second, float(np.linalg.norm(centres[1] - centres[0])), 1e-3)
