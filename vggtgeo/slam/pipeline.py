@@ -12,6 +12,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -77,7 +78,21 @@ def step(
             features = description.features
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
             return begun or start_without_depth(slam, frame, features, roles, settings)
-    return _follow(slam, frame, description, roles, settings, clock)
+
+    slam, sight, found = _track(slam, frame, description, roles, settings, clock)
+    if found is None or not found.accepted:
+        return _missed(slam, sight, Evidence() if found is None else found.evidence, roles, settings)
+    was_lost = bool(slam.tracker.lost)
+    slam = _moved(slam, frame, found)
+
+    slam, found, becomes_keyframe = _decide(slam, sight, found, roles, settings, clock)
+    if becomes_keyframe:
+        slam = _insert_and_adjust(slam, sight, found, roles, settings, clock)
+    else:
+        slam = _refer_to(slam, found.keyframe, roles)
+        slam = _with_record(slam, record_of(frame, found))
+        slam = with_view(slam, sight.view, roles, settings)
+    return place_waiting(slam, roles) if was_lost else slam
 
 
 def _settled(slam: Slam, clock: Clock) -> Slam:
@@ -110,14 +125,18 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
     )
 
 
-def _follow(
+def _track(
     slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock
-) -> Slam:
+) -> tuple[Slam, Sight, Track | None]:
+    """The frame and its pose by the map, and the state that the pose belongs to.
+
+    A pending window is taken up first where the frame has no pose, or becomes a keyframe.
+    """
     with clock.measure("track"):
         sight = _with_lines(sight_of(frame, description, slam, roles), roles, settings)
-        # In a map of another run nothing tells where the first frame is: it is searched by what it looks like alone.
-        blind = _in_known_map(slam) and slam.tracker.reference is None
-        found = None if blind else _find(slam, sight, roles, settings)
+        # In a map of another run the place of the first frame is unknown: it is searched by appearance alone.
+        unknown_place = _in_known_map(slam) and slam.tracker.reference is None
+        found = None if unknown_place else _find(slam, sight, roles, settings)
     if slam.pending is not None and (found is None or not found.accepted):
         slam = _settled(slam, clock)
         with clock.measure("track"):
@@ -127,19 +146,29 @@ def _follow(
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if slam.tracker.lost and (found is None or not found.accepted):
         with clock.measure("relocalise"):
-            place = relocalise(sight, slam.keyframes, slam, roles)
-        if place is not None:
-            return _found_again(slam, sight, place, roles, settings, clock)
-    if found is None or not found.accepted:
-        return _missed(slam, sight, Evidence() if found is None else found.evidence, roles, settings)
-    was_lost = bool(slam.tracker.lost)
-    if was_lost:
+            found = relocalise(sight, slam.keyframes, slam, roles) or found
+    return slam, sight, found
+
+
+def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
+    """The state with the motion to a tracked frame, which is unknown after tracking was lost."""
+    if slam.tracker.lost:
         slam = _noted_found(slam, frame)
-    velocity = np.eye(4) if was_lost else found.pose @ rigid.invert(slam.last_pose)
-    slam = _enter_frame(
-        replace(slam, tracker=replace(slam.tracker, velocity=velocity, lost=0)), sight, found, roles, settings, clock
-    )
-    return place_waiting(slam, roles) if was_lost else slam
+        velocity = np.eye(4)
+    else:
+        velocity = found.pose @ rigid.invert(slam.last_pose)
+    return replace(slam, tracker=replace(slam.tracker, velocity=velocity, lost=0))
+
+
+def _decide(
+    slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
+) -> tuple[Slam, Track, bool]:
+    """Whether a tracked frame becomes a keyframe; not where an old one shows it as well, which is then its keyframe."""
+    if _needs_keyframe(found, settings):
+        with clock.measure("track"):
+            tied, found = _seen_before(slam, sight, found, roles, settings)
+            slam = slam if settings.keyframes.localise_only else tied
+    return slam, found, not settings.keyframes.localise_only and _needs_keyframe(found, settings)
 
 
 def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Track:
@@ -179,52 +208,31 @@ def _rank(found: Track) -> tuple[bool, int]:
     return found.accepted, found.evidence.inliers
 
 
-def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
-    """Hang a tracked frame on its keyframe, or make it one."""
-    frame = sight.frame
-    if _needs_keyframe(found, settings):
-        with clock.measure("track"):
-            tied, found = _seen_before(slam, sight, found, roles, settings)
-            slam = slam if settings.keyframes.localise_only else tied
-    if settings.keyframes.localise_only or not _needs_keyframe(found, settings):
-        slam = _refer_to(slam, found.keyframe, roles)
-        slam = replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record_of(frame, found))))
-        return with_view(slam, sight.view, roles, settings)
-    number = len(slam.keyframes)
+def _insert_and_adjust(
+    slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
+) -> Slam:
+    """The state with the frame as a keyframe, whose window is matched and adjusted.
+
+    Beside tracking where the keyframe's own depth places the next frames, and where there is one submap only.
+    """
+    frame, number = sight.frame, len(slam.keyframes)
     with clock.measure("keyframe"):
         keyframe = make_keyframe(
             number, frame, found.pose, sight.description, roles, settings, slam.intrinsics, sight.found_lines
         )
-    slam = _mapped(slam, keyframe, found, sight, roles, settings, clock)
-    arrival = (found.keyframe.number, found.relative)
-    evidence = found.evidence
-    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)
-    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record)))
-
-
-def _mapped(
-    slam: Slam, keyframe: Keyframe, found: Track, sight: Sight, roles: Roles, settings: SlamSettings, clock: Clock
-) -> Slam:
-    """The state with a new keyframe, whose window is matched and adjusted.
-
-    Beside tracking where the keyframe's own depth places the next frames, and where there is one piece of map only.
-    """
-    tie, tied_to = tie_to(found, keyframe.number), found.keyframe.number
-    if tied_to not in slam.window.members:
-        slam = _window_around(slam, tied_to, settings)
-    reference = (keyframe.number, sight.view)
+    tracked = found.keyframe.number, found.relative
+    record = FramePose(
+        *(frame.index, frame.timestamp, number, np.eye(4), True, found.evidence.inliers, found.evidence), tracked
+    )
+    odometry = tie_to(found, number)
+    if odometry.first not in slam.window.members:
+        slam = _window_around(slam, odometry.first, settings)
+    slam = replace(slam, tracker=replace(slam.tracker, reference=(number, sight.view)))
 
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
-            entered = enter(slam, keyframe, roles, settings, tied_to=tied_to)
-            entered = _with_pair(
-                replace(
-                    entered,
-                    map=replace(entered.map, factors=(*slam.map.factors, tie)),
-                    tracker=replace(entered.tracker, reference=reference),
-                ),
-                tie,
-            )
+            entered = enter(slam, keyframe, roles, settings, tied_to=odometry.first)
+            entered = _with_odometry(entered, odometry)
             entered = constrain_rotation(entered, settings)
         with clock.measure("place frames" + own):
             entered = against_reference(entered)
@@ -232,23 +240,30 @@ def _mapped(
             return adjust(entered, settings)
 
     if slam.metric and len(slam.map.roots) == 1:
-        begun = replace(
+        inserted = replace(
             slam,
-            map=replace(slam.map, keyframes=(*slam.keyframes, keyframe), factors=(*slam.map.factors, tie)),
-            window=replace(slam.window, members=(*slam.window.members, keyframe.number)),
-            tracker=replace(slam.tracker, reference=reference, between=()),
+            map=replace(slam.map, keyframes=(*slam.keyframes, keyframe), factors=(*slam.map.factors, odometry)),
+            tracker=replace(slam.tracker, between=()),
+            window=replace(slam.window, members=(*slam.window.members, number)),
         )
-        return begin_window(begun, lambda: adjusted(" (own thread)"))
+        return _with_record(begin_window(inserted, lambda: adjusted(" (own thread)")), record)
     slam = adjusted("")
     with clock.measure("relocalise"):
-        return join_pieces(slam, sight, roles, settings)
+        return _with_record(join_pieces(slam, sight, roles, settings), record)
 
 
-def _with_pair(slam: Slam, tie: MeasuredRelativePose) -> Slam:
-    """A pair for the tie, if without a match, so that the surfaces of both are compared in the last adjustment."""
-    if any(pair.key == (tie.first, tie.second) for pair in slam.map.pairs):
-        return slam
-    return replace(slam, map=replace(slam.map, pairs=(*slam.map.pairs, without_matches(tie.first, tie.second))))
+def _with_record(slam: Slam, record: FramePose) -> Slam:
+    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record)))
+
+
+def _with_odometry(slam: Slam, odometry: MeasuredRelativePose) -> Slam:
+    """The state with an odometry factor, and a pair of its keyframes, if without a match: so the last adjustment
+    aligns the surfaces of both.
+    """
+    known = replace(slam.map, factors=(*slam.map.factors, odometry))
+    if all(pair.key != odometry.keyframes for pair in known.pairs):
+        known = replace(known, pairs=(*known.pairs, without_matches(*odometry.keyframes)))
+    return replace(slam, map=known)
 
 
 def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
@@ -279,15 +294,6 @@ def _noted_found(slam: Slam, frame: Frame) -> Slam:
     return replace(slam, notes=(*slam.notes, note))
 
 
-def _found_again(slam: Slam, sight: Sight, place: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
-    """Go on in the map where the camera was found."""
-    frame = sight.frame
-    slam = _noted_found(slam, frame)
-    slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4), lost=0))
-    slam = _enter_frame(slam, sight, place, roles, settings, clock)
-    return place_waiting(slam, roles)
-
-
 def _missed(slam: Slam, sight: Sight, evidence: Evidence, roles: Roles, settings: SlamSettings) -> Slam:
     """No pose; after too many such frames begin a piece of map of its own."""
     frame, features = sight.frame, sight.features
@@ -316,7 +322,8 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
 
     What the two keyframes know of each other by this frame ties them.
     """
-    near = _nearest(slam, found, settings)
+    others = (keyframe for keyframe in slam.keyframes if keyframe.number != found.keyframe.number)
+    near = nearest_keyframe(found.pose, others, settings.keyframes)
     again = None
     if near is not None:
         expected = Expectation(found.pose, slam.tracker.velocity)
@@ -333,29 +340,8 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie_between(found, again)))), again
 
 
-def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | None:
-    """Of all other keyframes the nearest that stands where the frame does."""
-    best, least = None, 1.0
-    for keyframe in slam.keyframes:
-        if keyframe.number == found.keyframe.number:
-            continue
-        distance = (
-            np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(found.pose))
-            / settings.keyframes.keyframe_distance
-        )
-        if distance < least:
-            turned = rigid.angle_between(keyframe.pose, found.pose) / settings.keyframes.keyframe_angle
-            away = max(float(distance), float(turned))
-            if away < least:
-                best, least = keyframe, away
-    return best
-
-
 def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
-    """Whether the frame sees what its keyframe, the nearest there is, does not."""
-    distance = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(found.keyframe.pose))
-    return bool(
-        distance > settings.keyframes.keyframe_distance
-        or rigid.angle_between(found.pose, found.keyframe.pose) > settings.keyframes.keyframe_angle
-        or found.evidence.inliers < settings.tracking.least_inliers
+    return needs_keyframe(
+        *(found.pose, found.keyframe.pose, found.evidence.inliers),
+        *(settings.tracking.least_inliers, settings.keyframes),
     )
