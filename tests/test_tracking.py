@@ -33,7 +33,7 @@ from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
 from vggtgeo.slam.tracking.rgbd_view import RgbdView
-from vggtgeo.slam.tracking.track import Expectation, Sight, Track, track
+from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, track
 from vggtgeo.slam.window.pending_window import settled
 
 SIZE = (320, 240)
@@ -210,9 +210,10 @@ def _by_lines(room: Room, keep: Callable[[np.ndarray], np.ndarray]) -> tuple[Tra
     segments = ROLES.lines.detect(frames[2].image)
     kept = keep(segments.endpoints)
     segments = Segments(segments.endpoints[kept], segments.scores[kept])
-    sight = Sight(frames[2], blank, None, lambda: ROLES.line_matches.describe(frames[2].image, segments))
+    data = FrameData(frames[2], blank, None, lambda: ROLES.line_matches.describe(frames[2].image, segments))
     wrong = exponential(np.array([0.03, -0.02, 0.02, 0.02, -0.025, 0.015])) @ poses[2]
-    return track(sight, keyframe, None, Expectation(wrong, np.eye(4)), intrinsics, ROLES), poses[2]
+    given = TrackingInput(data, intrinsics, ROLES, MotionPrior(wrong, np.eye(4)))
+    return track(given, keyframe, None), poses[2]
 
 
 def test_lines_alone_hold_a_frame(room: Room) -> None:
@@ -450,8 +451,8 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
     moved[:3, 3] = [0.5, -1.0, 2.0]
     torn = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
     newest = whole.keyframes[-1]
-    sight = Sight(seen[newest.frame], Description.of(newest.features), None)
-    joined = join_pieces(replace(apart, map=replace(apart.map, keyframes=torn)), sight, roles, SETTINGS)
+    data = FrameData(seen[newest.frame], Description.of(newest.features), None)
+    joined = join_pieces(replace(apart, map=replace(apart.map, keyframes=torn)), data, roles, SETTINGS)
     assert joined.map.roots == (0,), joined.notes
     for before, after in zip(whole.keyframes[origin:], joined.keyframes[origin:], strict=True):
         off = np.linalg.norm(rigid.centre(before.pose) - rigid.centre(after.pose))

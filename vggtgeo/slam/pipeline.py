@@ -27,11 +27,20 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
-from vggtgeo.slam.tracking.relocalisation import place_waiting, record_of, relocalise, revisit, sight_of, view_of, wait
+from vggtgeo.slam.tracking.relocalisation import (
+    frame_data,
+    place_waiting,
+    record_of,
+    relocalise,
+    revisit,
+    view_of,
+    wait,
+)
 from vggtgeo.slam.tracking.track import (
-    Expectation,
-    Sight,
+    FrameData,
+    MotionPrior,
     Track,
+    TrackingInput,
     moved_with,
     refined_by_map,
     tie_between,
@@ -79,19 +88,19 @@ def step(
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
             return begun or start_without_depth(slam, frame, features, roles, settings)
 
-    slam, sight, found = _track(slam, frame, description, roles, settings, clock)
+    slam, data, found = _track(slam, frame, description, roles, settings, clock)
     if found is None or not found.accepted:
-        return _missed(slam, sight, Evidence() if found is None else found.evidence, roles, settings)
+        return _missed(slam, data, Evidence() if found is None else found.evidence, roles, settings)
     was_lost = bool(slam.tracker.lost)
     slam = _moved(slam, frame, found)
 
-    slam, found, becomes_keyframe = _decide(slam, sight, found, roles, settings, clock)
+    slam, found, becomes_keyframe = _decide(slam, data, found, roles, settings, clock)
     if becomes_keyframe:
-        slam = _insert_and_adjust(slam, sight, found, roles, settings, clock)
+        slam = _insert_and_adjust(slam, data, found, roles, settings, clock)
     else:
         slam = _refer_to(slam, found.keyframe, roles)
         slam = _with_record(slam, record_of(frame, found))
-        slam = with_view(slam, sight.view, roles, settings)
+        slam = with_view(slam, data.view, roles, settings)
     return place_waiting(slam, roles) if was_lost else slam
 
 
@@ -127,27 +136,27 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
 
 def _track(
     slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock
-) -> tuple[Slam, Sight, Track | None]:
+) -> tuple[Slam, FrameData, Track | None]:
     """The frame and its pose by the map, and the state that the pose belongs to.
 
     A pending window is taken up first where the frame has no pose, or becomes a keyframe.
     """
     with clock.measure("track"):
-        sight = _with_lines(sight_of(frame, description, slam, roles), roles, settings)
+        data = _with_lines(frame_data(frame, description, slam, roles), roles, settings)
         # In a map of another run the place of the first frame is unknown: it is searched by appearance alone.
         unknown_place = _in_known_map(slam) and slam.tracker.reference is None
-        found = None if unknown_place else _find(slam, sight, roles, settings)
+        found = None if unknown_place else _find(slam, data, roles, settings)
     if slam.pending is not None and (found is None or not found.accepted):
         slam = _settled(slam, clock)
         with clock.measure("track"):
-            found = _find(slam, sight, roles, settings)
+            found = _find(slam, data, roles, settings)
     if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
         slam = _settled(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if slam.tracker.lost and (found is None or not found.accepted):
         with clock.measure("relocalise"):
-            found = relocalise(sight, slam.keyframes, slam, roles) or found
-    return slam, sight, found
+            found = relocalise(data, slam.keyframes, slam, roles) or found
+    return slam, data, found
 
 
 def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
@@ -161,47 +170,48 @@ def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
 
 
 def _decide(
-    slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
+    slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
 ) -> tuple[Slam, Track, bool]:
     """Whether a tracked frame becomes a keyframe; not where an old one shows it as well, which is then its keyframe."""
     if _needs_keyframe(found, settings):
         with clock.measure("track"):
-            tied, found = _seen_before(slam, sight, found, roles, settings)
+            tied, found = _seen_before(slam, data, found, roles, settings)
             slam = slam if settings.keyframes.localise_only else tied
     return slam, found, not settings.keyframes.localise_only and _needs_keyframe(found, settings)
 
 
-def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Track:
+def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Track:
     """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
     predicted = rigid.orthonormal(slam.tracker.velocity @ slam.last_pose)
-    expected = Expectation(predicted, slam.tracker.velocity, slam.tracker.lost)
+    prior = MotionPrior(predicted, slam.tracker.velocity, slam.tracker.lost)
     first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
     others = [number for number in reversed(slam.window.members) if number != first][:2]
-    window = [slam.keyframes[number] for number in (first, *others)]
+    window = tuple(slam.keyframes[number] for number in (first, *others))
+    given = TrackingInput(data, slam.intrinsics, roles, prior, window)
     best: Track | None = None
     for keyframe in window:
-        found = track(sight, keyframe, view_of(keyframe, slam, roles), expected, slam.intrinsics, roles, window)
+        found = track(given, keyframe, view_of(keyframe, slam, roles))
         if best is None or _rank(found) > _rank(best):
             best = found
         if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
             break
     assert best is not None
     # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
-    if not settings.tracking.search_map or (best.accepted and not sight.description.described):
+    if not settings.tracking.search_map or (best.accepted and not data.description.described):
         return best
     piece = slam.keyframes[slam.map.roots[-1] :]
     if not best.accepted:
         source = view_of(best.keyframe, slam, roles)
-        joint = track_by_map(sight, piece, best.keyframe, source, expected, slam.intrinsics, roles)
+        joint = track_by_map(given, piece, best.keyframe, source)
         return joint if joint.accepted else best
-    return refined_by_map(best, sight, piece, expected, slam.intrinsics)
+    return refined_by_map(best, given, piece)
 
 
-def _with_lines(sight: Sight, roles: Roles, settings: SlamSettings) -> Sight:
-    """The sight with a way to its segments, where lines take part in tracking."""
+def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameData:
+    """The data with a way to its segments, where lines take part in tracking."""
     if not settings.line.in_tracking:
-        return sight
-    return replace(sight, find_lines=lambda: find_lines(sight.frame.image, roles, settings))
+        return data
+    return replace(data, find_lines=lambda: find_lines(data.frame.image, roles, settings))
 
 
 def _rank(found: Track) -> tuple[bool, int]:
@@ -209,16 +219,16 @@ def _rank(found: Track) -> tuple[bool, int]:
 
 
 def _insert_and_adjust(
-    slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
+    slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
 ) -> Slam:
     """The state with the frame as a keyframe, whose window is matched and adjusted.
 
     Beside tracking where the keyframe's own depth places the next frames, and where there is one submap only.
     """
-    frame, number = sight.frame, len(slam.keyframes)
+    frame, number = data.frame, len(slam.keyframes)
     with clock.measure("keyframe"):
         keyframe = make_keyframe(
-            number, frame, found.pose, sight.description, roles, settings, slam.intrinsics, sight.found_lines
+            number, frame, found.pose, data.description, roles, settings, slam.intrinsics, data.found_lines
         )
     tracked = found.keyframe.number, found.relative
     record = FramePose(
@@ -227,7 +237,7 @@ def _insert_and_adjust(
     odometry = tie_to(found, number)
     if odometry.first not in slam.window.members:
         slam = _window_around(slam, odometry.first, settings)
-    slam = replace(slam, tracker=replace(slam.tracker, reference=(number, sight.view)))
+    slam = replace(slam, tracker=replace(slam.tracker, reference=(number, data.view)))
 
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
@@ -249,7 +259,7 @@ def _insert_and_adjust(
         return _with_record(begin_window(inserted, lambda: adjusted(" (own thread)")), record)
     slam = adjusted("")
     with clock.measure("relocalise"):
-        return _with_record(join_pieces(slam, sight, roles, settings), record)
+        return _with_record(join_pieces(slam, data, roles, settings), record)
 
 
 def _with_record(slam: Slam, record: FramePose) -> Slam:
@@ -294,9 +304,9 @@ def _noted_found(slam: Slam, frame: Frame) -> Slam:
     return replace(slam, notes=(*slam.notes, note))
 
 
-def _missed(slam: Slam, sight: Sight, evidence: Evidence, roles: Roles, settings: SlamSettings) -> Slam:
+def _missed(slam: Slam, data: FrameData, evidence: Evidence, roles: Roles, settings: SlamSettings) -> Slam:
     """No pose; after too many such frames begin a piece of map of its own."""
-    frame, features = sight.frame, sight.features
+    frame, features = data.frame, data.features
     if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
@@ -316,7 +326,7 @@ def _missed(slam: Slam, sight: Sight, evidence: Evidence, roles: Roles, settings
     return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record), waiting=waiting))
 
 
-def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
+def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
     """The frame by an old keyframe that stands where it does, if there is one that shows it as well as the present one:
     the map grows with space, not with time.
 
@@ -326,12 +336,13 @@ def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings:
     near = nearest_keyframe(found.pose, others, settings.keyframes)
     again = None
     if near is not None:
-        expected = Expectation(found.pose, slam.tracker.velocity)
-        again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
+        prior = MotionPrior(found.pose, slam.tracker.velocity)
+        given = TrackingInput(data, slam.intrinsics, roles, prior)
+        again = track(given, near, view_of(near, slam, roles))
         if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
             again = None  # drift may have put another keyframe there
     if again is None:
-        again = revisit(slam, sight, found, roles)
+        again = revisit(slam, data, found, roles)
     if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
         return slam, found
     near = again.keyframe

@@ -14,7 +14,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.description import Description
-from vggtgeo.slam.tracking.track import Sight, track
+from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track
 from vggtgeo.slam.tracking.tracker import FramePose, Waiting
 from vggtgeo.slam.window.sliding_window import adjust, enter, scale_anchor
 
@@ -162,8 +162,8 @@ def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
     placed = {}
     for waiting in slam.tracker.waiting:
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
-        sight = Sight(frame, Description.of(waiting.features), None)
-        found = track(sight, first, None, None, slam.intrinsics, roles)
+        data = FrameData(frame, Description.of(waiting.features), None)
+        found = track(TrackingInput(data, slam.intrinsics, roles), first, None)
         if found.accepted:
             evidence = found.evidence
             record = FramePose(

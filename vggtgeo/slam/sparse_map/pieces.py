@@ -16,7 +16,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePo
 from vggtgeo.slam.sparse_map.units import longer, ratio_of_units, scaled_factor, scaled_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import relocalise
-from vggtgeo.slam.tracking.track import Sight, Track
+from vggtgeo.slam.tracking.track import FrameData, Track
 from vggtgeo.slam.tracking.tracker import scaled_record
 from vggtgeo.slam.window.window_prior import WindowPrior
 
@@ -24,8 +24,8 @@ TRIED = 2
 """Keyframes of the other pieces that are verified for each new keyframe."""
 
 
-def join_pieces(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Slam:
-    """Where the newest keyframe, seen as `sight`, shows a place of an earlier piece, move its piece there.
+def join_pieces(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Slam:
+    """Where the newest keyframe, seen as `data`, shows a place of an earlier piece, move its piece there.
 
     By a rigid motion where lengths are metres, else by a similarity: each piece of free scale has a unit of its own.
     """
@@ -35,7 +35,7 @@ def join_pieces(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) 
     others = [keyframe for keyframe in slam.keyframes if label[keyframe.number] != label[-1]]
     if not others:
         return slam
-    place = relocalise(sight, others, slam, roles, TRIED)
+    place = relocalise(data, others, slam, roles, TRIED)
     if place is None:
         return slam
     if slam.metric:

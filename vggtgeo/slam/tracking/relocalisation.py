@@ -18,7 +18,7 @@ from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import STEP_GATE
 from vggtgeo.slam.tracking.odometry import Odometry
 from vggtgeo.slam.tracking.rgbd_view import RgbdView
-from vggtgeo.slam.tracking.track import Expectation, Sight, Track, tie_between, track
+from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_between, track
 from vggtgeo.slam.tracking.tracker import FramePose, Waiting
 
 CANDIDATES = 5
@@ -29,17 +29,18 @@ drifts by 1 to 2 %."""
 
 
 def relocalise(
-    sight: Sight, candidates: Iterable[Keyframe], slam: Slam, roles: Roles, most: int = CANDIDATES
+    data: FrameData, candidates: Iterable[Keyframe], slam: Slam, roles: Roles, most: int = CANDIDATES
 ) -> Track | None:
     """The frame's pose by the most similar of `candidates`, where one of the first `most` is certain."""
-    for keyframe in most_similar(sight.features, tuple(candidates))[:most]:
-        found = track(sight, keyframe, view_of(keyframe, slam, roles), None, slam.intrinsics, roles)
+    given = TrackingInput(data, slam.intrinsics, roles)
+    for keyframe in most_similar(data.features, tuple(candidates))[:most]:
+        found = track(given, keyframe, view_of(keyframe, slam, roles))
         if found.evidence.certain:
             return found
     return None
 
 
-def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | None:
+def revisit(slam: Slam, data: FrameData, current: Track, roles: Roles) -> Track | None:
     """The frame's pose by an old keyframe that shows the same place, wherever drift has put it: a loop that is closed
     while the run goes on. The camera goes on from there, and the last adjustment spreads what the loop was off.
 
@@ -54,7 +55,7 @@ def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | N
     way = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # from each keyframe to the newest
     within = np.linalg.norm(centres - rigid.centre(current.pose), axis=1) < MOST_DRIFT * way
     old = [k for k in slam.keyframes[:recent] if k.place is not None and within[k.number]]
-    place = place_vector(sight.features) if slam.metric and old else None
+    place = place_vector(data.features) if slam.metric and old else None
     if place is None:
         return None
     near = [slam.keyframes[number].place for number in slam.window.members]
@@ -63,7 +64,7 @@ def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | N
     best = int(np.argmax(similarity))
     if similarity[best] < usual:
         return None
-    found = track(sight, old[best], view_of(old[best], slam, roles), None, slam.intrinsics, roles)
+    found = track(TrackingInput(data, slam.intrinsics, roles), old[best], view_of(old[best], slam, roles))
     if not (found.accepted and found.evidence.certain):
         return None
     distance = Odometry.of(slam.map.odometry_factors, len(slam.keyframes)).distances([tie_between(current, found)])
@@ -103,9 +104,9 @@ def place_waiting(slam: Slam, roles: Roles) -> Slam:
     source = view_of(keyframe, slam, roles)
     for number, waiting in enumerate(reversed(slam.tracker.waiting)):
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
-        sight = sight_of(frame, Description.of(waiting.features), slam, roles)
-        expected = Expectation(step @ pose, step, waited=min(number, 3))
-        found = track(sight, keyframe, source, expected, slam.intrinsics, roles)
+        data = frame_data(frame, Description.of(waiting.features), slam, roles)
+        prior = MotionPrior(step @ pose, step, waited=min(number, 3))
+        found = track(TrackingInput(data, slam.intrinsics, roles, prior), keyframe, source)
         if not found.accepted:
             continue
         step, pose = found.pose @ rigid.invert(pose), found.pose
@@ -114,13 +115,13 @@ def place_waiting(slam: Slam, roles: Roles) -> Slam:
     return replace(slam, tracker=replace(slam.tracker, frames=frames, waiting=()))
 
 
-def sight_of(frame: Frame, description: Description, slam: Slam, roles: Roles) -> Sight:
+def frame_data(frame: Frame, description: Description, slam: Slam, roles: Roles) -> FrameData:
     """The frame as it is tracked."""
     view = None
     if roles.alignment is not None and slam.metric:
         view = description.view_by(slam.intrinsics)
         view = view or RgbdView.of(frame.image, roles.tracking_depth(frame.depth), slam.intrinsics)
-    return Sight(frame, description, view)
+    return FrameData(frame, description, view)
 
 
 def record_of(frame: Frame, found: Track) -> FramePose:
